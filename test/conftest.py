@@ -1,0 +1,15 @@
+"""Shared fixtures of the test suite."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope='session')
+def recordings():
+    """Folder of the real recordings; tests that need it are skipped when it is absent."""
+    folder = Path(os.environ.get('IMU_CALIBRATION_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+    if not folder.is_dir():
+        pytest.skip(f'real recordings not found at {folder}; set IMU_CALIBRATION_DATA')
+    return folder
