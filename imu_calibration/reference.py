@@ -1,0 +1,57 @@
+"""What a perfect sensor would feel: the true motion, as far as table and clock tell it."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Motion of the mount's reference point at the IMU's stamps."""
+
+    time: np.ndarray
+    """Seconds since the session's first sample, shape (n,)."""
+    mat_sn: np.ndarray
+    """Attitude, level frame to sensor frame, shape (n, 3, 3)."""
+    force_s: np.ndarray
+    """Specific force at the reference point, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Angular rate against inertial space, rad/s, shape (n, 3); without Earth rate when latitude or azimuth is unknown."""
+    alpha_s: np.ndarray
+    """Angular acceleration, rad/s^2, shape (n, 3)."""
+    gravity: float
+    """Local gravity, m/s^2."""
+    temperature_c: np.ndarray | None = None
+    """Temperature at the samples, degrees Celsius, shape (n,)."""
+    motion: object | None = None
+    """The joints' motion (`JointMotion`), when there is a table."""
+
+    def __len__(self):
+        return len(self.time)
+
+    def select(self, index):
+        """Return the reference at `index` (slice, mask or integer array)."""
+        changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        if self.motion is not None:
+            changed['motion'] = self.motion.select(index)
+        return replace(self, **changed)
+
+
+def skew(vector):
+    """Return the cross-product matrices of vectors, shape (..., 3) to (..., 3, 3)."""
+    vector = np.asarray(vector, float)
+    matrix = np.zeros(vector.shape + (3,))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -vector[..., 2], vector[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = vector[..., 2], -vector[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -vector[..., 1], vector[..., 0]
+    return matrix
+
+
+def lever_matrix(rate_s, alpha_s):
+    """
+    Return W with ``f_point = f_ref + W @ r``: ``W = [alpha x] + [omega x]^2``, shape (n, 3, 3).
+
+    Zhang 2017, eq. 11, with the dot on the tangential term that the print lost.
+    """
+    cross = skew(rate_s)
+    return skew(alpha_s) + cross @ cross
