@@ -1,0 +1,96 @@
+"""Effects of the table, the clock and a sensor's own lag: they change the motion that the sensor is thought to have felt."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_calibration import turntable
+from imu_calibration.effects.base import Effect
+
+ARCMIN = np.pi / 180 / 60
+LAGUERRE = np.polynomial.laguerre.laggauss(5)
+"""Nodes and weights that turn an exponential lag into a weighted mean of delays: int e^-x f(t - tau x) dx."""
+ORDERS = (1, 2)
+"""Harmonics per revolution of the encoder error."""
+
+
+def _tilt(table, motion, values):
+    return [(1.0, turntable.tilt(table, values), motion)]
+
+
+def _axes(table, motion, values):
+    """Turn each axis but the first about the common perpendicular with the axis before it, so that their angle changes."""
+    joints = list(table.joints)
+    for k, angle in enumerate(values, start=1):
+        before, axis = np.asarray(table.joints[k - 1].axis, float), np.asarray(table.joints[k].axis, float)
+        normal = np.cross(before, axis)
+        turned = Rotation.from_rotvec(angle * normal / np.linalg.norm(normal)).apply(axis)
+        joints[k] = replace(joints[k], axis=tuple(turned))
+    return [(1.0, replace(table, joints=tuple(joints)), motion)]
+
+
+def _zero(table, motion, values):
+    """Shift the joints between the first and the last: the first one's zero is the azimuth, the last one's belongs to the mount."""
+    offset = np.zeros(motion.position.shape[1])
+    offset[1:-1] = values
+    return [(1.0, table, replace(motion, position=motion.position + offset))]
+
+
+def _harmonics(table, motion, values):
+    amplitudes = np.reshape(values, (-1, len(ORDERS), 2))
+    for index, order in enumerate(ORDERS):
+        motion = turntable.with_encoder_harmonics(motion, order, amplitudes[:, index, 0], amplitudes[:, index, 1])
+    return [(1.0, table, motion)]
+
+
+def _late(table, motion, values):
+    return [(1.0, table, turntable.shifted(motion, values[0]))]
+
+
+def _lag(table, motion, values):
+    """First-order low-pass of time constant tau: y = int e^-x u(t - tau x) dx, by Gauss-Laguerre quadrature."""
+    return [(weight, table, turntable.shifted(motion, values[0] * node)) for node, weight in zip(*LAGUERRE)]
+
+
+def _earth(values, point):
+    """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
+    matrix = values['matrix'].reshape(3, 3)
+    return {'attitude': (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T}
+
+
+def _lag_effect(sensor):
+    short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[sensor]
+    return Effect(f'{short}_bandwidth', sensor, ('time_constant',), (), 's', 1e-4, 0.1,
+                  f'The {sensor} answers through a first-order low-pass filter: its output lags and loses amplitude at speed.',
+                  ('oscillate_fast',), 'none', warp=_lag, acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4,
+                  plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),))
+
+
+def reference_effects(joint_names):
+    """Return the effects of a table with these joints, of its clock, and of the sensors' lags."""
+    names, n_joints = list(joint_names), len(joint_names)
+    return (
+        Effect('table_tilt', 'reference', ('x', 'y'), (2,), 'rad', 1e-4, 0.02,
+               'The table does not stand level: its vertical is turned by a small angle about the base axes.', ('turn_about_vertical',), 'none',
+               warp=_tilt, needs=('joints',), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),)),
+        Effect('axis_non_orthogonality', 'reference', tuple(f'{a}_{b}' for a, b in zip(names, names[1:])), (max(n_joints - 1, 0),), 'rad',
+               1e-4, 0.01, 'The axes of the table are not perpendicular to one another.', ('two_axis', 'static_dense'), 'none',
+               warp=_axes, needs=('joints', 'two_joints'), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),)),
+        Effect('encoder_zero', 'reference', tuple(names[1:-1]), (max(n_joints - 2, 0),), 'rad', 1e-4, 0.01,
+               'The zero of an inner joint angle is not where the table description says.', ('static_dense',), 'none',
+               warp=_zero, needs=('joints', 'three_joints'), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),)),
+        Effect('encoder_harmonic', 'reference', tuple(f'{name}_{kind}{order}' for name in names for order in ORDERS for kind in ('cos', 'sin')),
+               (n_joints, len(ORDERS), 2), 'rad', 1e-4, 0.01,
+               'The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).', ('slow_turn',), 'none',
+               warp=_harmonics, needs=('joints',), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),)),
+        Effect('time_offset', 'reference', ('offset',), (), 's', 1e-4, 0.1, 'The IMU stamps are late against the joint stamps.',
+               ('oscillate_fast', 'two_axis'), 'none', warp=_late, needs=('joints', 'dynamic'), step=2e-4,
+               plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),)),
+        Effect('earth_rate', 'reference', ('x', 'y', 'z'), (3,), 'rad/s', 2e-6, 1e-4, "The gyroscopes feel the Earth's rotation, which the model leaves out.",
+               ('turn_about_vertical', 'static_poses'), 'none', groups=('attitude',), coefficients=_earth, acts_on=('gyroscope',), needs=('joints',),
+               plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),)),
+        _lag_effect('accelerometer'),
+        _lag_effect('gyroscope'),
+    )
+
