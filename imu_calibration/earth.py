@@ -1,0 +1,53 @@
+"""The Earth as a reference: normal gravity and the Earth's rate in the level frame."""
+
+import numpy as np
+
+EARTH_RATE = 7.292115e-5
+"""Rate of the Earth against inertial space, rad/s (WGS 84)."""
+
+_SEMI_MAJOR_AXIS = 6378137.0
+_FLATTENING = 1 / 298.257223563
+_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
+_GRAVITY_EQUATOR = 9.7803253359
+_SOMIGLIANA = 0.00193185265241
+_ROTATION_RATIO = 0.00344978650684  # m = omega^2 a^2 b / GM
+
+
+def normal_gravity(latitude_deg, height=0.0):
+    """
+    Return the normal gravity of the WGS 84 ellipsoid, m/s^2.
+
+    Somigliana's closed form on the ellipsoid, ``g_e (1 + k sin^2) / sqrt(1 - e^2 sin^2)``, with the height correction
+    of second order (NIMA TR8350.2, eq. 4-1 and 4-3). The local anomaly, up to 5e-4 m/s^2 in mountains, is not in it.
+
+    Parameters
+    ----------
+    latitude_deg : float or array
+        Geodetic latitude, degrees.
+    height : float or array
+        Height above the ellipsoid, m.
+
+    """
+    sin2 = np.sin(np.radians(latitude_deg)) ** 2
+    surface = _GRAVITY_EQUATOR * (1 + _SOMIGLIANA * sin2) / np.sqrt(1 - _ECCENTRICITY_SQUARED * sin2)
+    ratio = np.asarray(height, float) / _SEMI_MAJOR_AXIS
+    value = surface * (1 - 2 * (1 + _FLATTENING + _ROTATION_RATIO - 2 * _FLATTENING * sin2) * ratio + 3 * ratio ** 2)
+    return value if np.ndim(value) else float(value)
+
+
+def earth_rate_n(latitude_deg, azimuth_deg):
+    """
+    Return the Earth's rate in the level frame n, rad/s, shape (3,).
+
+    North lies `azimuth_deg` counter-clockwise of x: ``omega_e (cos(lat) cos(az), cos(lat) sin(az), sin(lat))``.
+
+    Parameters
+    ----------
+    latitude_deg : float
+        Geodetic latitude, degrees.
+    azimuth_deg : float
+        Heading of the x axis of n, degrees clockwise from true north.
+
+    """
+    latitude, azimuth = np.radians(latitude_deg), np.radians(azimuth_deg)
+    return EARTH_RATE * np.array([np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)])
