@@ -1,0 +1,115 @@
+"""The rotation between two moments from measured rates, with its exact derivative by the gyroscope's parameters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.reference import skew
+
+MAGNUS_SECOND = 1.0 / 12.0
+"""Weight of ``dt^2 rate_k x rate_{k+1}`` in the rotation vector when the body rate is linear in time between two samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """Rotation from the first sample of a stretch to its last one."""
+
+    mat_ji: np.ndarray
+    """Vector coordinates in the sensor at the first sample (i) to those at the last one (j), shape (3, 3)."""
+    by_bias: np.ndarray
+    """Derivative of psi by the bias, ``delta mat_ji = -[psi x] mat_ji``, shape (3, 3), s."""
+    by_matrix: np.ndarray
+    """Derivative of psi by the entries [row, column] of the forward matrix, shape (3, 3, 3)."""
+    integral: np.ndarray
+    """Integral of ``measured - bias``, shape (3,), rad."""
+    angle: float
+    """Path of the rotation: integral of the rate's length, rad."""
+    duration: float
+    """Seconds from first to last sample."""
+
+
+def integrate_turn(time, rate_measured, bias, matrix):
+    """
+    Integrate ``rate = matrix^-1 (measured - bias)`` over one stretch of samples.
+
+    Between two samples the rate is taken as linear in time and the rotation vector is the Magnus series to second order
+    (fourth order in the step); the steps are multiplied by a prefix product, log2(n) passes over the samples.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, not falling; n >= 2.
+    rate_measured : array, shape (n, 3)
+        Gyroscope readings, rad/s.
+    bias, matrix : arrays, shape (3,) and (3, 3)
+        Forward model ``measured = bias + matrix @ rate``.
+
+    Returns
+    -------
+    Turn
+
+    """
+    inverse = np.linalg.inv(matrix)
+    centred = rate_measured - bias
+    rate = centred @ inverse.T
+    step = np.diff(time)
+    first, second = rate[:-1], rate[1:]
+    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * np.cross(first, second)
+    forward = _prefix_product(_quaternion(vectors))
+    mat_ki = _matrix_to_sensor(forward)
+    to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)
+    gain = to_last @ _right_jacobian(vectors)
+    weight = _per_sample(gain, step, first, second)
+    by_inverse = np.einsum('mir,mc->irc', weight, centred)
+    by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
+    path = float(np.sum(0.5 * step * np.linalg.norm(first + second, axis=1)))
+    integral = 0.5 * np.sum(step[:, None] * (centred[:-1] + centred[1:]), axis=0)
+    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, integral, path, float(time[-1] - time[0]))
+
+
+def _per_sample(gain, step, first, second):
+    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step and begins the next."""
+    half, square = 0.5 * step[:, None, None] * np.eye(3), MAGNUS_SECOND * (step**2)[:, None, None]
+    weight = np.zeros((len(step) + 1, 3, 3))
+    weight[:-1] += gain @ (half - square * skew(second))
+    weight[1:] += gain @ (half + square * skew(first))
+    return weight
+
+
+def _quaternion(vectors):
+    """Return unit quaternions (w, x, y, z) of rotation vectors, shape (n, 4)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    return np.column_stack([np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi)[:, None] * vectors])
+
+
+def _multiply(left, right):
+    scalar = left[:, 0] * right[:, 0] - np.einsum('ij,ij->i', left[:, 1:], right[:, 1:])
+    vector = left[:, :1] * right[:, 1:] + right[:, :1] * left[:, 1:] + np.cross(left[:, 1:], right[:, 1:])
+    return np.column_stack([scalar, vector])
+
+
+def _prefix_product(quaternions):
+    """Return q_0, q_0 q_1, q_0 q_1 q_2, ...: doubling the reach in every pass."""
+    product, reach = quaternions.copy(), 1
+    while reach < len(product):
+        product[reach:] = _multiply(product[:-reach], product[reach:])
+        reach *= 2
+    return product / np.linalg.norm(product, axis=1, keepdims=True)
+
+
+def _matrix_to_sensor(quaternions):
+    """Return the matrices that take coordinates in the first sensor frame to the turned one (the transposed attitude)."""
+    scalar, vector = quaternions[:, 0, None, None], quaternions[:, 1:]
+    cross = skew(vector)
+    return np.eye(3) - 2 * scalar * cross + 2 * cross @ cross
+
+
+def _right_jacobian(vectors):
+    """Return J with ``exp(v + d) = exp(v) exp(J d)`` to first order, shape (n, 3, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    small = angle < 1e-3
+    safe = np.where(small, 1.0, angle)
+    one = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    two = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    cross = skew(vectors)
+    return np.eye(3) - one[:, None, None] * cross + two[:, None, None] * (cross @ cross)
