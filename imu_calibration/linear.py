@@ -9,6 +9,8 @@ from imu_calibration.errors import InputError, NotObservableError
 
 RANK_TOLERANCE = 1e-10
 """A singular value of the unit-column design below this times the largest counts as zero; rounding leaves about 1e-15."""
+COLUMN_TOLERANCE = 1e-14
+"""A column shorter than this times the longest is rounding of zero (the sine of pi), not a column to be scaled up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +226,11 @@ def _checked(design, outputs, param_names, weights):
 
 
 def _scaled_svd(design):
-    """Return (column norms with 1 for zero columns, U, singular values padded to n_params, V')."""
+    """Return (column norms with 1 for empty columns, U, singular values, V') of the unit-column design, all n_params of them."""
     norms = np.linalg.norm(design, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    orthogonal, factor = np.linalg.qr(_padded(design / norms))
+    empty = norms <= COLUMN_TOLERANCE * np.max(norms)
+    norms = np.where(empty, 1.0, norms)
+    orthogonal, factor = np.linalg.qr(_padded(np.where(empty, 0.0, design / norms)))
     left, singular, right = np.linalg.svd(factor)
     return norms, (orthogonal @ left)[:len(design)], singular, right
 
