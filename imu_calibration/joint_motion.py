@@ -1,8 +1,15 @@
-"""Motion of the joints at given instants, and small errors of it (encoder harmonics, delay)."""
+"""Joints brought to the IMU's stamps: a smooth curve through the readings, its motion, and small errors of it."""
 
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+
+from imu_calibration.bspline import (Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients)
+from imu_calibration.errors import InputError
+from imu_calibration.settings import JointSettings
+from imu_calibration.smoothing import PenalisedSpline, encoder_step, smooth
+
+_MINIMUM_SAMPLES = 8  # fewer are fitted with a parabola
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +33,140 @@ class JointMotion:
     def select(self, index):
         """Return the motion at `index` (slice, mask or integer array)."""
         return JointMotion(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class JointCurve:
+    """Smooth motion of the joints over a stretch of time."""
+
+    knots: Knots
+    """Knots of the quintic spline."""
+    pieces: np.ndarray
+    """Polynomials between the knots, shape (6, n_intervals, n_joints)."""
+    noise_sd: np.ndarray
+    """Noise of the positions, rad, shape (n_joints,): as found in the residuals, not below what is known of the encoder."""
+    velocity_trusted: np.ndarray
+    """Whether the velocities agree with the positions, shape (n_joints,)."""
+    bandwidth: np.ndarray
+    """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint that stands still."""
+
+    def at(self, time, derivatives=3):
+        """
+        Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than two of their periods.
+
+        Derivatives above `derivatives` are left out as zero.
+        """
+        time = np.asarray(time, float)
+        values = np.zeros((4, len(time), self.pieces.shape[2]))
+        values[:derivatives + 1] = evaluate_pieces(self.knots, self.pieces, time, derivatives)
+        outside = (time < self.knots.start) | (time > self.knots.start + self.knots.step * self.knots.n_intervals)
+        if outside.any():
+            values[:, outside] = np.nan
+        return JointMotion(time, *values)
+
+
+def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=JointSettings()):
+    """
+    Return the smooth curve behind readings of the joints.
+
+    A penalised quintic spline per joint, one knot per reading; the penalty follows from the data (`smoothing.smooth`), so
+    that readings without noise are interpolated and those of a coarse encoder give sane accelerations. Velocities that
+    agree with the positions in scale and lag take part.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, not decreasing; repeats, jitter and small gaps are fine.
+    position : array, shape (n, n_joints)
+        Joint angles, rad; jumps by whole turns are undone.
+    velocity : array, shape (n, n_joints), optional
+        Joint rates, rad/s; NaN where there is none.
+    noise_sd : float or array, shape (n_joints,), optional
+        Noise that the positions have at least, rad.
+    settings : JointSettings, optional
+        Adjustable numbers.
+
+    Returns
+    -------
+    JointCurve
+
+    Raises
+    ------
+    InputError
+        When there are no readings, a position is not finite or time runs backwards.
+
+    """
+    time, position = np.asarray(time, float), np.asarray(position, float)
+    _check(time, position)
+    position = _unwrapped(position)
+    knots = _place_knots(time)
+    centre, trend, coefficients, bandwidth, noise, trusted = _fit(knots, time, position, velocity, noise_sd, settings)
+    pieces = piece_coefficients(coefficients)
+    start = knots.start - centre + knots.step * np.arange(knots.n_intervals)[:, None]
+    pieces[0] += trend[0] + start * (trend[1] + start * trend[2])
+    pieces[1] += knots.step * (trend[1] + 2 * start * trend[2])
+    pieces[2] += knots.step ** 2 * trend[2]
+    return JointCurve(knots, pieces, noise, trusted, bandwidth)
+
+
+def _check(time, position):
+    if not len(time) or not np.isfinite(position).all():
+        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; drop what is not a number')
+    if np.any(np.diff(time) < 0):
+        raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those')
+
+
+def _unwrapped(position):
+    return np.unwrap(position, axis=0) if np.any(np.abs(np.diff(position, axis=0)) > np.pi) else position
+
+
+def _place_knots(time):
+    """Return knots at the usual distance of the readings, with a margin of two on both sides."""
+    count = len(time)
+    span = time[-1] - time[0]
+    stride = min(8, count - 1)
+    step = np.median(time[stride:] - time[:-stride]) / stride if count > 1 else 0.0
+    step = max(step, span / (4 * count), 1e-6)
+    return Knots(float(time[0] - 2 * step), float(step), int(np.ceil(span / step)) + 4)
+
+
+def _fit(knots, time, position, velocity, noise_sd, settings):
+    n_joints = position.shape[1]
+    centre = 0.5 * (time[0] + time[-1])
+    still = np.all(position == position[0], axis=0)
+    trend = _parabola(time - centre, position)
+    trend[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
+    coefficients = np.zeros((knots.n_coefficients, n_joints))
+    bandwidth, noise, trusted = np.zeros(n_joints), np.zeros(n_joints), np.zeros(n_joints, bool)
+    if noise_sd is not None:
+        noise[:] = noise_sd
+    moving = np.flatnonzero(~still)
+    if len(time) < _MINIMUM_SAMPLES or not len(moving):
+        return centre, trend, coefficients, bandwidth, noise, trusted
+    rest = position[:, moving] - np.polynomial.polynomial.polyval(time - centre, trend[:, moving]).T
+    for place, joint in enumerate(moving):
+        resolution = 4 * np.finfo(float).eps * np.abs(position[:, joint]).max()
+        noise[joint] = max(noise[joint], resolution, encoder_step(position[:, joint]) / np.sqrt(12))
+    interval, values = design_values(knots, time)
+    spline = PenalisedSpline(knots, design_matrix(knots, interval, values), normal_bands(knots, interval, values))
+    for joint, fit in zip(moving, smooth(spline, rest, noise[moving], settings.dof_weight), strict=True):
+        coefficients[:, joint], noise[joint] = fit.coefficients, max(noise[joint], fit.noise_sd)
+        bandwidth[joint] = _bandwidth(fit.penalty / spline.density, knots.step)
+    return centre, trend, coefficients, bandwidth, noise, trusted
+
+
+def _bandwidth(ratio, step):
+    """Return the frequency at which ``ratio (2 sin(omega step / 2))^6`` is one, at most Nyquist's."""
+    return np.arcsin(min(0.5 * ratio ** (-1 / 6), 1.0)) / (np.pi * step)
+
+
+def _parabola(time, position):
+    """Return the coefficients of a least-squares parabola (or less, for few readings), shape (3, n_joints)."""
+    degree = min(2, len(np.unique(time)) - 1)
+    scale = max(np.abs(time).max(), 1e-9)
+    trend = np.zeros((3, position.shape[1]))
+    trend[:degree + 1] = np.polynomial.polynomial.polyfit(time / scale, position, degree) / scale ** np.arange(degree + 1)[:, None]
+    return trend
 
 
 def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):

@@ -67,3 +67,15 @@ class WindowSettings:
                          'too small: every lost message cuts a window')
     chunk: float = setting(20.0, 's', 'the joints are smoothed in pieces of this length', (2.0, 600.0), '')
     overlap: float = setting(2.0, 's', 'margin on both sides of a piece, so that its ends do not show', (0.2, 60.0), '')
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """How the joints' motion is drawn from their readings."""
+
+    dof_weight: float = setting(1.2, '1', 'weight of the degrees of freedom when the smoothing is chosen', (1.0, 3.0),
+                                'too small: rough accelerations; too large: sharp ramps are rounded')
+    velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
+                                    'too large: filtered velocities bend the reference')
+    velocity_lag: float = setting(2e-4, 's', 'joint velocities are used when their lag behind the positions stays below this', (0.0, 0.1),
+                                  'too large: late velocities look like a time offset of the IMU')
