@@ -1,0 +1,82 @@
+# Two commands do all set-up on a machine that has Python 3.11 or later, its venv module and make:
+#   make demo    a simulated recording, its calibration, a compensated bag and a report
+#   make test    every test
+# With a ROS 2 Jazzy sourced its rclpy is used, otherwise rclpy comes from PyPI; all versions are pinned in constraints/.
+
+PYTHON ?= python3
+VENV ?= .venv
+PY = $(VENV)/bin/python
+OUTPUT ?= demo
+TEST_OPTIONS ?=
+SOAK_HOURS ?= 6
+
+# One thread per process: the tests run on two cores already, and sums come out in the same order every time.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+ifeq ($(ROS_DISTRO),jazzy)
+JAZZY := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
+endif
+
+ifeq ($(JAZZY),yes)
+PINS ?= constraints/jazzy-ubuntu2404.txt
+VENV_OPTIONS = --system-site-packages
+# ROS registers pytest plugins of its own, written for other pytest versions.
+export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
+PLUGINS = -p xdist
+else
+PINS ?= constraints/pypi.txt
+endif
+
+STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
+PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
+PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
+
+.PHONY: help setup demo live-demo test test-fast test-oldest bench soak hide-and-seek clean
+
+help:
+	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
+	@echo 'also: setup, live-demo, test-fast, test-oldest, bench, soak, hide-and-seek, clean'
+
+setup: $(STAMP)
+
+$(STAMP): $(wildcard constraints/*.txt) setup.py setup.cfg
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' || \
+	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
+	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
+	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
+	@$(PIP) --prefer-binary --requirement $(PINS)
+	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
+	@touch $@
+
+demo: $(STAMP)
+	@$(PY) examples/demo.py --output $(OUTPUT)
+
+live-demo: $(STAMP)
+	@$(PY) examples/live_demo.py
+
+test: $(STAMP)
+	$(PYTEST) $(TEST_OPTIONS)
+
+# Everything but what is long or needs DDS.
+test-fast: $(STAMP)
+	$(PYTEST) -m 'not slow and not dds' $(TEST_OPTIONS)
+
+# The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
+test-oldest:
+	$(MAKE) test VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
+
+bench: $(STAMP)
+	@$(PY) benchmarks/run.py
+
+soak: $(STAMP)
+	@$(PY) test/soak.py --hours $(SOAK_HOURS)
+
+hide-and-seek: $(STAMP)
+	@$(PY) test/hide_and_seek.py
+
+clean:
+	rm -rf build install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info
+	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +

@@ -1,0 +1,60 @@
+"""Installation by colcon (ament_python) and by pip; what runs where is explained in docs/decisions/packaging.md."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install_scripts import install_scripts
+
+NAME = 'imu_calibration'
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+
+
+class _OnPathToo:
+    """Write each console script to bin/ as well: `ros2 run` looks in lib/PACKAGE, a shell looks on PATH."""
+
+    def write_script(self, script_name, contents, *args):
+        super().write_script(script_name, contents, *args)
+        folder = Path(getattr(self, 'script_dir', None) or self.install_dir)
+        if folder.parts[-2:] == ('lib', NAME):
+            command = folder.parents[1] / 'bin' / script_name
+            command.parent.mkdir(parents=True, exist_ok=True)
+            command.write_text((folder / script_name).read_text())
+            command.chmod(0o755)
+
+
+class InstallScripts(_OnPathToo, install_scripts):
+    """Used by colcon build."""
+
+
+class Develop(_OnPathToo, develop):
+    """Used by colcon build --symlink-install."""
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Calibration and compensation of inertial measurement units, offline and live on ROS 2',
+    license='Apache-2.0',
+    maintainer='imu_calibration maintainers',
+    maintainer_email='imu_calibration@users.noreply.github.com',
+    packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_adapters', 'msg_adapters.*']),
+    package_data={NAME: ['templates/*']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
+    ],
+    python_requires='>=3.11',
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11'],
+    zip_safe=False,
+    cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
+    entry_points={
+        'console_scripts': [
+            f'{NAME} = {NAME}.cli:main',
+            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
+        ],
+    },
+)
