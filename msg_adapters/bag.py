@@ -1,0 +1,215 @@
+"""Recordings: which topics to read, and their samples block by block in file order."""
+
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from msg_adapters.decode import Decoder, JointDecoder
+from msg_adapters.definitions import is_standard, standard_typestore, typestore_for
+from msg_adapters.general_file import GeneralFile
+from msg_adapters.imu import IMU_TYPE
+from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.temperature import TEMPERATURE_TYPE
+
+DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
+OPTIONS = {IMU_TYPE: '--imu-topic', JOINT_STATE_TYPE: '--joint-topic', TEMPERATURE_TYPE: '--temperature-topic'}
+
+BLOCK_SAMPLES = 65536
+"""IMU and joint samples per block, about."""
+
+
+class Topic(NamedTuple):
+    """One topic of a recording."""
+
+    name: str
+    """Name with its leading slash."""
+    type: str
+    """Message type, as in sensor_msgs/msg/Imu."""
+    count: int
+    """Messages that the recording says it holds."""
+
+
+def open_recording(path, imu_topic=None, joint_topic=None, temperature_topic=None, want_joints=True, want_temperature=True):
+    """
+    Open a bag and choose its topics: the one that is named, else the default name, else the only one of the type.
+
+    Parameters
+    ----------
+    path : path-like
+        A rosbag2 folder, a bare .db3 or .mcap file, or a ROS 1 .bag file.
+    imu_topic, joint_topic, temperature_topic : str, optional
+        Names of topics.
+    want_joints : bool or 'optional'
+        True: refuse a recording without JointState; 'optional': go on without.
+    want_temperature : bool
+        Whether to read temperatures when the recording has them.
+
+    Returns
+    -------
+    recording : Recording
+
+    Raises
+    ------
+    InputError
+        When the path is no readable bag, or a topic cannot be chosen.
+
+    """
+    path = Path(path)
+    source = _open_source(path)
+    try:
+        topics = tuple(Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types))
+        imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
+        joints = _choose(path, topics, JOINT_STATE_TYPE, joint_topic, want_joints is True) if want_joints else None
+        temperature = _choose(path, topics, TEMPERATURE_TYPE, temperature_topic, False) if want_temperature else None
+    except BaseException:
+        source.close()
+        raise
+    return Recording(path, source, topics, imu, joints, temperature)
+
+
+class Recording:
+    """An open bag; use it as a context manager or call `close`."""
+
+    def __init__(self, path, source, topics, imu_topic, joint_topic, temperature_topic):
+        self.path = path
+        self.topics = topics
+        self.imu_topic, self.joint_topic, self.temperature_topic = imu_topic, joint_topic, temperature_topic
+        self._source = source
+
+    @property
+    def message_counts(self):
+        """Topic name -> messages that the recording says it holds."""
+        return {topic.name: topic.count for topic in self.topics}
+
+    @property
+    def n_messages(self):
+        """Messages on the chosen topics, as far as the recording says; for progress."""
+        counts = self.message_counts
+        return sum(counts[name] for name in (self.imu_topic, self.joint_topic, self.temperature_topic) if name)
+
+    @property
+    def duration(self):
+        """Seconds between the first and the last message by the recorder's clock."""
+        return self._source.duration_ns * 1e-9
+
+    @property
+    def lost(self):
+        """What could not be read, reason -> count; complete when `blocks` has run to its end."""
+        return dict(self._source.lost)
+
+    def blocks(self, joint_names=None, block_samples=BLOCK_SAMPLES):
+        """
+        Read the samples in file order.
+
+        Parameters
+        ----------
+        joint_names : sequence of str, optional
+            Joints of the table, in its order; default: those of the first JointState message.
+        block_samples : int
+            A block is handed out when it has at least this many IMU and joint samples.
+
+        Yields
+        ------
+        block : SampleBlock
+            IMU, joints and temperature of one stretch of the file; `dropped` counts the messages of the stretch that are unusable.
+
+        Raises
+        ------
+        InputError
+            When the JointState messages do not name the joints of the table.
+
+        """
+        decoders = self._decoders(joint_names)
+        parts, n_samples = {}, 0
+        for stretch in self._source.stretches(list(decoders)):
+            for topic, packed in stretch.items():
+                samples = decoders[topic](packed)
+                if samples is not None:
+                    parts.setdefault(type(samples), []).append(samples)
+                    n_samples += len(samples)
+            if n_samples >= block_samples:
+                yield _block(parts, decoders)
+                parts, n_samples = {}, 0
+        if self.joint_topic:
+            decoders[self.joint_topic].check()
+        last = _block(parts, decoders)
+        if parts or last.dropped:
+            yield last
+
+    def _decoders(self, joint_names):
+        store = typestore_for(self._source.definitions) if any(text for _, text in self._source.definitions.values()) else None
+        store = store or standard_typestore()
+        decoders = {}
+        for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
+            message_type = self._source.types[topic]
+            deserialize = _deserializer(store, message_type, self._source.ros1)
+            standard = not self._source.ros1 and is_standard(store, message_type)
+            if message_type == JOINT_STATE_TYPE:
+                decoders[topic] = JointDecoder(joint_names, deserialize, standard)
+            else:
+                decoders[topic] = Decoder(message_type, deserialize, standard)
+        return decoders
+
+    def close(self):
+        """Close the files."""
+        self._source.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.close()
+
+
+def _block(parts, decoders):
+    """Join the parts of a block and take over what the decoders dropped since the last one."""
+    dropped = Counter()
+    for decoder in decoders.values():
+        dropped.update(decoder.dropped)
+        decoder.dropped.clear()
+    joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
+    return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dict(dropped) or None)
+
+
+def _deserializer(store, message_type, ros1):
+    deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    return lambda data: deserialize(data, message_type)
+
+
+def _open_source(path):
+    if not path.exists():
+        raise InputError(f'a recording must be a rosbag2 folder, a .db3, .mcap or .bag file, got {path}, which does not exist; '
+                         'check the path')
+    try:
+        return GeneralFile(path)
+    except Exception as error:   # rosbags and its storages raise many kinds
+        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file): {error}') from error
+
+
+def _choose(path, topics, message_type, asked, required):
+    """Return the topic of a type by the rule of `open_recording`, or None."""
+    option = OPTIONS[message_type]
+    fitting = [topic.name for topic in topics if topic.type == message_type]
+    if asked is not None:
+        names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
+        if not names:
+            raise InputError(f'{option} must name a {message_type} topic of {path}, got {asked}; {_listing(topics, fitting)}')
+        return names[0]
+    if DEFAULT_TOPICS[message_type] in fitting:
+        return DEFAULT_TOPICS[message_type]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise InputError(f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
+                         f'got {", ".join(fitting)}; choose by {option}')
+    if required:
+        raise InputError(f'{path} must have a {message_type} topic, got none; {_listing(topics, fitting)}')
+    return None
+
+
+def _listing(topics, fitting):
+    if fitting:
+        return f'choose one of {", ".join(fitting)}'
+    return 'it holds ' + (', '.join(f'{topic.name} ({topic.type})' for topic in topics) or 'no topics')

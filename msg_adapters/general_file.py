@@ -1,0 +1,62 @@
+"""Bags as far as rosbags reads them, one raw message at a time: ROS 1 bags, and whatever the quick readers do not know."""
+
+from collections import defaultdict
+from contextlib import suppress
+from pathlib import Path
+
+from msg_adapters.layout import Packed
+
+STRETCH = 8192
+"""Messages per stretch."""
+
+
+class GeneralFile:
+    """One bag through rosbags' reader."""
+
+    def __init__(self, path):
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        self.ros1 = Path(path).suffix == '.bag'
+        self.reader = (Reader1 if self.ros1 else Reader2)(Path(path))
+        self.reader.open()
+        self.lost = {}
+        self.counts = {}
+        self.types = {}
+        self.definitions = {}
+        for connection in self.reader.connections:
+            self.types[connection.topic] = connection.msgtype
+            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
+            encoding = 'ros2idl' if connection.msgdef.format.name == 'IDL' else 'ros2msg'
+            self.definitions[connection.msgtype] = (encoding, connection.msgdef.data)
+
+    @property
+    def duration_ns(self):
+        """Time between the first and the last message by the clock of the recorder."""
+        return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
+
+    def stretches(self, topics):
+        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
+        connections = [c for c in self.reader.connections if c.topic in topics]
+        pending, n_pending, n_read = defaultdict(list), 0, 0
+        expected = sum(c.msgcount for c in connections)
+        messages = self.reader.messages(connections) if connections else iter(())
+        while True:
+            try:
+                connection, _, data = next(messages)
+            except StopIteration:
+                break
+            except Exception as error:   # whatever a damaged file makes rosbags raise
+                self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
+                break
+            pending[connection.topic].append(bytes(data))
+            n_pending, n_read = n_pending + 1, n_read + 1
+            if n_pending == STRETCH:
+                yield {topic: Packed.join(messages_) for topic, messages_ in pending.items()}
+                pending, n_pending = defaultdict(list), 0
+        if pending:
+            yield {topic: Packed.join(messages_) for topic, messages_ in pending.items()}
+
+    def close(self):
+        """Close the file."""
+        with suppress(Exception):
+            self.reader.close()

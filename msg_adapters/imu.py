@@ -1,0 +1,138 @@
+"""sensor_msgs/Imu: by attribute, by bytes one at a time, and many at once."""
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+from imu_calibration.samples import ImuSamples
+from msg_adapters.layout import Layout
+from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, align, byte_order, header_stamp_ns, to_ns
+
+IMU_TYPE = 'sensor_msgs/msg/Imu'
+
+N_DOUBLES = 37
+FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s': slice(13, 16), 'rate_cov': slice(16, 25),
+          'force_s': slice(25, 28), 'force_cov': slice(28, 37)}
+"""Places in the 37 doubles behind the header: x, y, z, w and row-major 3 x 3 covariances."""
+
+_FRAME = ENCAPSULATION_SIZE + 8
+_HEADERS = {order: struct.Struct(order + 'iII') for order in '<>'}
+_DOUBLES = {order: struct.Struct(f'{order}{N_DOUBLES}d') for order in '<>'}
+
+
+class ImuMessage(NamedTuple):
+    """One message taken apart."""
+
+    stamp_ns: int
+    """Header stamp."""
+    frame_id: str
+    """Frame of the readings."""
+    doubles: tuple
+    """All 37 numbers in the order of the message; `FIELDS` says which is which."""
+
+
+def parse_imu(data):
+    """
+    Take a serialized Imu message apart.
+
+    Raises
+    ------
+    MessageError
+        When the bytes are not a plain CDR Imu message.
+
+    """
+    order, frame, body, sec, nanosec = _open_message(data)
+    return ImuMessage(to_ns(sec, nanosec), frame.decode(errors='replace'), _DOUBLES[order].unpack_from(data, body))
+
+
+def patch_imu(data, frame_id=None, **fields):
+    """
+    Return a copy of a serialized Imu message with some fields replaced.
+
+    Parameters
+    ----------
+    data : bytes
+        The message; its stamp and every field that is not named stay as they are, to the last bit.
+    frame_id : str, optional
+        New frame.
+    fields : array_like
+        Values by the names of `FIELDS`; covariances as 3 x 3 or as nine numbers.
+
+    """
+    order, frame, body, _, _ = _open_message(data)
+    if frame_id is not None and frame_id.encode() != frame:
+        data, body = _reframed(data, order, body, frame_id.encode())
+    patched = bytearray(data)
+    for name, value in fields.items():
+        value = np.asarray(value, dtype=float).ravel()
+        place = FIELDS[name]
+        struct.pack_into(f'{order}{place.stop - place.start}d', patched, body + 8 * place.start, *value)
+    return bytes(patched)
+
+
+def find_imu_layout(data):
+    """Return the Layout of a serialized Imu message (raises MessageError)."""
+    order, frame, body, _, _ = _open_message(data)
+    offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
+    fixed = ((0, 2), (_FRAME, _FRAME + 4 + struct.unpack_from(order + 'I', data, _FRAME)[0]))
+    return Layout(order, len(data), bytes(data), fixed, offsets, (frame.decode(errors='replace'),))
+
+
+def decode_imu(layout, packed, index):
+    """
+    Decode messages of one layout; readings that a message declares absent (covariance -1) come as NaN.
+
+    Returns
+    -------
+    ImuSamples
+        In the order of `index`.
+
+    """
+    readings = {}
+    for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
+        values = layout.column(packed, index, name)
+        absent = _first(layout, cov).column(packed, index, cov)[:, 0] == -1.0
+        if absent.any():
+            values[absent] = np.nan
+        readings[name] = values
+    return ImuSamples(layout.stamp_ns(packed, index), frame_id=layout.names[0], **readings)
+
+
+def imu_from_message(message):
+    """Return one-row ImuSamples from a message object of rclpy or rosbags."""
+    def reading(value, covariance):
+        return np.full((1, 3), np.nan) if covariance[0] == -1.0 else np.array([[value.x, value.y, value.z]], dtype=float)
+
+    return ImuSamples(np.array([header_stamp_ns(message)], dtype=np.int64),
+                      reading(message.linear_acceleration, message.linear_acceleration_covariance),
+                      reading(message.angular_velocity, message.angular_velocity_covariance), message.header.frame_id)
+
+
+def _first(layout, name):
+    """The same layout with only the first number of field `name`."""
+    return Layout(layout.order, layout.size, layout.sample, layout.fixed, {name: (layout.offsets[name][0], 1)})
+
+
+def _open_message(data):
+    """Check the bytes and return (byte order, frame_id bytes, offset of the doubles, sec, nanosec)."""
+    order = byte_order(data)
+    if len(data) < _FRAME + 4:
+        raise MessageError(f'an Imu message has at least {_FRAME + 4} bytes, got {len(data)}')
+    sec, nanosec, length = _HEADERS[order].unpack_from(data, ENCAPSULATION_SIZE)
+    body = _body_offset(length)
+    if len(data) < body + 8 * N_DOUBLES:
+        raise MessageError(f'an Imu message with a frame_id of {length} bytes has {body + 8 * N_DOUBLES} bytes, got {len(data)}')
+    return order, bytes(data[_FRAME + 4:_FRAME + 4 + max(length - 1, 0)]), body, sec, nanosec
+
+
+def _body_offset(length):
+    """Offset of the doubles when the frame_id takes `length` bytes with its closing zero."""
+    return ENCAPSULATION_SIZE + align(_FRAME + length, 8)
+
+
+def _reframed(data, order, body, frame):
+    """Return the message with another frame_id and the new offset of its doubles."""
+    new_body = _body_offset(len(frame) + 1)
+    head = bytes(data[:_FRAME]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'
+    return head.ljust(new_body, b'\0') + bytes(data[body:]), new_body
