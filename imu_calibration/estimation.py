@@ -1,0 +1,387 @@
+"""Solving the system: one weighted non-linear least-squares problem over all windows, with honest standard deviations."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import NotObservableError
+from imu_calibration.sensor_model import coefficients
+from imu_calibration.window_noise import WindowNoise, estimate_offsets, sessions_of, white_noise, whiten
+from imu_calibration.window_statistics import triangular
+
+HELD_SHARE = 0.5
+"""A parameter whose standard deviation exceeds this share of its prior's is held at the prior."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Estimated parameters with everything that is needed to judge them."""
+
+    model: object
+    """The SensorModel, linearised where the columns were taken."""
+    values: np.ndarray
+    """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
+    covariance: np.ndarray
+    """Their covariance, the priors of held parameters included, shape (n_params, n_params)."""
+    held: np.ndarray
+    """True where the recording says next to nothing and the prior stands, shape (n_params,)."""
+    noise: dict
+    """Sensor -> WindowNoise."""
+    chi2_per_dof: dict
+    """Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom."""
+    information: np.ndarray
+    """Information matrix of the data alone, shape (n_params, n_params)."""
+    residual_rms: dict
+    """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
+
+    @property
+    def param_names(self):
+        """Names in the order of `values`."""
+        return self.model.param_names
+
+    @property
+    def sd(self):
+        """Standard deviations, shape (n_params,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, sensor, effect):
+        """Return the values of one effect."""
+        return self.values[self.model.slices[sensor, effect]]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian prior as rows: ``root @ (values - mean)`` has unit variance."""
+
+    mean: np.ndarray
+    """Prior values, shape (n_params,)."""
+    root: np.ndarray
+    """Square root of the information, shape (k, n_params)."""
+    sd: np.ndarray
+    """Marginal standard deviations, shape (n_params,)."""
+
+
+GAUGE_SD = 1e-12
+
+
+def make_prior(model):
+    """
+    Return the prior of a model.
+
+    When both `accel_size_effect` and `lever_arm` are estimated, the arms of the size effect sum to zero: the origin is the
+    mean of the sensitive points.
+    """
+    mean, sd = model.prior()
+    mean = np.where(np.isfinite(mean), mean, 0.0)
+    for effect in model.relinearised:
+        if effect.components[-1] == 'time_constant' and effect.size > 1:
+            mean[model.slices[effect.sensor, effect.name]][-1] = 300.0
+    rows = [np.diag(1 / sd)]
+    if ('accelerometer', 'accel_size_effect') in model.slices and ('accelerometer', 'lever_arm') in model.slices:
+        arms = np.arange(len(mean))[model.slices['accelerometer', 'accel_size_effect']].reshape(3, 3)
+        gauge = np.zeros((3, len(mean)))
+        for component in range(3):
+            gauge[component, arms[:, component]] = 1 / GAUGE_SD
+        rows.append(gauge)
+        sd = sd.copy()
+        sd[arms.ravel()] *= np.sqrt(2 / 3)
+    return Prior(mean, np.concatenate(rows), sd)
+
+
+def fixed_parameters(model):
+    """Return a mask of parameters that least squares leaves alone (saturation is censoring, not a column)."""
+    return np.concatenate([np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects])
+
+
+def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
+    """
+    Estimate all parameters jointly from accumulated windows.
+
+    Minimises the sum of squares of whitened rows ``[columns | output] @ [coefficients(values); -1]`` over all windows and
+    axes plus the prior. Window offsets and a wandering bias are part of the noise (restricted maximum likelihood).
+
+    Parameters
+    ----------
+    accumulator : Accumulator
+        Windows reduced with the columns of `model`.
+    allow_holding : bool
+        Whether parameters that the data do not determine may be held at their prior.
+    noise : dict, optional
+        Sensor -> WindowNoise, when it is known.
+
+    Raises
+    ------
+    NotObservableError
+        When nothing is determined, or something is not and holding is not allowed.
+
+    """
+    if not accumulator.rows:
+        raise NotObservableError('at least one static window, spin or dynamic stretch must be found, none was; '
+                                 'let the table rest between moves, or check the joint states')
+    prior = prior or make_prior(model)
+    problem = _Problem(accumulator, model, prior)
+    values = problem.start()
+    noises = noise or problem.first_noise(values)
+    for iteration in range(3):
+        values = problem.minimise(values, noises, _free(model, None))
+        if noise is not None:
+            break
+        noises = problem.update_noise(values, noises)
+    values = problem.minimise(values, noises, _free(model, None))
+    held = problem.undetermined(values, noises)
+    _refuse(held | fixed_parameters(model), held, model, allow_holding)
+    if held.any():
+        values = np.where(held, prior.mean, values)
+        values = problem.minimise(values, noises, _free(model, held))
+    covariance, information = problem.covariance(values, noises, held)
+    chi2, rms = problem.fit_quality(values, noises)
+    return Solution(model, values, covariance, held, noises, chi2, information, rms)
+
+
+def _free(model, held):
+    free = ~fixed_parameters(model)
+    return free if held is None else free & ~held
+
+
+def _refuse(without, held, model, allow_holding):
+    names = [name for name, flag in zip(model.param_names, held) if flag]
+    if without.all():
+        raise NotObservableError('the recording must determine at least one parameter, it determines none; record static positions in at least four '
+                                 'different attitudes')
+    if held.any() and not allow_holding:
+        raise NotObservableError(f"every parameter must be determined, {len(names)} are not: {', '.join(names)}; record more motion or allow holding")
+
+
+class _Problem:
+    """The rows of one solve, and the functions of the values that the solve needs."""
+
+    def __init__(self, accumulator, model, prior):
+        self.model, self.prior, self.accumulator = model, prior, accumulator
+        rows = accumulator.rows
+        self.times = np.array([row.time for row in rows])
+        self.counts = np.array([row.count for row in rows], float)
+        self.sessions = sessions_of(rows)
+        self.means = {s: np.array([row.sensors[s].mean for row in rows]) for s in SENSORS}
+        self.within = {s: {k: f for (sensor, k), f in sorted(accumulator.within.items()) if sensor == s and len(f)} for s in SENSORS}
+        self.dof_within = {k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples}
+        self.fixed = np.where(np.isfinite(model.prior()[0]), 0.0, np.inf)
+
+    def start(self):
+        """Return the static solution: bias and matrix of each sensor alone, everything else at its prior."""
+        values = self.model.start()
+        values = np.where(np.isfinite(values), values, 0.0)
+        for sensor in SENSORS:
+            index = np.arange(len(values))
+            bias, matrix = (index[self.model.slices[sensor, name]] for name in ('bias', 'matrix'))
+            order = np.cumsum([0] + [width for _, width in self.model.groups(sensor)])
+            first = {name: start for (name, _), start in zip(self.model.groups(sensor), order)}
+            chosen = [first['one']] + [first['force' if sensor == 'accelerometer' else 'rate'] + k for k in range(3)]
+            means, p = self.means[sensor], self.means[sensor].shape[1] - 3
+            weight = np.sqrt(self.counts / self.counts.max())[:, None]
+            penalty = 1e-6 * np.eye(4)
+            target = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+            design = np.concatenate([weight * means[:, chosen], penalty])
+            solution = np.linalg.lstsq(design, np.concatenate([weight * means[:, p:], penalty @ target]), rcond=None)[0]
+            values[bias], values[matrix] = solution[0], solution[1:].T.ravel()
+        return values
+
+    def first_noise(self, values):
+        """Return the noise before any residual is known."""
+        return {s: self._noise_of(s, values) for s in SENSORS}
+
+    def _noise_of(self, sensor, values):
+        white = white_noise(self.accumulator.rows, sensor)
+        if white is not None:
+            return WindowNoise(*white)
+        variance = np.full(3, 1e-30)
+        for kind, factor in self.within[sensor].items():
+            variance = np.maximum(variance, (self._misfit(sensor, factor, values)**2).sum(axis=0) / self.dof_within[kind])
+        if not self.within[sensor]:
+            variance = np.full(3, self.means[sensor][:, -3:].var() + 1e-12)
+        return WindowNoise(variance, np.ones(3))
+
+    def _misfit(self, sensor, rows, values):
+        """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
+        return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
+
+    def jacobian(self, sensor, values):
+        """Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params)."""
+        step, parts = 1e-30, []
+        own = np.concatenate([np.full(e.size, e.sensor in (sensor, 'reference')) for e in self.model.effects])
+        zero = None
+        for index in range(len(values)):
+            if not own[index]:
+                parts.append(zero)
+                continue
+            moved = values.astype(complex)
+            moved[index] += 1j * step
+            parts.append(coefficients(self.model, sensor, moved).imag / step)
+        shape = next(part.shape for part in parts if part is not None)
+        return np.stack([np.zeros(shape) if part is None else part for part in parts], axis=2)
+
+    def mean_variance(self, noise):
+        """Return the variance of the window means by the noise within, shape (n_windows, 3)."""
+        return noise.white_variance * noise.inflation / self.counts[:, None]
+
+    def systems(self, sensor, noise):
+        """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
+        p = self.means[sensor].shape[1] - 3
+        rows = np.stack([self.means[sensor][:, list(range(p)) + [p + axis]] for axis in range(3)], axis=1)
+        variance = self.mean_variance(noise) + noise.offset_sd**2
+        white, _ = whiten(rows, variance, self.times, self.sessions, noise.wander_sd, noise.wander_time)
+        factors = []
+        for axis in range(3):
+            parts = [white[:, axis]]
+            for kind, factor in self.within[sensor].items():
+                parts.append(factor[:, list(range(p)) + [p + axis]] / noise.within_sd(kind)[axis])
+            factors.append(triangular(np.concatenate(parts)))
+        return factors
+
+    def rows_of(self, values, factors):
+        """Return residual rows and their Jacobian over both sensors and all axes, without the prior."""
+        residuals, jacobians = [], []
+        for sensor in SENSORS:
+            c, dc = coefficients(self.model, sensor, values), self.jacobian(sensor, values)
+            for axis, factor in enumerate(factors[sensor]):
+                residuals.append(factor[:, :-1] @ c[:, axis] - factor[:, -1])
+                jacobians.append(factor[:, :-1] @ dc[:, axis])
+        return np.concatenate(residuals), np.concatenate(jacobians)
+
+    def minimise(self, values, noises, free):
+        """Gauss-Newton with step halving on the triangular factors; the prior is a set of rows."""
+        factors = {s: self.systems(s, noises[s]) for s in SENSORS}
+        cost = np.inf
+        for _ in range(40):
+            residual, jacobian = self._with_prior(values, factors)
+            step = _scaled_lstsq(jacobian[:, free], -residual)
+            moved, cost, residual_new = self._halve(values, step, free, factors, residual @ residual)
+            sd_steps = np.abs(step) * np.linalg.norm(jacobian[:, free], axis=0)
+            values = moved
+            if np.max(sd_steps, initial=0.0) < 1e-7 * max(1.0, np.sqrt(cost)):
+                break
+        return values
+
+    def _halve(self, values, step, free, factors, cost):
+        for shrink in range(12):
+            moved = values.copy()
+            moved[free] += step * 0.5**shrink
+            residual = self._residual_with_prior(moved, factors)
+            if residual @ residual <= cost * (1 + 1e-12) + 1e-12:
+                return moved, residual @ residual, residual
+        return values, cost, None
+
+    def _residual_with_prior(self, values, factors):
+        parts = []
+        for sensor in SENSORS:
+            c = coefficients(self.model, sensor, values)
+            parts += [factor[:, :-1] @ c[:, axis] - factor[:, -1] for axis, factor in enumerate(factors[sensor])]
+        return np.concatenate(parts + [self.prior.root @ (values - self.prior.mean)])
+
+    def _with_prior(self, values, factors):
+        residual, jacobian = self.rows_of(values, factors)
+        return (np.concatenate([residual, self.prior.root @ (values - self.prior.mean)]), np.concatenate([jacobian, self.prior.root]))
+
+    def undetermined(self, values, noises):
+        """Return a mask of the parameters whose standard deviation stays above a share of the prior's."""
+        factors = {s: self.systems(s, noises[s]) for s in SENSORS}
+        _, jacobian = self._with_prior(values, factors)
+        free = _free(self.model, None)
+        sd = np.zeros(len(values))
+        sd[free] = np.sqrt(np.diag(_inverse_gram(jacobian[:, free])))
+        return free & (sd > HELD_SHARE * self.prior.sd)
+
+    def covariance(self, values, noises, held):
+        """Return the covariance with held parameters considered at their prior, and the information of the data."""
+        factors = {s: self.systems(s, noises[s]) for s in SENSORS}
+        _, data = self.rows_of(values, factors)
+        free = _free(self.model, held)
+        jacobian = np.concatenate([data, self.prior.root])
+        gain = _inverse_gram(jacobian[:, free])
+        total = np.zeros((len(values), len(values)))
+        prior_cov = np.diag(np.where(held, self.prior.sd**2, 0.0))
+        sensitivity = -_scaled_lstsq(jacobian[:, free], jacobian[:, held]) if held.any() else np.zeros((free.sum(), 0))
+        inner = prior_cov[np.ix_(held, held)]
+        total[np.ix_(free, free)] = gain + sensitivity @ inner @ sensitivity.T
+        total[np.ix_(free, held)] = sensitivity @ inner
+        total[np.ix_(held, free)] = total[np.ix_(free, held)].T
+        total[np.ix_(held, held)] = inner
+        return total, data.T @ data
+
+    def update_noise(self, values, noises):
+        """Return the noise that the residuals at `values` show."""
+        return {sensor: self._updated(sensor, values, noises) for sensor in SENSORS}
+
+    def _updated(self, sensor, values, noises):
+        noise = noises[sensor]
+        if white_noise(self.accumulator.rows, sensor) is None:
+            noise = self._noise_of(sensor, values)
+        scale = {}
+        for kind, factor in self.within[sensor].items():
+            squares = (self._misfit(sensor, factor, values)**2).sum(axis=0)
+            scale[kind] = np.maximum(squares / (self.dof_within[kind] * noise.white_variance), 1.0)
+        noise = replace(noise, kind_scale=scale)
+        design, information = self._linearised(sensor, values, noise, noises)
+        offsets = estimate_offsets(design, self.mean_variance(noise), self.times, self.sessions, information)
+        return replace(noise, offset_sd=offsets[0], wander_sd=offsets[1], wander_time=offsets[2])
+
+    def _linearised(self, sensor, values, noise, noises):
+        """Return mean rows ``[design | residual]`` in the parameters, and the Gram matrix of what else is known of them."""
+        dc = self.jacobian(sensor, values)
+        own = np.flatnonzero(np.any(dc != 0, axis=(0, 1)))
+        dc, root = dc[:, :, own], self.prior.root[:, own]
+        means = self.means[sensor]
+        misfit = self._misfit(sensor, means, values)
+        design = np.einsum('kp,paq->kaq', means[:, :-3], dc)
+        rows = np.concatenate([design, misfit[:, :, None]], axis=2)
+        used = np.any(root != 0, axis=1)
+        offset = self.prior.root[used] @ (self.prior.mean - values)
+        parts = [np.concatenate([root[used], offset[:, None]], axis=1)]
+        for kind, factor in self.within[sensor].items():
+            sd, rest = noise.within_sd(kind), self._misfit(sensor, factor, values)
+            parts += [np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis:axis + 1]], axis=1) / sd[axis] for axis in range(3)]
+        stacked = np.concatenate(parts)
+        return rows, stacked.T @ stacked
+
+    def fit_quality(self, values, noises):
+        """Return chi-square per degree of freedom by part, and rms residuals (moving samples, window means)."""
+        chi2, rms = {}, {}
+        for sensor in SENSORS:
+            noise, quality, moving, count = noises[sensor], {}, 0.0, 0
+            misfit = self._misfit(sensor, self.means[sensor], values)
+            variance = self.mean_variance(noise) + noise.offset_sd**2
+            white, _ = whiten(misfit[:, :, None], variance, self.times, self.sessions, noise.wander_sd, noise.wander_time)
+            quality['means'] = float((white**2).sum() / max(white.size - self._used(sensor), 1))
+            for kind, factor in self.within[sensor].items():
+                squares = (self._misfit(sensor, factor, values)**2).sum(axis=0)
+                quality[kind] = float(np.mean(squares / (self.dof_within[kind] * noise.white_variance)))
+                moving, count = moving + squares.sum(), count + 3 * self.dof_within[kind]
+            chi2[sensor] = quality
+            rms[sensor] = np.array([np.sqrt(moving / count) if count else np.nan, np.sqrt((misfit**2).mean())])
+        return chi2, rms
+
+    def _used(self, sensor):
+        """Return how many parameters the means determine: those of bias and matrix, at most half the data."""
+        own = sum(e.size for e in self.model.concerning(sensor))
+        return min(own, self.means[sensor].shape[0] * 3 // 2)
+
+
+def _scaled_lstsq(matrix, right):
+    """Return the least-squares solution with columns scaled to unit norm first."""
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
+    diagonal = np.abs(np.diag(r))
+    rank = int((diagonal > 1e-15 * diagonal[0]).sum()) if len(diagonal) else 0
+    solved = np.zeros((matrix.shape[1],) + right.shape[1:])
+    solved[order[:rank]] = scipy.linalg.solve_triangular(r[:rank, :rank], (q.T @ right)[:rank])
+    return (solved.T / scale).T
+
+
+def _inverse_gram(matrix):
+    """Return (matrix' matrix)^-1 through the triangular factor of the scaled columns."""
+    scale = np.linalg.norm(matrix, axis=0)
+    r = scipy.linalg.qr(matrix / scale, mode='r')[0][:matrix.shape[1]]
+    inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
+    return (inverse @ inverse.T) / np.outer(scale, scale)

@@ -1,0 +1,182 @@
+"""Noise of a session: white noise within windows, an offset per window, a bias that wanders from window to window."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize
+
+
+@dataclass(frozen=True, eq=False)
+class WindowNoise:
+    """
+    Noise of one sensor.
+
+    The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the
+    same recording, the covariance ``wander_sd^2 exp(-|t_k - t_l| / wander_time)``.
+    """
+
+    white_variance: np.ndarray
+    """Variance of single samples, shape (3,)."""
+    inflation: np.ndarray
+    """Factor by which the noise at low frequency exceeds white noise of that variance, shape (3,)."""
+    offset_sd: float = 0.0
+    """Standard deviation of an independent offset per window."""
+    wander_sd: float = 0.0
+    """Standard deviation of a first-order Gauss-Markov wander of the bias."""
+    wander_time: float = 100.0
+    """Correlation time of the wander, s."""
+    kind_scale: dict = field(default_factory=dict)
+    """Kind -> factor on the variance of the centred rows, shape (3,): what moving windows scatter beyond the noise at rest."""
+
+    def sample_sd(self):
+        """Return the standard deviation of single samples, shape (3,)."""
+        return np.sqrt(self.white_variance)
+
+    def within_sd(self, kind):
+        """Return the standard deviation per centred row of windows of `kind`, shape (3,)."""
+        return np.sqrt(self.white_variance * self.inflation * self.kind_scale.get(kind, np.ones(3)))
+
+
+def white_noise(rows, sensor):
+    """
+    Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
+
+    Windows whose variance lies far from the median (clipped, knocked) are left out.
+    """
+    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
+    if not static:
+        return None
+    variances = np.array([row.sensors[sensor].noise_variance for row in static])
+    inflations = np.array([row.sensors[sensor].inflation for row in static])
+    counts = np.array([row.count for row in static], float)
+    pooled, factors = np.empty(3), np.empty(3)
+    for axis in range(3):
+        median = np.median(variances[:, axis])
+        near = (variances[:, axis] <= 2 * median) & (variances[:, axis] >= 0.5 * median)
+        weight = counts * near
+        pooled[axis] = np.average(variances[:, axis], weights=weight) if weight.sum() else median
+        weight = (counts >= 32) * near
+        factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
+    floor = 1e-30 + np.finfo(float).eps**2 * np.max(np.abs([row.sensors[sensor].mean[-3:] for row in static]))**2
+    return np.maximum(pooled, floor), np.clip(factors, 0.8, None)
+
+
+def sessions_of(rows):
+    """Return the index arrays of the rows of each recording, in order of time."""
+    numbers = np.array([row.session for row in rows])
+    times = np.array([row.time for row in rows])
+    return [np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')] for number in np.unique(numbers)]
+
+
+def whiten(values, variance, times, sessions, wander_sd, wander_time):
+    """
+    Turn rows with correlated offsets into independent rows of unit variance.
+
+    Innovations of a scalar Kalman filter, row after row: the same as multiplying with the inverse Cholesky factor of
+    ``diag(variance) + wander_sd^2 exp(-|dt| / wander_time)``, in linear time.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, n_axes, q)
+        Rows for each axis.
+    variance : ndarray, shape (n, n_axes)
+        Independent part of the variance.
+
+    Returns
+    -------
+    ndarray, ndarray
+        Whitened rows, and the log of the innovation variances, shape (n, n_axes).
+
+    """
+    if wander_sd == 0:
+        return values / np.sqrt(variance)[:, :, None], np.log(variance)
+    white, logs = np.empty_like(values), np.empty_like(variance)
+    for index in sessions:
+        state, spread = np.zeros(values.shape[1:]), np.full(variance.shape[1], wander_sd**2)
+        steps = np.exp(-np.diff(times[index], prepend=times[index[0]]) / wander_time)
+        for k, decay in zip(index, steps):
+            state = decay * state
+            spread = decay**2 * spread + (1 - decay**2) * wander_sd**2
+            total = spread + variance[k]
+            innovation = values[k] - state
+            gain = spread / total
+            white[k] = innovation / np.sqrt(total)[:, None]
+            logs[k] = np.log(total)
+            state = state + gain[:, None] * innovation
+            spread = spread * (1 - gain)
+    return white, logs
+
+
+def restricted_likelihood(rows, variance, times, sessions, wander, information):
+    """
+    Return minus twice the restricted log likelihood of mean rows ``[design | residual]``, shape (n, 3, q + 1).
+
+    Parameters
+    ----------
+    information : ndarray, shape (q + 1, q + 1)
+        Gram matrix ``[J r]' [J r]`` of everything else that is known about the q parameters.
+
+    """
+    white, logs = whiten(rows, variance, times, sessions, *wander)
+    flat = white.reshape(-1, rows.shape[2])
+    gram = flat.T @ flat + information
+    scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-300))
+    factor = np.linalg.cholesky(gram[:-1, :-1] / np.outer(scale, scale) + 1e-13 * np.eye(len(scale)))
+    solved = np.linalg.solve(factor, gram[:-1, -1] / scale)
+    return logs.sum() + 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() + gram[-1, -1] - solved @ solved
+
+
+WANDER_GAIN = 9.2
+"""Fall of minus twice the log likelihood that a wander must win over independent offsets: chi-square, two degrees of freedom, 1 %."""
+OFFSET_GAIN = 2.7
+"""The same for an offset against none: chi-square with half a degree of freedom on the boundary, 5 %."""
+
+
+def estimate_offsets(rows, white, times, sessions, information):
+    """
+    Return (offset_sd, wander_sd, wander_time) by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, 3, q + 1)
+        Mean rows ``[design | residual]`` of the linearised model, one layer per axis.
+    white : ndarray, shape (n, 3)
+        Variance of the means by the noise within windows.
+
+    """
+    typical = float(np.sqrt(np.median(white)))
+
+    def cost(offset, wander, time):
+        return restricted_likelihood(rows, white + offset**2, times, sessions, (wander, time), information)
+
+    ratios = np.array([0.0, 0.3, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
+    costs = [cost(ratio * typical, 0.0, 100.0) for ratio in ratios]
+    offset = _refine(lambda x: cost(np.exp(x[0]), 0.0, 100.0), [ratios[int(np.argmin(costs))] * typical], typical, min(costs), costs[0])
+    alone = cost(offset[0], 0.0, 100.0)
+    if len(rows) < 12:
+        return offset[0], 0.0, 100.0
+    best = (alone, (offset[0], 0.0, 100.0))
+    for time in (40.0, 120.0, 400.0):
+        for ratio in (1.0, 3.0, 10.0, 30.0):
+            for share in (0.0, 0.3):
+                trial = (share * ratio * typical, ratio * typical, time)
+                value = cost(*trial)
+                if value < best[0]:
+                    best = (value, trial)
+    if best[0] == alone:
+        return offset[0], 0.0, 100.0
+    start = [max(best[1][0], 0.1 * typical), best[1][1], best[1][2]]
+    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), float(np.exp(np.clip(x[2], 1.6, 8.0)))), np.log(start), method='Nelder-Mead',
+                     options={'maxfev': 120, 'xatol': 0.02, 'fatol': 0.02})
+    if alone - min(found.fun, best[0]) < WANDER_GAIN:
+        return offset[0], 0.0, 100.0
+    offset_sd, wander_sd, wander_time = np.exp(found.x)
+    return float(offset_sd), float(wander_sd), float(np.exp(np.clip(found.x[2], 1.6, 8.0)))
+
+
+def _refine(cost, start, typical, best, at_zero):
+    """Return the offset sd near a grid point, zero when zero is as good."""
+    if start[0] == 0:
+        return [0.0]
+    found = minimize(cost, np.log(start), method='Nelder-Mead', options={'maxfev': 40, 'xatol': 0.02, 'fatol': 0.01})
+    return [float(np.exp(found.x[0]))] if found.fun < at_zero - OFFSET_GAIN else [0.0]

@@ -1,0 +1,124 @@
+"""One window of data, reduced to what least squares needs of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.sensor_model import columns
+
+BLOCK = 2000
+"""Rows per orthogonal factorisation: tall blocks cost more than stacked small ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorStatistics:
+    """
+    The rows ``[columns | output]`` of one sensor in one window, split in mean and rest.
+
+    The mean row carries a random offset of the window (bias wander) beside the averaged noise; the centred rows do not.
+    Weighted apart, the two are an exact summary for the model ``output = columns @ coefficients + window offset + noise``.
+    """
+
+    mean: np.ndarray
+    """Mean of the rows, shape (n_columns + 3,)."""
+    within: np.ndarray
+    """Triangular factor of the centred rows, shape (k, n_columns + 3); no rows for a static window."""
+    noise_variance: np.ndarray
+    """Variance of the output about its mean (static windows; else NaN), shape (3,)."""
+    inflation: np.ndarray
+    """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
+
+
+@dataclass(frozen=True, eq=False)
+class WindowStatistics:
+    """Reduced window for both sensors."""
+
+    kind: str
+    """'static', 'spin' or 'dynamic'."""
+    time: float
+    """Middle of the window, s."""
+    duration: float
+    """Length, s."""
+    count: int
+    """Number of samples."""
+    sensors: dict
+    """Sensor name -> SensorStatistics."""
+    session: int = 0
+    """Recording that the window comes from."""
+
+
+def reduce_window(window, model, table, session=0, column_function=columns):
+    """
+    Reduce one window to its statistics.
+
+    Parameters
+    ----------
+    window : Window
+        Measured samples with the joints' motion.
+    model : SensorModel
+        Defines the columns.
+    table : Table
+        Reference kinematics.
+    column_function : callable
+        Same signature as `sensor_model.columns`.
+
+    """
+    static = window.kind == 'static'
+    temperature = window.temperature_c
+    if static and temperature is not None:
+        temperature = np.array([temperature.mean()])
+    outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
+    reduce = _reduce_static if static else _reduce_moving
+    sensors = {sensor: reduce(column_function(model, sensor, table, window.motion, temperature), outputs[sensor]) for sensor in SENSORS}
+    return WindowStatistics(window.kind, float(window.time.mean()), float(window.time[-1] - window.time[0]), len(window.time), sensors, session)
+
+
+def _reduce_static(design, output):
+    mean = np.concatenate([design.mean(axis=0), output.mean(axis=0)])
+    variance, inflation = batch_statistics(output)
+    return SensorStatistics(mean, np.zeros((0, len(mean))), variance, inflation)
+
+
+def _reduce_moving(design, output):
+    rows = np.concatenate([design, output], axis=1)
+    mean = rows.mean(axis=0)
+    unknown = np.full(3, np.nan)
+    return SensorStatistics(mean, triangular(rows - mean), unknown, unknown)
+
+
+def batch_statistics(output, batches=16):
+    """
+    Return the variance of each column and the factor by which means of it scatter more than white noise.
+
+    The factor is the variance of the means of `batches` equal pieces, times their length, over the sample variance:
+    a sensor's low-pass filter makes it larger than one. Pieces rather than the whole keep slow wander out.
+    """
+    variance = output.var(axis=0, ddof=1)
+    length = len(output) // batches
+    if length < 2:
+        return variance, np.ones(output.shape[1])
+    means = output[:length * batches].reshape(batches, length, -1).mean(axis=1)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        factor = np.diff(means, axis=0).var(axis=0, ddof=0) / 2 * length / variance
+    return variance, np.where(np.isfinite(factor), factor, 1.0)
+
+
+def triangular(rows):
+    """Return the triangular factor of `rows` by Householder reflections, block after block, with as many rows as it has rank bound."""
+    width = rows.shape[1]
+    factor = np.zeros((0, width))
+    for start in range(0, len(rows), BLOCK):
+        stacked = np.asfortranarray(np.concatenate([factor, rows[start:start + BLOCK]]))
+        factor = _r_factor(stacked)
+    return factor
+
+
+def _r_factor(stacked):
+    if not len(stacked):
+        return stacked
+    raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
+    if info != 0 or not np.all(np.isfinite(raw[:, 0])):
+        raise FloatingPointError('orthogonal factorisation met values that are not finite')
+    return np.triu(raw[:min(raw.shape)])
