@@ -1,0 +1,170 @@
+"""Compensation: the calibration inverted, with the lever-arm correction from the measured rate."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.effects import SENSORS
+from imu_calibration.errors import InputError
+from imu_calibration.reference import Reference, lever_matrix
+from imu_calibration.sensor_model import sensor_output
+
+ITERATIONS = 12
+"""Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """Samples after compensation, in the sensor frame and at the gauge's origin, or in the target frame and point."""
+
+    force: np.ndarray
+    """Specific force, m/s^2, shape (n, 3)."""
+    rate: np.ndarray
+    """Angular rate, rad/s, shape (n, 3)."""
+    flagged: np.ndarray
+    """True where the input was saturated and the output cannot be trusted, shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Another point and frame of the same rigid body."""
+
+    frame_id: str
+    """Name of the target frame."""
+    mat_ts: np.ndarray
+    """Turns sensor vectors into target vectors, shape (3, 3)."""
+    arm_t: np.ndarray
+    """From the target's origin to the sensor, in the target frame, m, shape (3,)."""
+
+
+def invertible(model):
+    """Return the model with only those effects that compensation inverts."""
+    keep = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact') for sensor in SENSORS}
+    return replace(model, reference=(), **keep)
+
+
+def invertible_values(calibration):
+    """Return (model, values) of the part of a calibration that compensation inverts."""
+    model = invertible(calibration.model)
+    values = np.concatenate([calibration.values[calibration.model.slices[e.sensor, e.name]] for e in model.effects])
+    return model, values
+
+
+def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transfer=None):
+    """
+    Return corrected samples.
+
+    Solves ``measured = output(true)`` for both sensors together by fixed-point steps
+    ``x <- x + matrix^-1 (measured - output(x))``: gyroscope and accelerometer depend on one another through g-sensitivity
+    and lever arms.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What to undo; effects of the table and of the session are left alone.
+    force_s, rate_s : ndarray, shape (n, 3)
+        Measured specific force (m/s^2) and rate (rad/s) in the sensor frame.
+    alpha_s : ndarray, shape (n, 3)
+        Angular acceleration in the sensor frame, rad/s^2 (see `differentiation`).
+    temperature_c : ndarray, shape (n,), optional
+        Needed when the calibration has thermal effects.
+    transfer : Transfer, optional
+        Point and frame to move to: ``f_target = f_s - (alpha x r + omega x (omega x r))``.
+
+    """
+    model, values = invertible_values(calibration)
+    if temperature_c is None and needs_temperature(model):
+        raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
+    true_force, true_rate = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
+    flagged = saturated(calibration, force_s, rate_s)
+    if transfer is None:
+        return Corrected(true_force, true_rate, flagged)
+    return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged)
+
+
+def needs_temperature(model):
+    """Return whether an effect of the model depends on temperature."""
+    return any('temperature' in effect.needs for effect in model.effects)
+
+
+def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
+    inverse = {s: np.linalg.inv(values[model.slices[s, 'matrix']].reshape(3, 3)) for s in SENSORS}
+    bias = {s: values[model.slices[s, 'bias']] for s in SENSORS}
+    measured = {'accelerometer': force_s, 'gyroscope': rate_s}
+    true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
+    attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
+    for _ in range(ITERATIONS):
+        change = 0.0
+        for sensor in ('gyroscope', 'accelerometer'):
+            ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, temperature_c)
+            step = (measured[sensor] - sensor_output(model, sensor, values, ref)) @ inverse[sensor].T
+            true[sensor] = true[sensor] + step
+            change = max(change, float(np.max(np.abs(step), initial=0.0)))
+        if change < 1e-14:
+            break
+    return true['accelerometer'], true['gyroscope']
+
+
+def moved(transfer, force_s, rate_s, alpha_s):
+    """Return (force, rate) at the target point in the target frame."""
+    force, rate, alpha = (vector @ transfer.mat_ts.T for vector in (force_s, rate_s, alpha_s))
+    return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
+
+
+def saturated(calibration, force_s, rate_s):
+    """Return a mask of samples at or beyond a saturation level of the calibration."""
+    mask = np.zeros(len(force_s), bool)
+    for sensor, name, measured in (('accelerometer', 'accel_saturation', force_s), ('gyroscope', 'gyro_saturation', rate_s)):
+        if calibration.has(sensor, name):
+            mask |= np.any(np.abs(measured) >= float(calibration.value(sensor, name)) * (1 - 1e-6), axis=1)
+    return mask
+
+
+def arms_of(calibration):
+    """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
+    return calibration.value('accelerometer', 'accel_size_effect') if calibration.has('accelerometer', 'accel_size_effect') else np.zeros((3, 3))
+
+
+def output_covariance(calibration, sensor, measured_cov=None):
+    """
+    Return the covariance of the corrected output of one sample from the sensor's noise, shape (3, 3).
+
+    ``matrix^-1 N matrix^-T`` with N the message's covariance or, when that is unknown, the calibration's noise.
+    """
+    inverse = np.linalg.inv(calibration.value(sensor, 'matrix'))
+    if measured_cov is None:
+        measured_cov = np.diag(calibration.noise(sensor)[0]**2)
+    return inverse @ measured_cov @ inverse.T
+
+
+def parameter_covariance(calibration, sensor, force, rate, alpha):
+    """
+    Return what the uncertainty of bias, matrix and arms adds to the covariance of one corrected sample, shape (3, 3).
+
+    ``J P J'`` with J the derivative of the output with respect to the parameters, through the inverse matrix.
+    """
+    model, values = invertible_values(calibration)
+    keep = np.concatenate([np.arange(len(calibration.values))[calibration.model.slices[e.sensor, e.name]] for e in model.effects])
+    covariance = calibration.covariance[np.ix_(keep, keep)]
+    ref = Reference(np.zeros(1), np.eye(3)[None], np.atleast_2d(force), np.atleast_2d(rate), np.atleast_2d(alpha), 0.0,
+                    np.full(1, model.temperature_ref_c))
+    jacobian = np.stack([sensor_output(model, sensor, values + 1e-30j * unit, ref)[0].imag / 1e-30 for unit in np.eye(len(values))], axis=1)
+    jacobian = np.linalg.inv(calibration.value(sensor, 'matrix')) @ jacobian
+    return jacobian @ covariance @ jacobian.T
+
+
+def outside_conditions(calibration, rate_s, temperature_c=None):
+    """Return lines that say where samples leave the range of the calibration (rate, temperature)."""
+    lines = []
+    largest = calibration.conditions.get('largest_rate')
+    fastest = float(np.max(np.linalg.norm(rate_s, axis=1), initial=0.0))
+    if largest is not None and fastest > 1.1 * largest + 0.1:
+        lines.append(f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use')
+    limits = calibration.conditions.get('temperature_range_c')
+    if limits and temperature_c is not None and len(temperature_c):
+        low, high = float(np.min(temperature_c)), float(np.max(temperature_c))
+        if low < limits[0] - 5 or high > limits[1] + 5:
+            lines.append(f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; calibrate there')
+    return lines
+
+
