@@ -52,6 +52,8 @@ class WindowSettings:
 
     static_rate: float = setting(0.002, 'rad/s', 'joints slower than this, and the IMU quiet, count as at rest', (0.0, 1.0),
                                  'too small: no static windows; too large: slow creep enters the means')
+    quiet_ratio: float = setting(3.0, '1', 'at rest the IMU may scatter by this factor more than where it is quietest', (1.2, 100.0),
+                                 'too small: no static windows; too large: knocks and vibration enter the means')
     settling: float = setting(0.5, 's', 'kept out after a joint stops and after a ramp ends', (0.0, 60.0),
                               'too small: ringing of the table shows as between-window variance')
     turn_on: float = setting(0.0, 's', 'kept out at the start of a recording', (0.0, 3600.0),
@@ -73,8 +75,8 @@ class WindowSettings:
 class JointSettings:
     """How the joints' motion is drawn from their readings."""
 
-    dof_weight: float = setting(1.2, '1', 'weight of the degrees of freedom when the smoothing is chosen', (1.0, 3.0),
-                                'too small: rough accelerations; too large: sharp ramps are rounded')
+    robustness: float = setting(0.7, '1', 'guard against rough fits when the smoothing is chosen; 1 is plain cross-validation', (0.05, 1.0),
+                                'too large: rough accelerations now and then; too small: sharp ramps are rounded')
     velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
                                     'too large: filtered velocities bend the reference')
     velocity_lag: float = setting(2e-4, 's', 'joint velocities are used when their lag behind the positions stays below this', (0.0, 0.1),
