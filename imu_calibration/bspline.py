@@ -1,7 +1,7 @@
 """Quintic splines on uniform knots: rows of the design, normal equations with a third-difference penalty, values."""
 
 from dataclasses import dataclass
-from math import comb
+from math import comb, factorial
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -97,22 +97,22 @@ def piece_coefficients(coefficients):
 
 def evaluate_pieces(knots, pieces, time, derivatives):
     """Return the values and the first `derivatives` derivatives at `time`, shape (derivatives + 1, n, n_joints)."""
-    result = np.empty((derivatives + 1, len(time), pieces.shape[2]))
+    n_joints = pieces.shape[2]
+    result = np.zeros((derivatives + 1, len(time), n_joints))
     for start in range(0, len(time), _BLOCK):
         part = slice(start, start + _BLOCK)
         interval, place = knots.locate(time[part])
-        powers = [piece.take(interval, axis=0) for piece in pieces]
-        _horner(powers, place[:, None], result[:, part])
+        _horner(pieces, interval, np.repeat(place, n_joints).reshape(-1, n_joints), result[:, part])
     for order in range(1, derivatives + 1):
-        result[order] *= 1.0 / knots.step ** order
+        result[order] *= factorial(order) / knots.step ** order
     return result
 
 
-def _horner(powers, place, out):
-    """Write value and derivatives with respect to `place` of the polynomials with coefficients `powers`."""
-    for order, target in enumerate(out):
-        factors = [float(np.prod(range(power - order + 1, power + 1))) for power in range(ORDER)]
-        np.multiply(powers[-1], factors[-1], out=target)
-        for power in range(ORDER - 2, order - 1, -1):
-            target *= place
-            target += powers[power] if factors[power] == 1.0 else factors[power] * powers[power]
+def _horner(pieces, interval, place, taylor):
+    """Fill `taylor`, zeros, with the Taylor coefficients of the polynomials at `place` (repeated synthetic division)."""
+    for power in range(DEGREE, -1, -1):
+        for order in range(min(DEGREE - power, len(taylor) - 1), 0, -1):
+            taylor[order] *= place
+            taylor[order] += taylor[order - 1]
+        taylor[0] *= place
+        taylor[0] += pieces[power].take(interval, axis=0)

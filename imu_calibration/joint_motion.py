@@ -149,7 +149,7 @@ def _fit(knots, time, position, velocity, noise_sd, settings):
         noise[joint] = max(noise[joint], resolution, encoder_step(position[:, joint]) / np.sqrt(12))
     interval, values = design_values(knots, time)
     spline = PenalisedSpline(knots, design_matrix(knots, interval, values), normal_bands(knots, interval, values))
-    for joint, fit in zip(moving, smooth(spline, rest, noise[moving], settings.dof_weight), strict=True):
+    for joint, fit in zip(moving, smooth(spline, rest, noise[moving], settings.robustness), strict=True):
         coefficients[:, joint], noise[joint] = fit.coefficients, max(noise[joint], fit.noise_sd)
         bandwidth[joint] = _bandwidth(fit.penalty / spline.density, knots.step)
     return centre, trend, coefficients, bandwidth, noise, trusted
@@ -163,9 +163,10 @@ def _bandwidth(ratio, step):
 def _parabola(time, position):
     """Return the coefficients of a least-squares parabola (or less, for few readings), shape (3, n_joints)."""
     degree = min(2, len(np.unique(time)) - 1)
-    scale = max(np.abs(time).max(), 1e-9)
+    scale = max(np.abs(time).max(), 1e-9) ** np.arange(degree + 1)
+    powers = np.vander(time, degree + 1, increasing=True) / scale
     trend = np.zeros((3, position.shape[1]))
-    trend[:degree + 1] = np.polynomial.polynomial.polyfit(time / scale, position, degree) / scale ** np.arange(degree + 1)[:, None]
+    trend[:degree + 1] = np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
     return trend
 
 

@@ -1,14 +1,19 @@
 """How much to smooth: noise and resolution of encoders, and the penalty that suits the data."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.signal.windows import tukey
 
 from imu_calibration.bspline import ORDER, penalty_bands
 
-# Decades of the penalty relative to the samples per knot: from interpolation to a bandwidth of 1/128 of Nyquist's.
-_COARSE = np.arange(-6.0, 10.1, 2.0)
+# Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100 of Nyquist's.
+_COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
+_PILOT = -2.0  # rough, but tame where readings lie close together
+_TAPER = 0.2  # share of a record in which the weight of the ends rises
+_LONG = 1000  # rows from which on the residuals are taken from the spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,40 +34,49 @@ class PenalisedSpline:
     """
     Least squares on rows ``design @ coefficients = values`` with the penalty ``lambda |third differences|^2``.
 
-    Eilers and Marx 1996. The degrees of freedom come from the mean bands of the normal matrix, as for a long uniform
-    record: ``3 + (n - 3) mean_theta N / (N + lambda (2 - 2 cos theta)^3)``.
+    Eilers and Marx 1996. Degrees of freedom come from the mean bands of the normal matrix, as for a long uniform
+    record: the gain of the fit at the frequency theta is ``N / (N + lambda p)`` with ``p = (2 - 2 cos theta)^3``.
     """
 
     def __init__(self, knots, design, bands):
         self.design, self.bands, self.penalty = design, bands, penalty_bands(knots)
-        self.n_rows = design.shape[0]
-        self.density = self.n_rows / knots.n_coefficients
-        theta = (np.arange(256) + 0.5) * np.pi / 256
-        weights = np.where(np.arange(ORDER) == 0, 1.0, 2.0)
-        self._symbol = np.maximum(np.cos(theta[:, None] * np.arange(ORDER)) @ (weights * bands.sum(axis=1)) / knots.n_coefficients, 0)
-        self._penalty_symbol = (2 - 2 * np.cos(theta)) ** 3
+        self.n_rows, self.n_coefficients = design.shape
+        # Splines are worst at the ends, which callers keep out: the ends have no say in the noise or the penalty.
+        self._interior = tukey(self.n_rows, _TAPER) ** 2 / np.sum(tukey(self.n_rows, _TAPER) ** 2)
+        self.density = self.n_rows / self.n_coefficients
+        self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
+        self.gains = lru_cache(None)(self._gains)
+        self._symbols = self.symbols((np.arange(256) + 0.5) * np.pi / 256)
+
+    def symbols(self, theta):
+        """Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot."""
+        normal = np.cos(theta[:, None] * np.arange(ORDER)) @ self._mean_bands
+        return np.maximum(normal, 1e-6 * self.density), (2 - 2 * np.cos(theta)) ** 3
 
     def solve(self, values, penalty):
         """Return the coefficients for columns of `values`."""
         return solveh_banded(self.bands + penalty * self.penalty, self.design.T @ values, lower=True, overwrite_ab=True,
                              overwrite_b=True, check_finite=False)
 
-    def residual_share(self, penalty):
-        """Return the share of the rows that is left to the residuals, ``1 - dof / n``."""
-        damped = penalty * self._penalty_symbol
-        return (1 - 3 / self.n_rows) * np.mean(damped / (self._symbol + damped))
+    def fit(self, values, penalty):
+        """Return the coefficients for columns of `values`, and the mean squared residuals away from the ends."""
+        coefficients = self.solve(values, penalty)
+        residual = values - self.design @ coefficients
+        return coefficients, np.einsum('i,ij,ij->j', self._interior, residual, residual)
 
-    def residual_squares(self, values, penalty):
-        """Return the mean squared residual of each column."""
-        residual = values - self.design @ self.solve(values, penalty)
-        return np.einsum('ij,ij->j', residual, residual) / self.n_rows
+    def _gains(self, penalty):
+        """Return the mean gain of the fit over all frequencies (degrees of freedom per row), and of its square."""
+        normal, damping = self._symbols
+        gain = normal / (normal + penalty * damping)
+        least = 3 / self.n_rows
+        return least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
 
 
-def smooth(spline, values, noise_floor, dof_weight):
+def smooth(spline, values, noise_floor, robustness):
     """
     Return a `Smooth` per column of `values`, with the penalty that predicts best.
 
-    The larger one of two penalties: that of generalised cross-validation (Craven and Wahba 1979), which needs no
+    The larger one of two penalties: that of robust generalised cross-validation (Lukas 2006), which needs no
     noise, and that of Mallows' Cp for `noise_floor`, which holds where the noise is not white (coarse encoders).
 
     Parameters
@@ -73,42 +87,82 @@ def smooth(spline, values, noise_floor, dof_weight):
         Right-hand sides.
     noise_floor : array, shape (n_joints,)
         Standard deviation that the noise has at least.
-    dof_weight : float
-        Weight of the degrees of freedom; above one it guards against fits that are too rough.
+    robustness : float
+        Parameter gamma of the robust criterion: one for plain cross-validation, less for smoother fits.
 
     """
-    squares = {x: spline.residual_squares(values, _penalty(spline, x)) for x in _COARSE}
-    results = []
-    for column, floor in enumerate(noise_floor):
-        known = {x: square[column] for x, square in squares.items()}
+    squares = (_squares_by_spectrum if spline.n_rows >= _LONG else _squares_by_fits)(spline, values)
+    decades = [_best_decade((lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c], robustness),
+                             lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f, robustness)))
+               for column, floor in enumerate(noise_floor)]
+    results = {}
+    for decade in set(decades):
+        columns = np.flatnonzero(np.array(decades) == decade)
+        penalty = _penalty(spline, decade)
+        coefficients, residual = spline.fit(values[:, columns], penalty)
+        gain, _ = spline.gains(penalty)
+        noise = np.sqrt(residual / (1 - gain))
+        for place, column in enumerate(columns):
+            results[column] = Smooth(coefficients[:, place], penalty, gain * spline.n_rows, float(noise[place]))
+    return [results[column] for column in range(len(decades))]
 
-        def score(x, column=column, known=known, floor=floor):
-            if x not in known:
-                known[x] = spline.residual_squares(values[:, column:column + 1], _penalty(spline, x))[0]
-            share = spline.residual_share(_penalty(spline, x))
-            gcv = known[x] / max(1 - dof_weight * (1 - share), 1e-12) ** 2 if dof_weight * (1 - share) < 1 else np.inf
-            return gcv, known[x] + 2 * dof_weight * floor ** 2 * (1 - share)
 
-        x = max(_minimum(lambda x: score(x)[0]), _minimum(lambda x: score(x)[1]))
-        penalty = _penalty(spline, x)
-        coefficients = spline.solve(values[:, column:column + 1], penalty)
-        residual = values[:, column] - spline.design @ coefficients[:, 0]
-        share = spline.residual_share(penalty)
-        noise = np.sqrt(np.mean(residual ** 2) / share) if share > 0 else 0.0
-        results.append(Smooth(coefficients[:, 0], penalty, (1 - share) * spline.n_rows, float(noise)))
-    return results
+def _squares_by_fits(spline, values):
+    return lru_cache(None)(lambda decade: spline.fit(values, _penalty(spline, decade))[1])
+
+
+def _squares_by_spectrum(spline, values):
+    """
+    Return the function decade -> mean squared residuals, from one rough fit.
+
+    With d the third differences of the unpenalised coefficients, the residuals have the power
+    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; what no spline of these knots can follow comes on top.
+    """
+    pilot = _penalty(spline, _PILOT)
+    coefficients, floor = spline.fit(values, pilot)
+    taper = tukey(len(coefficients) - 3, _TAPER)[:, None]
+    power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(taper ** 2)
+    theta = np.arange(len(power)) * 2 * np.pi / len(taper)
+    normal, damping = spline.symbols(theta)
+    # Third differences of the rough fit lack what its own penalty took.
+    power *= ((1 + pilot * damping / normal) ** 2 * normal * damping)[:, None]
+    power[1:] *= 2.0 if len(taper) % 2 else np.where(np.arange(1, len(power)) == len(power) - 1, 1.0, 2.0)[:, None]
+    power /= len(taper) * spline.density
+
+    @lru_cache(None)
+    def squares(decade):
+        penalty = _penalty(spline, decade)
+        return (penalty / (normal + penalty * damping)) ** 2 @ power
+
+    beyond = np.maximum(floor - squares(_PILOT), 0.0)
+    return lambda decade: squares(decade) + beyond
 
 
 def _penalty(spline, decade):
     return spline.density * 10.0 ** decade
 
 
-def _minimum(score):
-    """Return the decade of the smallest score: coarse steps, then one decade, then half a one."""
-    best = min(_COARSE, key=score)
+def _cross_validation(spline, decade, squares, robustness):
+    gain, square = spline.gains(_penalty(spline, decade))
+    return squares / (1 - gain) ** 2 * (robustness + (1 - robustness) * square)
+
+
+def _mallows(spline, decade, squares, noise_sd, robustness):
+    gain, _ = spline.gains(_penalty(spline, decade))
+    # The guard of the robust criterion, to first order in the gain.
+    return squares + (1 + 1 / robustness) * noise_sd ** 2 * gain
+
+
+def _best_decade(scores):
+    """Return the largest of the scores' minima: in coarse steps, then one decade, then half a one."""
+    coarse = [min(_COARSE, key=score) for score in scores]
+    return max(_refine(score, start) for score, start in zip(scores, coarse, strict=True) if start == max(coarse))
+
+
+def _refine(score, decade):
     for step in (1.0, 0.5):
-        best = min((best - step, best, best + step), key=score)
-    return best
+        decade = min((decade, decade - step, decade + step), key=score)
+    return decade
 
 
 def encoder_step(position):
