@@ -48,7 +48,10 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     python_requires='>=3.11',
-    install_requires=['numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11'],
+    install_requires=[
+        'numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11',
+        'lz4', 'backports.zstd; python_version < "3.14"',
+    ],
     zip_safe=False,
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={
