@@ -11,6 +11,7 @@ from msg_adapters.definitions import is_standard, standard_typestore, typestore_
 from msg_adapters.general_file import GeneralFile
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
@@ -183,9 +184,10 @@ def _open_source(path):
         raise InputError(f'a recording must be a rosbag2 folder, a .db3, .mcap or .bag file, got {path}, which does not exist; '
                          'check the path')
     try:
-        return GeneralFile(path)
-    except Exception as error:   # rosbags and its storages raise many kinds
-        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file): {error}') from error
+        return GeneralFile(path) if path.suffix == '.bag' else Rosbag2(path)
+    except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
+        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file), got: {error}; '
+                         'check the path, or record again') from error
 
 
 def _choose(path, topics, message_type, asked, required):

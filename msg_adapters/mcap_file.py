@@ -1,0 +1,247 @@
+"""rosbag2 mcap storage, read from front to back; the summary is used for topics and counts, and to go on behind damage."""
+
+import os
+import struct
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from msg_adapters.compressed import decompress_chunk
+from msg_adapters.layout import Packed
+from msg_adapters.mcap_records import (CHANNEL, CHUNK, CHUNK_INDEX, DATA_END, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, PREFIX, SCHEMA, STATISTICS,
+                                       McapDamage, indexed_messages, is_record, parse_channel, parse_message_index, parse_schema,
+                                       parse_statistics, unpack_chunk, walk)
+from msg_adapters.read_ahead import read_ahead
+
+STRETCH_BYTES = 8 << 20
+"""Chunks are joined to about this size before they are decoded."""
+FOOTER_SIZE = PREFIX.size + 20
+
+
+class McapFile:
+    """
+    One .mcap file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unpack : callable, optional
+        Bytes -> bytes for each message (compression by message).
+
+    """
+
+    def __init__(self, path, unpack=None):
+        self.path, self.unpack = Path(path), unpack
+        self.file = open(path, 'rb', buffering=0)
+        self.size = os.fstat(self.file.fileno()).st_size
+        self.schemas, self.channels, self.lost = {}, {}, {}
+        self.chunk_starts, self.statistics, self.complete = [], None, False
+        try:
+            if self._read(0, len(MAGIC)) != MAGIC:
+                raise ValueError('the file does not begin as an MCAP file')
+            self._read_summary()
+            if self.statistics is None or not self.channels:
+                self.statistics = self._scan()
+        except BaseException:
+            self.file.close()
+            raise
+
+    @property
+    def types(self):
+        """Topic -> message type; other serializations than CDR are named behind the type."""
+        types = {}
+        for channel in self.channels.values():
+            name = self.schemas[channel.schema_id].name if channel.schema_id in self.schemas else 'unknown'
+            types[channel.topic] = name if channel.encoding == 'cdr' else f'{name} ({channel.encoding})'
+        return types
+
+    @property
+    def definitions(self):
+        """Message type -> (language, text)."""
+        return {schema.name: (schema.encoding, schema.text) for schema in self.schemas.values()}
+
+    def count(self):
+        """Return topic -> messages."""
+        counts = Counter({channel.topic: 0 for channel in self.channels.values()})
+        for number, count in self.statistics[2].items():
+            if number in self.channels:
+                counts[self.channels[number].topic] += count
+        return dict(counts)
+
+    def time_range(self):
+        """Return (first, last) receive time in ns, or None when the file does not say."""
+        first, last, counts = self.statistics
+        return (first, last) if any(counts.values()) and last else None
+
+    def stretches(self, topics):
+        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
+        for buffer, messages in read_ahead(self._joined_pieces()):
+            stretch = {}
+            for topic in topics:
+                numbers = [number for number, channel in self.channels.items() if channel.topic == topic]
+                mine = np.flatnonzero(np.isin(messages.channel, numbers))
+                if len(mine):
+                    packed = Packed(buffer, messages.start[mine], messages.size[mine])
+                    stretch[topic] = packed if self.unpack is None else Packed.join(
+                        [self.unpack(packed.message(k)) for k in range(len(packed))])
+            if stretch:
+                yield stretch
+
+    def close(self):
+        """Close the file."""
+        self.file.close()
+
+    def _joined_pieces(self):
+        """Join pieces to stretches."""
+        waiting, n_waiting = [], 0
+        for piece in self._pieces():
+            waiting.append(piece)
+            n_waiting += len(piece[0])
+            if n_waiting >= STRETCH_BYTES:
+                yield _join(waiting)
+                waiting, n_waiting = [], 0
+        if waiting:
+            yield _join(waiting)
+
+    def _pieces(self):
+        """Yield (buffer, Messages) for each chunk and each run of messages outside of chunks."""
+        for opcode, position, length, walked in self._records():
+            if opcode == CHUNK:
+                yield from self._chunk(position, length)
+            elif opcode == MESSAGE:
+                self._register(walked[2])
+                yield walked[:2]
+            elif opcode in (SCHEMA, CHANNEL):
+                self._register([(opcode, self._read(position, length))])
+
+    def _chunk(self, position, length):
+        content = memoryview(self._read(position, length))
+        indexes = [parse_message_index(self._read(at, size)) for at, size in self._indexes_behind(position + length)]
+        try:
+            records, whole = unpack_chunk(content, decompress_chunk)
+        except McapDamage as damage:
+            self._lose(f'messages in {damage}', max(sum(len(offsets) for _, offsets in indexes), 1))
+            return
+        buffer = np.frombuffer(records, np.uint8)
+        messages = indexed_messages(buffer, indexes) if whole else None
+        if messages is None:
+            messages, others, end = walk(buffer)
+            self._register(others)
+            if not whole or end < len(buffer):
+                self._lose('chunks that end early', 1)
+        yield buffer, messages
+
+    def _records(self):
+        """
+        Yield (opcode, position, length, None) of the records of the data section; a chunk that is cut off comes with what is left.
+
+        Messages outside of chunks come many at once, with (buffer, Messages, other records) in place of None.
+        """
+        position = len(MAGIC)
+        while position is not None:
+            prefix = self._read(position, PREFIX.size)
+            opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
+            behind = position + PREFIX.size + length
+            if opcode in (DATA_END, FOOTER):
+                return
+            if not is_record(opcode) or behind > self.size:
+                if opcode == CHUNK:
+                    yield CHUNK, position + PREFIX.size, self.size - position - PREFIX.size, None
+                position = self._resume(position)
+            elif opcode == MESSAGE:
+                buffer = np.frombuffer(self._read(position, max(STRETCH_BYTES, behind - position)), np.uint8)
+                messages, others, end = walk(buffer)
+                if end:
+                    yield MESSAGE, position, end, (buffer[:end], messages, others)
+                position = position + end if end else self._resume(position)
+            else:
+                yield opcode, position + PREFIX.size, length, None
+                position = behind
+
+    def _resume(self, position):
+        """Count the damage at `position` and return the start of the next chunk that the summary knows, or None."""
+        following = min((start for start in self.chunk_starts if start > position), default=None)
+        self._lose('bytes that are no whole record', max((following or self.size) - position, 1))
+        return following
+
+    def _indexes_behind(self, position):
+        """Yield (position, length) of the MessageIndex records that start at `position`."""
+        while True:
+            prefix = self._read(position, PREFIX.size)
+            opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
+            if opcode != MESSAGE_INDEX or position + PREFIX.size + length > self.size or length < 6:
+                return
+            yield position + PREFIX.size, length
+            position += PREFIX.size + length
+
+    def _read_summary(self):
+        """Take channels, counts and places of chunks from the summary, when the file has one."""
+        footer = self._read(max(self.size - FOOTER_SIZE - len(MAGIC), 0), FOOTER_SIZE + len(MAGIC))
+        if len(footer) < FOOTER_SIZE + len(MAGIC) or footer[FOOTER_SIZE:] != MAGIC or footer[0] != FOOTER:
+            return
+        start, = struct.unpack_from('<Q', footer, PREFIX.size)
+        self.complete = True
+        if not len(MAGIC) <= start < self.size:
+            return
+        summary = memoryview(self._read(start, self.size - start))
+        position = 0
+        while position + PREFIX.size <= len(summary):
+            opcode, length = PREFIX.unpack_from(summary, position)
+            content = summary[position + PREFIX.size:position + PREFIX.size + length]
+            if opcode == FOOTER:
+                return
+            if opcode == STATISTICS:
+                self.statistics = parse_statistics(content)
+            elif opcode == CHUNK_INDEX:
+                self.chunk_starts.append(struct.unpack_from('<Q', content, 16)[0])
+            self._register([(opcode, content)])
+            position += PREFIX.size + length
+
+    def _scan(self):
+        """Find channels and counts without a summary, by the message indexes where there are any."""
+        counts = Counter()
+        for opcode, position, length, walked in self._records():
+            indexes = []
+            if opcode == CHUNK:
+                indexes = [parse_message_index(self._read(at, size)) for at, size in self._indexes_behind(position + length)]
+            if indexes and all(number in self.channels for number, _ in indexes):
+                counts.update({number: len(offsets) for number, offsets in indexes})
+            elif opcode == CHUNK:
+                for _, messages in self._chunk(position, length):
+                    counts.update(messages.channel.tolist())
+            elif opcode == MESSAGE:
+                self._register(walked[2])
+                counts.update(walked[1].channel.tolist())
+            elif opcode in (SCHEMA, CHANNEL):
+                self._register([(opcode, self._read(position, length))])
+        self.lost.clear()   # it will be counted again when the messages are read
+        return 0, 0, counts
+
+    def _register(self, records):
+        for opcode, content in records:
+            if opcode == SCHEMA:
+                number, schema = parse_schema(content)
+                self.schemas[number] = schema
+            elif opcode == CHANNEL:
+                number, channel = parse_channel(content)
+                self.channels[number] = channel
+
+    def _lose(self, what, count):
+        reason = f'{what} of {self.path.name}'
+        self.lost[reason] = self.lost.get(reason, 0) + count
+
+    def _read(self, position, size):
+        return os.pread(self.file.fileno(), size, position)
+
+
+def _join(pieces):
+    """Join (buffer, Messages) pieces into one."""
+    if len(pieces) == 1:
+        return pieces[0]
+    base = np.cumsum([0] + [len(buffer) for buffer, _ in pieces[:-1]])
+    channel = np.concatenate([messages.channel for _, messages in pieces])
+    start = np.concatenate([messages.start + shift for (_, messages), shift in zip(pieces, base, strict=True)])
+    size = np.concatenate([messages.size for _, messages in pieces])
+    return np.concatenate([buffer for buffer, _ in pieces]), type(pieces[0][1])(channel, start, size)

@@ -1,0 +1,142 @@
+"""rosbag2 recordings: a folder with its metadata, a folder without them, or a single storage file."""
+
+import re
+import shutil
+from pathlib import Path, PurePath
+from tempfile import mkdtemp
+
+from msg_adapters.compressed import decompress_file, decompress_message
+from msg_adapters.mcap_file import McapFile
+from msg_adapters.sqlite_file import SqliteFile
+
+FILES = {'.db3': SqliteFile, '.mcap': McapFile}
+COMPRESSED = ('.zstd', '.zst')
+
+
+class Rosbag2:
+    """
+    Storage files of one recording, read one after the other.
+
+    Parameters
+    ----------
+    path : path-like
+        The folder or the file.
+
+    Raises
+    ------
+    ValueError, OSError, sqlite3.Error
+        When nothing of it can be read.
+
+    """
+
+    ros1 = False
+
+    def __init__(self, path):
+        self.path, self.folder = Path(path), None
+        self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
+        self._lost, self.files = {}, []
+        by_message = self.metadata.get('compression_mode', '').lower() == 'message'
+        try:
+            errors = [self._open(path, decompress_message if by_message else None) for path in self._storage_paths()]
+            if not self.files:
+                raise ValueError('; '.join(filter(None, errors)) or 'there is no .db3 or .mcap file')
+            self.types = {name: kind for file in self.files for name, kind in file.types.items()}
+            self.definitions = {name: text for file in self.files for name, text in file.definitions.items()}
+            self.counts = self._counts()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def duration_ns(self):
+        """Time between the first and the last message by the clock of the recorder."""
+        if 'duration' in self.metadata:
+            return int(self.metadata['duration']['nanoseconds'])
+        ranges = [times for times in (file.time_range() for file in self.files) if times]
+        return max(last for _, last in ranges) - min(first for first, _ in ranges) if ranges else 0
+
+    @property
+    def lost(self):
+        """What could not be read, reason -> count."""
+        lost = dict(self._lost)
+        for file in self.files:
+            lost.update(file.lost)
+        return lost
+
+    def stretches(self, topics):
+        """Yield dicts topic -> Packed in file order."""
+        n_read = 0
+        for file in self.files:
+            file.lost.clear()
+            for stretch in file.stretches(topics):
+                n_read += sum(map(len, stretch.values()))
+                yield stretch
+        announced = sum(self._announced().get(topic, 0) for topic in topics)
+        if self.lost and announced > n_read:
+            self._lost['messages that the metadata announce and the files do not hold'] = announced - n_read
+
+    def close(self):
+        """Close the files and remove what was decompressed."""
+        for file in self.files:
+            file.close()
+        if self.folder:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _storage_paths(self):
+        if not self.path.is_dir():
+            return [self.path]
+        if self.metadata.get('relative_file_paths'):
+            return [self.path / PurePath(name).name for name in self.metadata['relative_file_paths']]
+        return sorted((path for path in self.path.iterdir() if _storage_suffix(path) in FILES), key=_natural)
+
+    def _open(self, path, unpack):
+        """Open one storage file; return the error when that fails."""
+        try:
+            opened = FILES[_storage_suffix(path)]
+            plain = self._decompressed(path) if path.suffix in COMPRESSED else path
+            self.files.append(opened(plain, unpack))
+        except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not cost the others
+            self._lost[f'file {path.name} that cannot be read ({error})'] = 1
+            return f'{path.name}: {error}'
+        return None
+
+    def _decompressed(self, path):
+        self.folder = self.folder or mkdtemp(prefix='imu_calibration_')
+        target = Path(self.folder, path.stem)
+        error = decompress_file(path, target)
+        if error:
+            self._lost[f'end of {path.name} ({error})'] = 1
+        return target
+
+    def _announced(self):
+        return {entry['topic_metadata']['name']: int(entry['message_count'])
+                for entry in self.metadata.get('topics_with_message_count', ())}
+
+    def _counts(self):
+        announced = self._announced()
+        if announced:
+            return {name: announced.get(name, 0) for name in self.types}
+        counted = [file.count() for file in self.files]
+        return {name: sum(counts.get(name, 0) for counts in counted) for name in self.types}
+
+
+def read_metadata(folder):
+    """Return the content of metadata.yaml; empty when there is none or it is damaged, as after a crash of the recorder."""
+    import yaml
+    try:
+        information = yaml.load((folder / 'metadata.yaml').read_text(encoding='utf-8'), getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+        information = information['rosbag2_bagfile_information']
+        topics = information['topics_with_message_count']
+        _ = [(topic['topic_metadata']['name'], int(topic['message_count'])) for topic in topics], information['relative_file_paths']
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        return {}
+    return information
+
+
+def _storage_suffix(path):
+    return Path(path.stem).suffix if path.suffix in COMPRESSED else path.suffix
+
+
+def _natural(path):
+    """Sort key that puts bag_10 behind bag_9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]

@@ -1,0 +1,168 @@
+"""rosbag2 sqlite3 storage: topics by SQL, messages straight from the pages, or row by row where that does not apply."""
+
+import os
+import sqlite3
+from collections import defaultdict
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from msg_adapters.layout import Packed
+from msg_adapters.read_ahead import read_ahead
+from msg_adapters.sqlite_pages import PageReader
+
+COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
+STRETCH_ROWS = 8192
+
+
+class SqliteFile:
+    """
+    One .db3 file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unpack : callable, optional
+        Bytes -> bytes for each message (compression by message).
+
+    """
+
+    def __init__(self, path, unpack=None):
+        self.path, self.unpack = Path(path), unpack
+        self.logged = Path(f'{path}-wal').exists()
+        self.connection = _connect(self.path, self.logged)
+        try:
+            self._read_topics()
+        except BaseException:
+            self.connection.close()
+            raise
+        self.lost = {}
+
+    def _read_topics(self):
+        self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
+        for topic_id, name, message_type, encoding in self.connection.execute('SELECT id, name, type, serialization_format FROM topics'):
+            self.topic_ids[name].append(topic_id)
+            self.types[name] = message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
+        with suppress(sqlite3.Error):   # before schema version 4 there are no definitions
+            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')
+            self.definitions = {name: (encoding, text) for name, encoding, text in rows}
+
+    def count(self):
+        """Return topic -> messages by counting them."""
+        by_id = defaultdict(int)
+        for ids, _ in self._all_rows():
+            for topic_id, count in zip(*np.unique(ids, return_counts=True), strict=True):
+                by_id[int(topic_id)] += int(count)
+        return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
+
+    def time_range(self):
+        """Return (first, last) receive time in ns, or None when there are no messages or they cannot be read."""
+        with suppress(sqlite3.Error):
+            first, = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
+            last, = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
+            return None if first is None else (first, last)
+        return None
+
+    def stretches(self, topics):
+        """Yield dicts topic -> Packed in the order of the rows; what the file loses is counted in `lost`."""
+        for ids, pack in self._all_rows():
+            stretch = {}
+            for topic in topics:
+                mine = np.flatnonzero(np.isin(ids, self.topic_ids.get(topic, [])))
+                if len(mine):
+                    stretch[topic] = self._unpacked(pack(mine))
+            if stretch:
+                yield stretch
+
+    def close(self):
+        """Close the file."""
+        self.connection.close()
+
+    def _unpacked(self, packed):
+        if self.unpack is None:
+            return packed
+        return Packed.join([self.unpack(packed.message(k)) for k in range(len(packed))])
+
+    def _all_rows(self):
+        """Yield (topic ids, function index -> Packed) stretch by stretch."""
+        root = self._root()
+        if root is None:
+            yield from self._rows_by_sql()
+            return
+        reader = PageReader(self.path, root)
+        try:
+            for buffer, starts in read_ahead(reader.stretches()):
+                rows = reader.rows(buffer, starts)
+                yield rows.topic_id, lambda index, rows=rows: self._pack(rows, index)
+        finally:
+            reader.close()
+            for name, count in (('pages', reader.damaged_pages), ('rows', reader.damaged_rows)):
+                if count:
+                    self.lost[f'unreadable {name} of {self.path.name}'] = count
+
+    def _root(self):
+        """Return the root page of the table of messages, or None when only SQL can read it (write-ahead log, other columns)."""
+        columns = [row[1] for row in self.connection.execute('PRAGMA table_info(messages)')]
+        found = self.connection.execute("SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'").fetchone()
+        if self.logged or columns != COLUMNS or not found or 'INTEGER PRIMARY KEY' not in found[1].upper():
+            return None
+        return found[0]
+
+    def _pack(self, rows, index):
+        """Return the data of some rows; what goes on in overflow pages is fetched by SQL and put behind the pages."""
+        start, size = rows.start[index], rows.size[index]
+        outside = np.flatnonzero(~rows.inside[index])
+        if not len(outside):
+            return Packed(rows.buffer, start, size)
+        found = [self._by_id(int(rows.row_id[index[k]])) for k in outside]
+        tail = Packed.join([data or b'' for data in found])
+        start[outside], size[outside] = len(rows.buffer) + tail.start, tail.size
+        kept = np.ones(len(index), dtype=bool)
+        kept[outside] = [data is not None for data in found]
+        return Packed(np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept])
+
+    def _by_id(self, row_id):
+        try:
+            return self.connection.execute('SELECT data FROM messages WHERE id = ?', (row_id,)).fetchone()[0]
+        except (sqlite3.Error, TypeError):
+            self._lose('unreadable rows', 1)
+            return None
+
+    def _rows_by_sql(self):
+        cursor = iter(self.connection.execute('SELECT topic_id, data FROM messages ORDER BY id'))
+        going = True
+        while going:
+            ids, messages = [], []
+            going = self._fetch(cursor, ids, messages)
+            if ids:
+                yield np.array(ids), lambda index, messages=messages: Packed.join([messages[k] for k in index])
+
+    def _fetch(self, cursor, ids, messages):
+        """Append a stretch of rows to the two lists; return whether there may be more."""
+        try:
+            for topic_id, data in islice(cursor, STRETCH_ROWS):
+                ids.append(topic_id)
+                messages.append(bytes(data))
+        except sqlite3.Error as error:
+            self._lose(f'rest after damage ({error})', 1)
+            return False
+        return len(ids) == STRETCH_ROWS
+
+    def _lose(self, what, count):
+        reason = f'{what} of {self.path.name}'
+        self.lost[reason] = self.lost.get(reason, 0) + count
+
+
+def _connect(path, logged):
+    """Open read-only; `immutable` keeps SQLite from looking for locks, but hides a write-ahead log."""
+    if os.path.getsize(path) < 512:
+        raise sqlite3.DatabaseError('the file is shorter than one page')
+    address = f'file:{quote(str(path))}?mode=ro' + ('' if logged else '&immutable=1')
+    connection = sqlite3.connect(address, uri=True, check_same_thread=False)
+    # Without this SQLite refuses a truncated file as a whole; what is still there can then be read.
+    connection.execute('PRAGMA writable_schema = ON')
+    return connection

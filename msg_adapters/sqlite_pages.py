@@ -1,0 +1,190 @@
+"""
+Table leaves of an SQLite file, many pages at once.
+
+Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). Rows that do not fit
+into one page are left to SQL; a damaged page costs its own rows only.
+"""
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+INTERIOR, LEAF = 0x05, 0x0D
+STRETCH_PAGES = 2048
+MAX_DEPTH = 20
+"""Of a b-tree by the file format's page numbers; deeper means a loop in a damaged file."""
+
+_INTEGER_SIZE = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0, 0, 0], dtype=np.int64)
+"""Bytes of a value by its serial type (file format, section 2.1)."""
+
+
+class Rows(NamedTuple):
+    """Rows of the table `messages`, in the order of their ids."""
+
+    buffer: np.ndarray
+    """Pages, uint8."""
+    row_id: np.ndarray
+    """Primary keys, int64, shape (n,)."""
+    topic_id: np.ndarray
+    """Topics, int64, shape (n,)."""
+    start: np.ndarray
+    """First byte of the data in `buffer`, int64, shape (n,)."""
+    size: np.ndarray
+    """Bytes of the data, int64, shape (n,)."""
+    inside: np.ndarray
+    """False where the data go on in overflow pages, bool, shape (n,)."""
+
+
+class PageReader:
+    """Reads the leaves below one root page in the order of the row ids."""
+
+    def __init__(self, path, root):
+        self.file = open(path, 'rb', buffering=0)
+        header = self.file.read(100)
+        size = int.from_bytes(header[16:18], 'big')
+        self.page_size = 65536 if size == 1 else size
+        self.usable = self.page_size - header[20]
+        self.n_pages = os.fstat(self.file.fileno()).st_size // self.page_size
+        self.root = root
+        self.damaged_pages = 0
+        self.damaged_rows = 0
+
+    def close(self):
+        """Close the file."""
+        self.file.close()
+
+    def stretches(self):
+        """Yield (buffer, starts of the pages in it) over the leaves."""
+        waiting, n_waiting = [], 0
+        for leaves in self._leaf_groups(np.array([self.root]), 0):
+            waiting.append(leaves)
+            n_waiting += len(leaves)
+            if n_waiting >= STRETCH_PAGES:
+                yield self._read(np.concatenate(waiting))
+                waiting, n_waiting = [], 0
+        if waiting:
+            yield self._read(np.concatenate(waiting))
+
+    def rows(self, buffer, starts):
+        """Parse the leaves of a stretch; pages and rows that make no sense are counted and left out."""
+        whole = buffer[starts] == LEAF
+        self.damaged_pages += int((~whole).sum())
+        starts = starts[whole]
+        word = np.ndarray((max(len(buffer) - 1, 0),), '>u2', buffer, strides=(1,))
+        n_cells = word[starts + 3].astype(np.int64)
+        n_cells[8 + 2 * n_cells > self.usable] = 0
+        page = np.repeat(starts, n_cells)
+        number = np.arange(n_cells.sum()) - np.repeat(np.cumsum(n_cells) - n_cells, n_cells)
+        cell = page + word[page + 8 + 2 * number]
+        rows, sensible = _parse_cells(buffer, cell, page + self.usable, self.usable - 35)
+        self.damaged_rows += int((~sensible).sum())
+        return rows if sensible.all() else Rows(buffer, *(column[sensible] for column in rows[1:]))
+
+    def _leaf_groups(self, pages, depth):
+        """Yield arrays of leaf page numbers below `pages`, all of one level."""
+        inside = pages[(pages >= 1) & (pages <= self.n_pages)]
+        self.damaged_pages += len(pages) - len(inside)
+        kind = next((kind for kind in map(self._kind, inside) if kind in (INTERIOR, LEAF)), None)
+        if kind == LEAF:
+            yield inside
+        elif kind is None or depth == MAX_DEPTH:
+            self.damaged_pages += len(inside)
+        else:
+            for page in inside:
+                children = self._children(page)
+                if children is None:
+                    self.damaged_pages += 1
+                else:
+                    yield from self._leaf_groups(children, depth + 1)
+
+    def _kind(self, page):
+        return os.pread(self.file.fileno(), 1, (int(page) - 1) * self.page_size)[0]
+
+    def _children(self, page):
+        data = np.frombuffer(os.pread(self.file.fileno(), self.page_size, (int(page) - 1) * self.page_size), np.uint8)
+        n_cells = int(data[3]) << 8 | int(data[4])
+        if data[0] != INTERIOR or 12 + 2 * n_cells > self.usable:
+            return None
+        pointers = data[12:12 + 2 * n_cells].view('>u2').astype(np.int64)
+        if n_cells and pointers.max() + 4 > self.page_size:
+            return None
+        word = np.ndarray((len(data) - 3,), '>u4', data, strides=(1,))
+        return word[np.append(pointers, 8)].astype(np.int64)
+
+    def _read(self, pages):
+        """Read pages: in one piece where they lie close together, else run by run."""
+        if np.ptp(pages) < 2 * len(pages) + 16:
+            runs = [(pages.min(), pages.max() + 1)]
+        else:
+            ordered = np.sort(pages)
+            cuts = np.flatnonzero(np.diff(ordered) > 8) + 1
+            runs = [(run[0], run[-1] + 1) for run in np.split(ordered, cuts)]
+        buffer = np.empty(sum(int(last - first) for first, last in runs) * self.page_size, dtype=np.uint8)
+        filled, firsts, bases = 0, [], []
+        for first, last in runs:
+            size = int(last - first) * self.page_size
+            _read_into(self.file.fileno(), buffer[filled:filled + size], (int(first) - 1) * self.page_size)
+            firsts.append(first)
+            bases.append(filled)
+            filled += size
+        run = np.searchsorted(firsts, pages, side='right') - 1
+        return buffer, np.array(bases)[run] + (pages - np.array(firsts)[run]) * self.page_size
+
+
+def _read_into(descriptor, target, offset):
+    view = memoryview(target)
+    while len(view):
+        n_read = os.preadv(descriptor, [view], offset)
+        if n_read == 0:
+            view[:] = bytes(len(view))
+            return
+        view, offset = view[n_read:], offset + n_read
+
+
+def _parse_cells(buffer, cell, page_end, largest):
+    """Return (Rows, mask of the sensible ones) for the table cells at `cell`, which must end before `page_end`."""
+    limit = len(buffer) - 1
+    payload_size, position = _varint(buffer, cell, limit)
+    row_id, position = _varint(buffer, position, limit)
+    header_size, field = _varint(buffer, position, limit)
+    value = position + header_size
+    types = []
+    for _ in range(4):   # id, topic_id, timestamp, data
+        serial, field = _varint(buffer, field, limit)
+        types.append(serial)
+    sizes = [_INTEGER_SIZE[np.clip(serial, 0, 11)] for serial in types[:3]]
+    topic_id = _integer(buffer, value + sizes[0], types[1], limit)
+    start = value + sizes[0] + sizes[1] + sizes[2]
+    size = (types[3] - 12) >> 1
+    inside = payload_size <= largest
+    sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (header_size < 60) & (field <= page_end)
+    sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
+    return Rows(buffer, row_id, topic_id, start, size, inside), sensible
+
+
+def _varint(buffer, position, limit):
+    """Decode SQLite varints at `position`; return (value, position behind)."""
+    position = np.minimum(position, limit)
+    byte = buffer[position].astype(np.int64)
+    value, position = byte & 0x7F, position + 1
+    going = np.flatnonzero(byte & 0x80)
+    for count in range(2, 10):
+        if not len(going):
+            break
+        byte = buffer[np.minimum(position[going], limit)].astype(np.int64)
+        value[going] = (value[going] << 8 | byte) if count == 9 else (value[going] << 7 | byte & 0x7F)
+        position[going] += 1
+        going = going[(byte & 0x80) != 0]
+    return value, position
+
+
+def _integer(buffer, position, serial, limit):
+    """Decode big-endian integers of up to four bytes; topic ids are small."""
+    value = np.where(serial == 9, 1, 0)
+    for size in (1, 2, 3, 4):
+        mine = np.flatnonzero(serial == size)
+        if len(mine):
+            at = position[mine, np.newaxis] + np.arange(size)
+            value[mine] = buffer[np.minimum(at, limit)].astype(np.int64) @ (256 ** np.arange(size)[::-1])
+    return value
