@@ -67,13 +67,11 @@ class Segment:
         return motion
 
     def _add_steps(self, motion, time):
-        if self.kind in ('rest', 'spin', 'oscillation'):
-            return
         part = time / self.duration
-        change = self.rate_to - self.rate_from
-        for order in range(4):
-            motion[order] += np.outer(_RATE_STEP[order](part) * self.duration ** (1 - order), change)
-            motion[order] += np.outer(_POSITION_STEP[order](part) * self.duration ** -order, self.shift)
+        for steps, gain, power in ((_RATE_STEP, self.rate_to - self.rate_from, 1), (_POSITION_STEP, self.shift, 0)):
+            if gain.any():
+                for order in range(4):
+                    motion[order] += np.outer(steps[order](part), gain * self.duration ** (power - order))
 
     def _add_sines(self, motion, time):
         rise = np.clip(time / self.fade, 0.0, 1.0)

@@ -1,0 +1,86 @@
+"""Sensing elements: each has a place, an input direction and a physical response; written without the catalogue of effects."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import lfilter
+
+TEMPERATURE_REF_C = 25.0
+
+
+@dataclass(eq=False)
+class Triad:
+    """Three sensing elements of one kind. Coefficients are those of the output, per unit of the input along the element's own axis."""
+
+    bias: np.ndarray
+    """Output at zero input, shape (3,)."""
+    matrix: np.ndarray
+    """Row i: scale factor times the direction in which element i senses, shape (3, 3)."""
+    arms: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Row i: where element i sits, from the reference point, m."""
+    quadratic: np.ndarray | float = 0.0
+    cubic: np.ndarray | float = 0.0
+    asymmetry: np.ndarray | float = 0.0
+    """Part of the response that does not change sign with the input."""
+    products: np.ndarray | None = None
+    """Response of element i to the products xy, yz, xz of the input, shape (3, 3)."""
+    to_force: np.ndarray | None = None
+    """Response of gyroscope i to specific force, shape (3, 3)."""
+    thermal_bias: np.ndarray | float = 0.0
+    thermal_scale: np.ndarray | float = 0.0
+    drift: np.ndarray | float = 0.0
+    drift_constant: float = 1.0
+    """Bias warm-up: drift (1 - exp(-t / constant))."""
+    low_pass: float = 0.0
+    """Time constant of the filter behind the elements, s."""
+    low_pass_order: int = 1
+    """Number of equal first-order stages; their time constants add up to `low_pass`."""
+    limit: float = np.inf
+    """The output cannot leave [-limit, limit]."""
+
+    def respond(self, inputs, time, temperature_c, force_s):
+        """
+        Return the output before filter and limit, shape (n, 3).
+
+        Parameters
+        ----------
+        inputs : list of three arrays (n, 3)
+            The field (specific force or rate) at each element, in s.
+
+        """
+        warm = temperature_c - TEMPERATURE_REF_C
+        output = np.empty((len(time), 3))
+        for i in range(3):
+            scale = np.linalg.norm(self.matrix[i])
+            along = inputs[i] @ (self.matrix[i] / scale)
+            output[:, i] = (_of(self.bias, i) + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
+                            + _of(self.quadratic, i) * along**2 + _of(self.cubic, i) * along**3 + _of(self.asymmetry, i) * np.abs(along)
+                            + _of(self.thermal_bias, i) * warm - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
+            if self.products is not None:
+                x, y, z = inputs[i].T
+                output[:, i] += self.products[i, 0] * x * y + self.products[i, 1] * y * z + self.products[i, 2] * x * z
+            if self.to_force is not None:
+                output[:, i] += force_s @ self.to_force[i]
+        return output
+
+
+def _of(value, i):
+    return value if np.isscalar(value) else value[i]
+
+
+def low_pass(values, step, time_constant, order=1):
+    """
+    Return the output of `order` equal first-order stages that were in balance at the start.
+
+    Exact for an input that is linear between the grid points:
+    ``y[k+1] = e y[k] + c0 u[k] + c1 u[k+1]``, e = exp(-h / tau), c1 = 1 - tau / h (1 - e), c0 = tau / h (1 - e) - e.
+    """
+    if time_constant == 0.0:
+        return values
+    tau = time_constant / order
+    decay = np.exp(-step / tau)
+    rest = -np.expm1(-step / tau) * tau / step
+    ahead, behind = 1.0 - rest, rest - decay
+    for _ in range(order):
+        values, _state = lfilter([ahead, behind], [1.0, -decay], values, axis=0, zi=values[:1] * (1.0 - ahead))
+    return values
