@@ -79,10 +79,10 @@ def normal_bands(knots, interval, values):
     return bands
 
 
-def penalty_bands(knots):
-    """Return the lower bands of D.T @ D with D the third differences of the coefficients, shape (6, n_coefficients)."""
-    bands = np.zeros((ORDER, knots.n_coefficients))
-    n_rows = knots.n_coefficients - 3
+def penalty_bands(size):
+    """Return the lower bands of D.T @ D with D the third differences of the coefficients, shape (6, size)."""
+    bands = np.zeros((ORDER, size))
+    n_rows = size - 3
     for first in range(4):
         for second in range(first, 4):
             bands[second - first, first:first + n_rows] += _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second]

@@ -4,10 +4,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from imu_calibration.bspline import (Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients)
+from imu_calibration.bspline import Knots, evaluate_pieces, piece_coefficients
 from imu_calibration.errors import InputError
+from imu_calibration.joint_fit import Rows, Trend, fitfit_with_velocity
 from imu_calibration.settings import JointSettings
-from imu_calibration.smoothing import PenalisedSpline, encoder_step, smooth
+from imu_calibration.smoothing import encoder_step, smooth
 
 _MINIMUM_SAMPLES = 8  # fewer are fitted with a parabola
 
@@ -100,12 +101,23 @@ def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=Joint
     _check(time, position)
     position = _unwrapped(position)
     knots = _place_knots(time)
-    centre, trend, coefficients, bandwidth, noise, trusted = _fit(knots, time, position, velocity, noise_sd, settings)
+    still = np.all(position == position[0], axis=0)
+    floor = _noise_floor(position, noise_sd)
+    trend = Trend.through(time, position, still)
+    coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
+    bandwidth, trusted = np.zeros(position.shape[1]), np.zeros(position.shape[1], bool)
+    noise = floor.copy()
+    moving = np.flatnonzero(~still)
+    if len(time) >= _MINIMUM_SAMPLES and len(moving):
+        rows = Rows(knots, time)
+        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], settings.robustness)
+        for joint, fit in zip(moving, fits, strict=True):
+            noise[joint] = max(floor[joint], fit.noise_sd)
+            if velocity is not None:
+                trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity[:, joint], trend.column(joint), settings)
+            coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
-    start = knots.start - centre + knots.step * np.arange(knots.n_intervals)[:, None]
-    pieces[0] += trend[0] + start * (trend[1] + start * trend[2])
-    pieces[1] += knots.step * (trend[1] + 2 * start * trend[2])
-    pieces[2] += knots.step ** 2 * trend[2]
+    trend.add_to(pieces, knots)
     return JointCurve(knots, pieces, noise, trusted, bandwidth)
 
 
@@ -130,44 +142,11 @@ def _place_knots(time):
     return Knots(float(time[0] - 2 * step), float(step), int(np.ceil(span / step)) + 4)
 
 
-def _fit(knots, time, position, velocity, noise_sd, settings):
-    n_joints = position.shape[1]
-    centre = 0.5 * (time[0] + time[-1])
-    still = np.all(position == position[0], axis=0)
-    trend = _parabola(time - centre, position)
-    trend[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
-    coefficients = np.zeros((knots.n_coefficients, n_joints))
-    bandwidth, noise, trusted = np.zeros(n_joints), np.zeros(n_joints), np.zeros(n_joints, bool)
-    if noise_sd is not None:
-        noise[:] = noise_sd
-    moving = np.flatnonzero(~still)
-    if len(time) < _MINIMUM_SAMPLES or not len(moving):
-        return centre, trend, coefficients, bandwidth, noise, trusted
-    rest = position[:, moving] - np.polynomial.polynomial.polyval(time - centre, trend[:, moving]).T
-    for place, joint in enumerate(moving):
-        resolution = 4 * np.finfo(float).eps * np.abs(position[:, joint]).max()
-        noise[joint] = max(noise[joint], resolution, encoder_step(position[:, joint]) / np.sqrt(12))
-    interval, values = design_values(knots, time)
-    spline = PenalisedSpline(knots, design_matrix(knots, interval, values), normal_bands(knots, interval, values))
-    for joint, fit in zip(moving, smooth(spline, rest, noise[moving], settings.robustness), strict=True):
-        coefficients[:, joint], noise[joint] = fit.coefficients, max(noise[joint], fit.noise_sd)
-        bandwidth[joint] = _bandwidth(fit.penalty / spline.density, knots.step)
-    return centre, trend, coefficients, bandwidth, noise, trusted
-
-
-def _bandwidth(ratio, step):
-    """Return the frequency at which ``ratio (2 sin(omega step / 2))^6`` is one, at most Nyquist's."""
-    return np.arcsin(min(0.5 * ratio ** (-1 / 6), 1.0)) / (np.pi * step)
-
-
-def _parabola(time, position):
-    """Return the coefficients of a least-squares parabola (or less, for few readings), shape (3, n_joints)."""
-    degree = min(2, len(np.unique(time)) - 1)
-    scale = max(np.abs(time).max(), 1e-9) ** np.arange(degree + 1)
-    powers = np.vander(time, degree + 1, increasing=True) / scale
-    trend = np.zeros((3, position.shape[1]))
-    trend[:degree + 1] = np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
-    return trend
+def _noise_floor(position, noise_sd):
+    """Return the noise that the readings have at least: what the caller knows, rounding, coarse steps."""
+    floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
+    steps = np.array([encoder_step(column) for column in position.T])
+    return np.maximum.reduce([floor, steps / np.sqrt(12), np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape)])
 
 
 def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):

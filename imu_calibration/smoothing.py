@@ -26,6 +26,8 @@ class Smooth:
     """Penalty of the third differences that was chosen."""
     dof: float
     """Effective number of parameters."""
+    bandwidth: float
+    """Frequency below which more than half the amplitude passes, rad per knot."""
     noise_sd: float
     """Standard deviation of the residuals, unit of the data, corrected for `dof`."""
 
@@ -36,17 +38,29 @@ class PenalisedSpline:
 
     Eilers and Marx 1996. Degrees of freedom come from the mean bands of the normal matrix, as for a long uniform
     record: the gain of the fit at the frequency theta is ``N / (N + lambda p)`` with ``p = (2 - 2 cos theta)^3``.
+
+    Parameters
+    ----------
+    design : sparse array, shape (n_rows, n_coefficients)
+        One row per reading; with readings of several kinds, each kind in the order of time, one kind after the other.
+    bands : array, shape (6, n_coefficients)
+        Lower bands of ``design.T @ design``.
+    n_kinds : int
+        Kinds of readings.
+
     """
 
-    def __init__(self, knots, design, bands):
-        self.design, self.bands, self.penalty = design, bands, penalty_bands(knots)
+    def __init__(self, design, bands, n_kinds=1):
+        self.design, self.bands, self.penalty = design, bands, penalty_bands(design.shape[1])
         self.n_rows, self.n_coefficients = design.shape
         # Splines are worst at the ends, which callers keep out: the ends have no say in the noise or the penalty.
-        self._interior = tukey(self.n_rows, _TAPER) ** 2 / np.sum(tukey(self.n_rows, _TAPER) ** 2)
+        interior = np.tile(tukey(self.n_rows // n_kinds, _TAPER) ** 2, n_kinds)
+        self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
         self.gains = lru_cache(None)(self._gains)
-        self._symbols = self.symbols((np.arange(256) + 0.5) * np.pi / 256)
+        self._theta = (np.arange(512) + 0.5) * np.pi / 512
+        self._symbols = self.symbols(self._theta)
 
     def symbols(self, theta):
         """Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot."""
@@ -70,6 +84,11 @@ class PenalisedSpline:
         gain = normal / (normal + penalty * damping)
         least = 3 / self.n_rows
         return least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
+
+    def bandwidth(self, penalty):
+        """Return the frequency, rad per knot, below which more than half the amplitude passes."""
+        normal, damping = self._symbols
+        return self._theta[np.searchsorted(penalty * damping / normal, 1.0) - 1]
 
 
 def smooth(spline, values, noise_floor, robustness):
@@ -103,7 +122,8 @@ def smooth(spline, values, noise_floor, robustness):
         gain, _ = spline.gains(penalty)
         noise = np.sqrt(residual / (1 - gain))
         for place, column in enumerate(columns):
-            results[column] = Smooth(coefficients[:, place], penalty, gain * spline.n_rows, float(noise[place]))
+            results[column] = Smooth(coefficients[:, place], penalty, gain * spline.n_rows, spline.bandwidth(penalty),
+                                     float(noise[place]))
     return [results[column] for column in range(len(decades))]
 
 
