@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.bspline import Knots, evaluate_pieces, piece_coefficients
 from imu_calibration.errors import InputError
-from imu_calibration.joint_fit import Rows, Trend, fitfit_with_velocity
+from imu_calibration.joint_fit import Rows, Trend, fit_with_velocity
 from imu_calibration.settings import JointSettings
 from imu_calibration.smoothing import encoder_step, smooth
 
