@@ -11,6 +11,7 @@ from imu_calibration.settings import JointSettings
 from imu_calibration.smoothing import encoder_step, smooth
 
 _MINIMUM_SAMPLES = 8  # fewer are fitted with a parabola
+_MARGIN = 3  # knots beyond the readings
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ class JointCurve:
 
     def at(self, time, derivatives=3):
         """
-        Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than two of their periods.
+        Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than three of their periods.
 
         Derivatives above `derivatives` are left out as zero.
         """
@@ -133,13 +134,13 @@ def _unwrapped(position):
 
 
 def _place_knots(time):
-    """Return knots at the usual distance of the readings, with a margin of two on both sides."""
+    """Return knots at the usual distance of the readings, with a margin on both sides."""
     count = len(time)
     span = time[-1] - time[0]
     stride = min(8, count - 1)
     step = np.median(time[stride:] - time[:-stride]) / stride if count > 1 else 0.0
     step = max(step, span / (4 * count), 1e-6)
-    return Knots(float(time[0] - 2 * step), float(step), int(np.ceil(span / step)) + 4)
+    return Knots(float(time[0] - _MARGIN * step), float(step), int(np.ceil(span / step)) + 2 * _MARGIN)
 
 
 def _noise_floor(position, noise_sd):

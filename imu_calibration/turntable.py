@@ -7,8 +7,9 @@ import numpy as np
 from imu_calibration.chain import align, reference_motion, rotation
 from imu_calibration.earth import normal_gravity
 from imu_calibration.errors import InputError
+from imu_calibration.joint_motion import shifted, with_encoder_harmonics
 
-__all__ = ['Joint', 'Table', 'axis_error_directions', 'reference_motion', 'tilt', 'with_axis_errors']
+__all__ = ['Joint', 'Table', 'axis_error_directions', 'reference_motion', 'shifted', 'tilt', 'with_axis_errors', 'with_encoder_harmonics']
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
 
