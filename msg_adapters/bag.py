@@ -1,13 +1,14 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.decode import Decoder, JointDecoder
-from msg_adapters.definitions import is_standard, standard_typestore, typestore_for
+from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.general_file import GeneralFile
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
@@ -140,13 +141,11 @@ class Recording:
             yield last
 
     def _decoders(self, joint_names):
-        store = typestore_for(self._source.definitions) if any(text for _, text in self._source.definitions.values()) else None
-        store = store or standard_typestore()
-        decoders = {}
+        source, decoders = self._source, {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
-            message_type = self._source.types[topic]
-            deserialize = _deserializer(store, message_type, self._source.ros1)
-            standard = not self._source.ros1 and is_standard(store, message_type)
+            message_type = source.types[topic]
+            standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
+            deserialize = _lazy(message_type, source)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize, standard)
             else:
@@ -174,9 +173,10 @@ def _block(parts, decoders):
     return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dict(dropped) or None)
 
 
-def _deserializer(store, message_type, ros1):
-    deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-    return lambda data: deserialize(data, message_type)
+def _lazy(message_type, source):
+    """Return a deserializer that is built at its first use: most recordings never need it, and building it takes time."""
+    build = cache(lambda: deserializer(message_type, source.definitions, source.ros1))
+    return lambda data: build()(data)
 
 
 def _open_source(path):

@@ -1,7 +1,32 @@
-"""Message definitions: the standard ones, their hashes, and whether a bag's own definition is the standard one."""
+"""Message definitions: the standard ones, and whether a bag's own definition is the standard one."""
 
-from functools import cache
 from typing import NamedTuple
+
+from msg_adapters.imu import IMU_TYPE
+from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.temperature import TEMPERATURE_TYPE
+
+SEPARATOR = '=' * 80
+
+_PARTS = {
+    'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
+    'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec\n',
+    'geometry_msgs/Quaternion': 'float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n',
+    'geometry_msgs/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
+}
+_HEADER = ('std_msgs/Header', 'builtin_interfaces/Time')
+_STANDARD = {
+    IMU_TYPE: ('std_msgs/Header header\n'
+               'geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n'
+               'geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n'
+               'geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n',
+               (*_HEADER, 'geometry_msgs/Quaternion', 'geometry_msgs/Vector3'),
+               'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b'),
+    JOINT_STATE_TYPE: ('std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n', _HEADER,
+                       'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e'),
+    TEMPERATURE_TYPE: ('std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n', _HEADER,
+                       'RIHS01_72514a14126ab9f8a9abec974c78e5610a367b59db5da355ff1fb982d5bad4b8'),
+}
 
 
 class TypeDefinition(NamedTuple):
@@ -17,42 +42,71 @@ class TypeDefinition(NamedTuple):
     """RIHS01 hash; may be empty."""
 
 
-@cache
-def standard_typestore():
-    """Return rosbags' typestore of the current ROS 2 definitions."""
-    from rosbags.typesys import Stores, get_typestore
-    return get_typestore(Stores.ROS2_JAZZY)
-
-
-@cache
 def standard_definition(message_type):
-    """Return the TypeDefinition of a standard type."""
-    store = standard_typestore()
-    text, _ = store.generate_msgdef(message_type, ros_version=2)
-    return TypeDefinition(message_type, 'ros2msg', text, store.hash_rihs01(message_type))
+    """Return the TypeDefinition of Imu, JointState or Temperature."""
+    text, parts, digest = _STANDARD[message_type]
+    nested = ''.join(f'{SEPARATOR}\nMSG: {part}\n{_PARTS[part]}' for part in parts)
+    return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
 
 
-def typestore_for(definitions):
+def is_standard(message_type, encoding, text):
+    """Return whether a definition has the fields of the standard one; without a text the standard is taken for granted."""
+    if not text:
+        return True
+    if encoding != 'ros2msg':
+        return False
+    try:
+        return _flatten(text) == _flatten(standard_definition(message_type).text)
+    except (KeyError, IndexError, RecursionError):
+        return False
+
+
+def deserializer(message_type, definitions, ros1=False):
     """
-    Return a typestore that knows the standard types, overridden by a bag's own definitions.
+    Return a function from message bytes to a message object, by rosbags.
 
     Parameters
     ----------
+    message_type : str
+        Type of the messages.
     definitions : dict
-        Message type -> (encoding 'ros2msg' or 'ros2idl', text); empty texts are passed over.
+        Message type -> (encoding, text) of the bag; the current ROS 2 definitions stand in where it has none.
+    ros1 : bool
+        Whether the bytes are of ROS 1.
 
     """
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    types = dict(standard_typestore().fielddefs)
-    for name, (encoding, text) in definitions.items():
-        if text:
-            types.update(get_types_from_msg(text, name) if encoding == 'ros2msg' else get_types_from_idl(text))
+    types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY).fielddefs)
+    encoding, text = definitions.get(message_type, ('', ''))
+    if text and encoding == 'ros2msg':
+        types.update(get_types_from_msg(text, message_type))
+    elif text:
+        parts = [part.split('\n', 1)[1] for part in text.split(SEPARATOR + '\n')[1:]] if text.startswith(SEPARATOR) else [text]
+        for part in parts:
+            types.update(get_types_from_idl(part))
     store = get_typestore(Stores.EMPTY)
     store.register(types)
-    return store
+    deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    return lambda data: deserialize(data, message_type)
 
 
-def is_standard(typestore, message_type):
-    """Return whether a type and everything inside it has the fields of the standard definition."""
-    standard = standard_typestore()
-    return message_type in standard.fielddefs and typestore.hash_rihs01(message_type) == standard.hash_rihs01(message_type)
+def _flatten(text):
+    """List the plain fields of a ros2msg definition in order, those of nested types by their path."""
+    first, *others = text.replace('\r', '').split(SEPARATOR + '\n')
+    nested = {}
+    for part in others:
+        name, _, body = part.partition('\n')
+        nested[name.removeprefix('MSG:').strip().rpartition('/')[2]] = body
+
+    def expand(body, prefix):
+        for line in body.split('\n'):
+            words = line.split('#')[0].split()
+            if not words or '=' in line.split('#')[0]:   # empty, or a constant
+                continue
+            kind, name = words[0], prefix + words[1]
+            if '/' in kind or kind in nested:
+                yield from expand(nested[kind.rpartition('/')[2]], name + '.')
+            else:
+                yield kind, name
+
+    return list(expand(first, ''))
