@@ -203,13 +203,15 @@ def columns(model, sensor, table, motion, temperature_c=None, ref=None):
         raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
     point = model.full_point()
     warps = {'warp:' + e.name: e for e in model.concerning(sensor) if e.warp is not None}
-    parts = [warp_columns(model, warps[name], sensor, table, motion) if name in warps else GROUPS[name](ref, point)
+    parts = [warp_columns(model, warps[name], sensor, table, motion, ref) if name in warps else GROUPS[name](ref, point)
              for name, _ in model.groups(sensor)]
     return np.concatenate(parts, axis=1)
 
 
-def warp_columns(model, effect, sensor, table, motion):
+def warp_columns(model, effect, sensor, table, motion, ref):
     """Return d(true input)/d(parameter) for each parameter of a warp, shape (n, 3 size)."""
+    if effect.derivative is not None:
+        return effect.derivative(ref)
     at, parts = model.warp_point(effect), []
     for index in range(effect.size):
         step = np.zeros(effect.size)

@@ -55,6 +55,8 @@ class Effect:
     """``coefficients(values, point) -> {group: (n_columns, 3)}`` with `values` a dict effect name -> array of the sensor."""
     warp: Callable | None = None
     """``warp(table, motion, values) -> [(weight, table, motion), ...]``."""
+    derivative: Callable | None = None
+    """``derivative(ref) -> (n, 3 size)``: the same as the central difference of `warp` for the true input, where it has a closed form."""
     acts_on: tuple = SENSORS
     """Sensors that a warp concerns."""
     needs: tuple = ()

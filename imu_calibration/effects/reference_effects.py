@@ -19,6 +19,11 @@ def _tilt(table, motion, values):
     return [(1.0, turntable.tilt(table, values), motion)]
 
 
+def _tilt_derivative(ref):
+    """Derivative of ``mat_sn @ (up + theta x up) g`` with respect to (theta_x, theta_y)."""
+    return ref.gravity * np.concatenate([-ref.mat_sn[:, :, 1], ref.mat_sn[:, :, 0]], axis=1)
+
+
 def _axes(table, motion, values):
     """Turn each axis but the first about the common perpendicular with the axis before it, so that their angle changes."""
     joints = list(table.joints)
@@ -71,9 +76,9 @@ def reference_effects(joint_names):
     """Return the effects of a table with these joints, of its clock, and of the sensors' lags."""
     names, n_joints = list(joint_names), len(joint_names)
     return (
-        Effect('table_tilt', 'reference', ('x', 'y'), (2,), 'rad', 1e-4, 0.02,
+        Effect('table_tilt', 'reference', ('x', 'y'), (2,), 'rad', 1e-4, 2e-3,
                'The table does not stand level: its vertical is turned by a small angle about the base axes.', ('turn_about_vertical',), 'none',
-               warp=_tilt, needs=('joints',), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),)),
+               warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),)),
         Effect('axis_non_orthogonality', 'reference', tuple(f'{a}_{b}' for a, b in zip(names, names[1:])), (max(n_joints - 1, 0),), 'rad',
                1e-4, 0.01, 'The axes of the table are not perpendicular to one another.', ('two_axis', 'static_dense'), 'none',
                warp=_axes, needs=('joints', 'two_joints'), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),)),

@@ -1,0 +1,55 @@
+"""``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
+
+from imu_calibration import documents, workflow
+from imu_calibration.cli import files, recordings
+from imu_calibration.cli.show import show_calibration
+
+NAME = 'calibrate'
+HELP = 'Write calibration.yaml and report.html from one or several recordings of the same IMU.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('bags', nargs='+', metavar='BAG', help='rosbag2 folder, .db3, .mcap or ROS 1 .bag')
+    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); without it: by hand, gravity as the reference')
+    parser.add_argument('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
+    parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for calibration by hand, default 9.80665')
+    parser.add_argument('--no-report', action='store_true', help='write calibration.yaml only')
+    parser.add_argument('--jobs', type=int, default=1, help='recordings read side by side')
+    recordings.add_topic_arguments(parser)
+    recordings.add_model_arguments(parser)
+
+
+def run(options):
+    """Calibrate, write, print the verdict."""
+    settings = recordings.calibration_options(options)
+    table = files.read_table(options.table) if options.table else None
+    names = None if table is None else table.joint_names
+    for bag in options.bags:
+        recordings.open_bag(bag, options, want_joints=table is not None).close()
+    folder = files.make_folder(options.output)
+    sources = [recordings.source_of(bag, options, names, table is not None) for bag in options.bags]
+    provenance = recordings.provenance_of(options.bags, options)
+    if table is None:
+        result = workflow.calibrate_without_table(sources, settings, options.gravity, provenance)
+    else:
+        result = workflow.calibrate(sources, table, settings, provenance, mapper=mapper(options.jobs))
+    text = documents.calibration_to_text(result.calibration)
+    if not options.no_report:
+        from imu_calibration.report import calibration_report
+        files.write_text(folder / 'report.html', calibration_report(result))
+    files.write_text(folder / 'calibration.yaml', text)
+    show_calibration(result, folder, report=not options.no_report)
+    return workflow.exit_code(result)
+
+
+def mapper(jobs):
+    """Return a map that runs in as many processes as asked."""
+    if jobs <= 1:
+        return map
+
+    def parallel(function, items):
+        from concurrent.futures import ProcessPoolExecutor
+        with ProcessPoolExecutor(jobs) as pool:
+            return list(pool.map(function, items))
+    return parallel

@@ -1,0 +1,33 @@
+"""``imu_calibration compare``: whether two calibrations agree."""
+
+from imu_calibration import comparison
+from imu_calibration.cli import files
+from imu_calibration.cli.show import SHOWN, console, with_sd
+
+NAME = 'compare'
+HELP = 'Say whether two calibrations agree, in units of their combined standard deviation.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('first', metavar='A.yaml')
+    parser.add_argument('second', metavar='B.yaml')
+
+
+def run(options):
+    """Compare and print."""
+    from rich.table import Table
+    result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
+    out = console()
+    table = Table(box=None, pad_edge=False)
+    for heading in ('parameter', 'A', 'B', 'B - A', 'combined sd', 'unit', 'in sd'):
+        table.add_column(heading, justify='left' if heading in ('parameter', 'unit') else 'right')
+    for row in result.rows:
+        factor, unit = SHOWN.get(row.unit, (1.0, row.unit))
+        difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
+        table.add_row(row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
+                      'held' if row.ratio is None else f'{row.ratio:.1f}')
+    out.print(table)
+    for line in result.lines:
+        out.print(line, soft_wrap=True)
+    return 0

@@ -1,0 +1,42 @@
+"""``imu_calibration compensate``: a bag with the corrected topic beside the others."""
+
+from pathlib import Path
+
+from imu_calibration import workflow
+from imu_calibration.cli import files, recordings
+from imu_calibration.cli.progress import progress_bar
+from imu_calibration.errors import InputError
+
+NAME = 'compensate'
+HELP = 'Write a bag with the corrected Imu topic beside all other topics.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('bag', metavar='BAG')
+    parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    parser.add_argument('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
+    parser.add_argument('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
+    recordings.add_topic_arguments(parser)
+
+
+def run(options):
+    """Compensate block by block."""
+    from msg_adapters.write import copy_with_corrected
+    calibration = files.read_calibration(options.calibration)
+    if Path(options.output).exists():
+        raise InputError(f'the output bag {options.output} must not exist yet; choose another name or remove it')
+    recording = recordings.open_bag(options.bag, options, want_joints=False)
+    with recording, progress_bar('compensate', recording.message_counts.get(recording.imu_topic, 0)) as advance:
+        stream = workflow.CompensationStream(calibration, recordings.temperatures(recording, options))
+
+        def correct(imu):
+            advance(len(imu))
+            return stream.correct(imu)
+        lost = copy_with_corrected(options.bag, options.output, recording.imu_topic, options.corrected_topic, correct)
+    for line in stream.warnings():
+        print(f'note: {line}')
+    print(f'written: {options.output} with {options.corrected_topic} ({stream.count} samples)')
+    if lost:
+        print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in lost.items()))
+    return 3 if lost else 0

@@ -1,0 +1,46 @@
+"""What the verbs print: short tables on standard output."""
+
+import numpy as np
+
+from imu_calibration import workflow
+
+SHOWN = {'m/s^2': (1e3 / 9.80665, 'mg'), 'rad/s': (180 / np.pi, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (180 / np.pi * 60, 'arcmin'), 's': (1e3, 'ms')}
+"""Units for people: SI unit -> factor, unit."""
+
+
+def console():
+    """Return a console on standard output that keeps lines whole when it is not a terminal."""
+    import sys
+
+    from rich.console import Console
+    return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+
+
+def show_calibration(result, folder, report=True):
+    """Print the verdict, the parameters and where the files are."""
+    from rich.table import Table
+    out, calibration = console(), result.calibration
+    verdict, lines = workflow.summary(result)
+    table = Table(title=None, box=None, pad_edge=False)
+    for heading in ('parameter', 'value', 'sd', 'unit', 'status'):
+        table.add_column(heading, justify='right' if heading in ('value', 'sd') else 'left')
+    for effect in calibration.model.effects:
+        part = calibration.model.slices[effect.sensor, effect.name]
+        for k, index in enumerate(range(part.start, part.stop)):
+            factor, unit = SHOWN.get(effect.unit_of(k), (1.0, effect.unit_of(k)))
+            value, sd = calibration.values[index] * factor, calibration.sd[index] * factor
+            table.add_row(calibration.param_names[index], *with_sd(value, sd), unit, calibration.status[index])
+    out.print(table)
+    out.print(f'verdict: {verdict}')
+    for line in lines:
+        out.print('  ' + line, soft_wrap=True)
+    files = 'calibration.yaml' + (' and report.html' if report else '')
+    out.print(f'written: {files} in {folder}', soft_wrap=True)
+
+
+def with_sd(value, sd):
+    """Return value and standard deviation as text with no more digits than the standard deviation supports."""
+    if not np.isfinite(sd) or sd <= 0:
+        return f'{value:.6g}', f'{sd:.2g}'
+    digits = max(0, min(12, 1 - int(np.floor(np.log10(sd)))))
+    return f'{value:.{digits}f}', f'{sd:.{digits}f}'

@@ -1,0 +1,373 @@
+"""Use cases as plain functions: the command line, the nodes and the tests call the same ones."""
+
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+
+import numpy as np
+
+import imu_calibration
+from imu_calibration import observability
+from imu_calibration.calibration import DETERMINED, Calibration, statuses, tolerances_of
+from imu_calibration.errors import InputError
+from imu_calibration.estimation import make_prior, solve
+from imu_calibration.gathering import Gathered, gather, merge, restrict
+from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
+from imu_calibration.settings import WindowSettings
+
+SENSORS = ('accelerometer', 'gyroscope')
+G = 9.80665
+PASSES = 4
+"""Passes over a recording at most, when effects have to be linearised anew."""
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What to estimate and how to judge it."""
+
+    accelerometer_model: str | None = None
+    """Named model or names joined by '+'; None: bias+matrix, and accel_size_effect when the rotation shows it."""
+    gyroscope_model: str | None = None
+    """The same; None: bias+matrix."""
+    reference_model: str | None = None
+    """Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when latitude or azimuth is unknown."""
+    tolerances: dict = field(default_factory=dict)
+    """{section: {effect: tolerance}}."""
+    windows: WindowSettings = WindowSettings()
+    """How windows are found."""
+    nominal: object | None = None
+    """NominalScaling for recordings in volts or counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A calibration with what a report needs beside it."""
+
+    calibration: Calibration
+    """The document's content."""
+    solution: object
+    """The Solution, or the HandCalibration of a recording without a table."""
+    gathered: Gathered
+    """Windows, counts, kept samples."""
+    table: object
+    """The Table, or None."""
+    model: SensorModel
+    """The model that was solved."""
+    gathered_model: SensorModel
+    """The model whose columns were gathered; it may have more effects."""
+    tolerances: np.ndarray
+    """Tolerance of each parameter."""
+
+
+def choose_model(options, table, temperature_c=None):
+    """
+    Return the model whose columns are gathered; `settle_model` takes out what the rotation does not show.
+
+    With an unknown place of the mount, the size effect comes with a common `lever_arm` and the origin is the mean of the three
+    sensitive points.
+    """
+    names = table.joint_names
+    accelerometer = parse_effects('accelerometer', options.accelerometer_model or 'bias+matrix+accel_size_effect', names)
+    gyroscope = parse_effects('gyroscope', options.gyroscope_model or 'bias+matrix', names)
+    if 'accel_size_effect' in accelerometer and table.mount_xyz is None and 'lever_arm' not in accelerometer:
+        accelerometer += ('lever_arm',)
+    if options.reference_model is None:
+        reference = ('table_tilt',) + (('earth_rate',) if table.latitude is None or table.azimuth_deg is None else ())
+    else:
+        reference = tuple(name for name in options.reference_model.split('+') if name not in ('', 'none'))
+    reference_c = 25.0 if temperature_c is None else float(round(temperature_c))
+    return SensorModel(accelerometer, gyroscope, reference, tuple(names), reference_c)
+
+
+def settle_model(model, options, gathered):
+    """Return the model without the size effect when nobody asked for it and the recording holds no rotation that shows it."""
+    if options.accelerometer_model is not None:
+        return model
+    if gathered.accumulator.samples.get('spin', 0) + gathered.accumulator.samples.get('dynamic', 0) == 0:
+        return model.without('accelerometer', 'accel_size_effect').without('accelerometer', 'lever_arm')
+    return model
+
+
+def calibrate(sources, table, options=CalibrationOptions(), provenance=None, progress=None, mapper=map):
+    """
+    Calibrate from one or several recordings of the same IMU on a table.
+
+    Parameters
+    ----------
+    sources : sequence of callables
+        Each returns an iterator of SampleBlock when called; called again when effects must be linearised anew.
+    table : Table
+        The reference.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
+    progress : callable, optional
+        Called with the number of IMU samples read.
+    mapper : callable
+        Applies the map step to the recordings; `map`, or that of a pool.
+
+    Returns
+    -------
+    CalibrationResult
+
+    """
+    model = choose_model(options, table, _first_temperature(sources, options))
+    for _ in range(PASSES):
+        gathered = merge(mapper(_Gather(table, model, options, progress), enumerate(sources)))
+        check_units(gathered, model)
+        result = finish(gathered, model, table, options, provenance)
+        if not _needs_another_pass(model, result.solution):
+            break
+        model = model.at(_values_in(model, result.solution))
+    return result
+
+
+@dataclass
+class _Gather:
+    """The map step with its arguments bound, so that it can be sent to another process."""
+
+    table: object
+    model: object
+    options: CalibrationOptions
+    progress: object
+
+    def __call__(self, numbered):
+        session, source = numbered
+        return gather(source(), self.table, self.model, self.options.windows, self.options.nominal, session, progress=self.progress)
+
+
+def _first_temperature(sources, options):
+    """Return the first temperature of the first recording when a thermal effect asks for a reference temperature."""
+    if 'thermal' not in (options.accelerometer_model or '') + (options.gyroscope_model or ''):
+        return None
+    for block in sources[0]():
+        if block.temperature is not None and len(block.temperature):
+            return float(block.temperature.temperature_c[0])
+    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
+
+
+def _needs_another_pass(model, solution):
+    """Return whether an effect moved so far from where its columns were taken that the first derivative no longer holds."""
+    for effect in model.relinearised:
+        if (effect.sensor, effect.name) not in solution.model.slices:
+            continue
+        part = solution.model.slices[effect.sensor, effect.name]
+        moved = np.abs(solution.values[part] - model.warp_point(effect))
+        if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
+            return True
+    return False
+
+
+def _values_in(model, solution):
+    values = model.start()
+    for effect in solution.model.effects:
+        values[model.slices[effect.sensor, effect.name]] = solution.values[solution.model.slices[effect.sensor, effect.name]]
+    return values
+
+
+def finish(gathered, model, table, options=CalibrationOptions(), provenance=None):
+    """Solve what was gathered and judge it: the reduce step of calibration; the live node calls it after each window."""
+    narrow = settle_model(model, options, gathered)
+    accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    solution = solve(accumulator, narrow)
+    if options.accelerometer_model is None and _size_effect_unseen(solution):
+        smaller = narrow.without('accelerometer', 'accel_size_effect').without('accelerometer', 'lever_arm')
+        solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
+    tolerances = tolerances_of(narrow, options.tolerances)
+    calibration = document(solution, tolerances, table, gathered, provenance)
+    return CalibrationResult(calibration, solution, gathered, table, narrow, model, tolerances)
+
+
+def _size_effect_unseen(solution):
+    part = solution.model.slices.get(('accelerometer', 'accel_size_effect'))
+    return part is not None and bool(solution.held[part].all())
+
+
+def document(solution, tolerances, table, gathered, provenance=None):
+    """Return the Calibration for a solution, with statuses, weak directions and the motions that would help."""
+    model = solution.model
+    covariance = with_gravity_uncertainty(solution, table)
+    sd = np.sqrt(np.diag(covariance))
+    prior = make_prior(model)
+    status = statuses(model, sd, solution.held, tolerances)
+    needed = observability.needed_motions(solution, tolerances, table.gravity_value, prior.sd)
+    directions = observability.weak_directions(covariance, tolerances, model.param_names)
+    undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
+    centred = ('accelerometer', 'lever_arm') in model.slices and ('accelerometer', 'accel_size_effect') in model.slices
+    gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
+    return Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
+                       statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
+
+
+def _need(weights, needed):
+    texts = [needed[name][0] for name in sorted(weights, key=lambda n: -abs(weights[n])) if name in needed]
+    return texts[0] if texts else 'more of the same motion'
+
+
+def with_gravity_uncertainty(solution, table):
+    """Return the covariance with the uncertainty of gravity, which scales the accelerometer matrix as a whole."""
+    if not table.gravity_sd:
+        return solution.covariance
+    direction = np.zeros(len(solution.values))
+    part = solution.model.slices['accelerometer', 'matrix']
+    direction[part] = solution.values[part] * table.gravity_sd / table.gravity_value
+    return solution.covariance + np.outer(direction, direction)
+
+
+def statistics(solution, gathered):
+    """Return the statistics section: noise, residuals, chi-square, windows, what was dropped."""
+    result = {}
+    for sensor in SENSORS:
+        noise = solution.noise[sensor]
+        result[sensor] = {
+            'noise_sd': noise.sample_sd(), 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd, 'wander_sd': noise.wander_sd,
+            'wander_time_s': noise.wander_time if noise.wander_sd else None, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
+            'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
+    accumulator = gathered.accumulator
+    result['windows'] = dict(sorted(accumulator.windows.items()))
+    result['samples_used'] = dict(sorted(accumulator.samples.items()))
+    result['dropped'] = dropped(gathered.counts)
+    result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
+    return result
+
+
+STREAM_COUNTS = ('used', 'gap', 'gaps', 'imu', 'joints', 'samples', 'clock reset')
+"""Counts that do not mean lost samples."""
+
+
+def dropped(counts):
+    """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
+    return {reason: int(count) for reason, count in sorted(counts.items())
+            if isinstance(count, (int, np.integer)) and count and not any(reason.startswith(name) for name in STREAM_COUNTS)}
+
+
+def _finite(value):
+    return float(value) if np.isfinite(value) else None
+
+
+def conditions(gathered, table):
+    """Return the conditions section."""
+    date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
+    return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,
+            'gravity': table.gravity_value if table is not None else None, 'duration_s': gathered.duration, 'date': date}
+
+
+def check_units(gathered, model):
+    """
+    Refuse recordings whose units are plainly not SI.
+
+    Compares the length of the specific force at rest with gravity, and the measured rates with those of the joints.
+
+    Raises
+    ------
+    InputError
+        Naming the likely unit.
+
+    """
+    rows = gathered.accumulator.rows
+    static = [row for row in rows if row.kind == 'static']
+    if static:
+        length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
+        if 0.8 < length < 1.25:
+            raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
+                             f'give --nominal with accelerometer_scale {1 / G:.6f}')
+        if not 3.0 < length < 30.0:
+            raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')
+    _check_rates([row for row in rows if row.kind != 'static'], gathered, model)
+
+
+def _check_rates(moving, gathered, model):
+    measured, reference = 0.0, 0.0
+    start = 0
+    for name, width in model.groups('gyroscope'):
+        if name == 'rate':
+            break
+        start += width
+    for (sensor, kind), factor in gathered.accumulator.within.items():
+        if sensor == 'gyroscope':
+            measured += (factor[:, -3:]**2).sum()
+            reference += (factor[:, start:start + 3]**2).sum()
+    for row in moving:
+        mean = row.sensors['gyroscope'].mean
+        measured += row.count * (mean[-3:]**2).sum()
+        reference += row.count * (mean[start:start + 3]**2).sum()
+    if reference <= 0 or measured <= 0:
+        return
+    ratio = np.sqrt(measured / reference)
+    if 40 < ratio < 80:
+        raise InputError(f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; convert them in the '
+                         'driver or give --nominal with gyroscope_scale 57.29578')
+    if 1 / 80 < ratio < 1 / 40:
+        raise InputError(f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like degrees; '
+                         'convert them in the driver of the table')
+
+
+def summary(result):
+    """Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people."""
+    calibration = result.calibration
+    lines, verdict = [], 'good'
+    requested = [k for k, name in enumerate(calibration.param_names) if requested_parameter(result, name)]
+    weak = [k for k in requested if calibration.status[k] != DETERMINED]
+    if weak:
+        verdict = 'weak'
+        for status in ('weak', 'held'):
+            names = [calibration.param_names[k] for k in weak if calibration.status[k] == status]
+            if names:
+                lines.append(f'{status}: {", ".join(names)}')
+        needs = list(dict.fromkeys(d['needs'] for d in calibration.undetermined))
+        lines += [f'next: {need}' for need in needs[:3]]
+    if calibration.statistics.get('dropped'):
+        lines.append('dropped: ' + ', '.join(f'{count} {reason}' for reason, count in calibration.statistics['dropped'].items()))
+    bad = misfits(calibration)
+    if bad:
+        verdict, lines = 'bad', bad + lines
+    return verdict, lines
+
+
+def requested_parameter(result, name):
+    """Return whether a parameter is the robot's business; table, clock and the common arm are nuisances."""
+    return not name.startswith('reference.') and '.lever_arm.' not in name
+
+
+MISFIT = 10.0
+"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
+
+
+def misfits(calibration):
+    """Return a line for each sensor whose residuals in motion are far above its noise at rest."""
+    lines = []
+    for sensor in SENSORS:
+        for kind, ratio in (calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}).items():
+            if kind != 'means' and ratio > MISFIT:
+                lines.append(f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times the noise at rest; '
+                             "run 'imu_calibration diagnose' to find the cause")
+    return lines
+
+
+def exit_code(result):
+    """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
+    calibration = result.calibration
+    lacking = any(status != DETERMINED for name, status in zip(calibration.param_names, calibration.status) if requested_parameter(result, name))
+    return 3 if lacking or calibration.statistics.get('dropped') else 0
+
+
+def window_residuals(result):
+    """
+    Return residuals per window before and after: what a nominal sensor would show, and what the model leaves.
+
+    Returns
+    -------
+    dict
+        'time', 'kind', 'count', and per sensor 'before', 'after', each shape (n_windows, 3): residuals of window means.
+
+    """
+    solution, rows = result.solution, result.gathered.accumulator.rows
+    wide, narrow = result.gathered_model, result.model
+    accumulator = result.gathered.accumulator if wide is narrow else restrict(result.gathered.accumulator, wide, narrow)
+    found = {'time': np.array([r.time for r in rows]), 'kind': [r.kind for r in rows], 'count': np.array([r.count for r in rows])}
+    nominal = narrow.start()
+    for sensor in SENSORS:
+        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
+        after, before = coefficients(narrow, sensor, solution.values), coefficients(narrow, sensor, np.where(np.isfinite(nominal), nominal, 0.0))
+        found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
+                         'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
+    return found
