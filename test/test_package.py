@@ -117,7 +117,7 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
     lines = pinned(name)
     for line in lines:
         requirement, _, reason = line.partition('#')
-        assert re.fullmatch(r'[\w.-]+(\[\w+\])?==[\w.]+(; python_version < "3\.\d+")?', requirement.strip()), line
+        assert re.fullmatch(r'[\w.-]+==[\w.]+(; python_version < "3\.\d+")?', requirement.strip()), line
         assert len(reason.split()) >= 2, f'why is this needed? {line}'
     names = [distribution(line) for line in lines]
     assert len(names) == len(set(names))
@@ -143,6 +143,27 @@ def test_every_file_that_a_make_target_runs_exists():
     scripts = set(re.findall(r'\$\(PY\) (\w+/\w+\.py)', makefile))
     assert {'examples/demo.py', 'examples/live_demo.py', 'benchmarks/run.py'} <= scripts
     assert {script for script in scripts if not (ROOT / script).is_file()} == set()
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name)
+def test_launch_files_name_executables_and_config_files_that_exist(path):
+    text = path.read_text()
+    ast.parse(text)
+    nodes = set(re.findall(r'\b(\w+_node)\b', text))
+    assert nodes and nodes <= EXECUTABLES
+    files = set(re.findall(r"'(\w+\.yaml)'", text)) | ({f'{node}.yaml' for node in nodes} if "{name}.yaml" in text else set())
+    assert files and all((ROOT / 'config' / name).is_file() for name in files)
+
+
+def test_node_parameter_files_hold_one_documented_set_for_any_node_name():
+    for path in (ROOT / 'config').glob('*_node.yaml'):
+        assert path.stem in EXECUTABLES
+        (name, group), = yaml.safe_load(path.read_text()).items()
+        assert name == '/**' and set(group) == {'ros__parameters'}
+        lines = path.read_text().splitlines()
+        for parameter in group['ros__parameters']:
+            row = next(i for i, line in enumerate(lines) if line.strip().startswith(f'{parameter}:'))
+            assert lines[row - 1].strip().startswith('#') or '#' in lines[row], f'{path.name}: {parameter} has no comment'
 
 
 def test_links_of_the_documents_lead_somewhere():

@@ -1,0 +1,33 @@
+"""
+Calibrate an IMU on a table, live.
+
+    ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+
+
+def generate_launch_description():
+    """Describe calibration_node and the names it can be given."""
+    return LaunchDescription([
+        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
+                              description='table description, YAML'),
+        DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
+                              description='parameters of the node, YAML'),
+        DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
+        DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
+        DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        Node(
+            package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
+            parameters=[LaunchConfiguration('params'),
+                        {'table_file': LaunchConfiguration('table'), 'use_sim_time': LaunchConfiguration('use_sim_time')}],
+            remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states'))],
+        ),
+    ])

@@ -1,0 +1,33 @@
+"""
+Correct an IMU's messages with a calibration, live.
+
+    ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml imu:=/imu/data_raw
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+
+
+def generate_launch_description():
+    """Describe compensator_node and the names it can be given."""
+    return LaunchDescription([
+        DeclareLaunchArgument('calibration', default_value='',
+                              description='calibration.yaml; empty: wait for the latched topic imu/calibration'),
+        DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
+                              description='parameters of the node, YAML'),
+        DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
+        DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
+        DeclareLaunchArgument('corrected', default_value='imu/data_corrected', description='topic of the corrected messages'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        Node(
+            package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
+            parameters=[LaunchConfiguration('params'),
+                        {'calibration_file': LaunchConfiguration('calibration'), 'use_sim_time': LaunchConfiguration('use_sim_time')}],
+            remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('imu/data_corrected', LaunchConfiguration('corrected'))],
+        ),
+    ])

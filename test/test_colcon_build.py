@@ -1,0 +1,86 @@
+"""The tree builds as a ROS 2 workspace, and every executable starts from it."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+EXECUTABLES = ('imu_calibration', *NODES)
+NOT_SOURCE = shutil.ignore_patterns('.git', '.venv*', '.hypothesis', '.pytest_cache', '__pycache__', '*.egg-info', 'build', 'install', 'log', 'demo', 'out')
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory):
+    """A workspace with this tree built in it."""
+    folder = tmp_path_factory.mktemp('workspace')
+    shutil.copytree(ROOT, folder / 'src' / 'imu_calibration', ignore=NOT_SOURCE)
+    done = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, env=plain_environment(), capture_output=True, text=True,
+                          timeout=300)
+    logs = '\n'.join(path.read_text() for path in sorted(folder.glob('log/latest_build/*/std*.log')))
+    assert done.returncode == 0, done.stdout + done.stderr + logs
+    return folder
+
+
+def plain_environment():
+    """The environment of a shell outside the checkout, with this interpreter first on PATH."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(('PYTEST', 'COLCON', 'PYTHONPATH'))}
+    environment['PATH'] = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
+    if 'ROS_DISTRO' in os.environ and 'PYTHONPATH' in os.environ:
+        environment['PYTHONPATH'] = os.environ['PYTHONPATH']
+    return environment
+
+
+def sourced(workspace, *command, **options):
+    """Run `command` in a shell that has sourced the workspace, away from the checkout."""
+    script = f'. {workspace}/install/setup.bash && exec "$@"'
+    return subprocess.run(['bash', '-c', script, 'bash', *map(str, command)], cwd=workspace, env=plain_environment(), capture_output=True,
+                          text=True, timeout=120, **options)
+
+
+def prefix(workspace):
+    """Where the package was installed."""
+    return workspace / 'install' / 'imu_calibration'
+
+
+@pytest.mark.parametrize('name', EXECUTABLES)
+def test_executables_lie_where_ros2_run_and_the_shell_look(workspace, name):
+    assert os.access(prefix(workspace) / 'lib' / 'imu_calibration' / name, os.X_OK)
+    found = sourced(workspace, 'bash', '-c', f'type -p {name}')
+    assert found.stdout.strip() == str(prefix(workspace) / 'bin' / name)
+
+
+def test_the_ament_index_finds_the_package_with_its_files(workspace):
+    script = 'from ament_index_python.packages import get_package_share_directory as share; print(share("imu_calibration"))'
+    done = sourced(workspace, 'python', '-c', script)
+    assert done.returncode == 0, done.stderr
+    share = Path(done.stdout.strip())
+    assert share == prefix(workspace) / 'share' / 'imu_calibration'
+    for folder, pattern in (('config', '*.yaml'), ('launch', '*.launch.py')):
+        source = sorted(path.name for path in (ROOT / folder).glob(pattern))
+        assert source and sorted(path.name for path in (share / folder).iterdir() if path.is_file()) == source
+    assert (share / 'package.xml').is_file()
+
+
+def test_the_code_and_its_files_come_from_the_workspace(workspace):
+    script = ('import imu_calibration, msg_adapters; from imu_calibration.resources import config_file; '
+              'print(imu_calibration.__file__, msg_adapters.__file__, config_file("tolerances.yaml"))')
+    done = sourced(workspace, 'python', '-c', script)
+    assert done.returncode == 0, done.stderr
+    assert all(name.startswith(str(prefix(workspace))) for name in done.stdout.split())
+
+
+@pytest.mark.parametrize('folder', ['bin', 'lib/imu_calibration'])
+def test_the_command_line_starts(workspace, folder):
+    done = sourced(workspace, prefix(workspace) / folder / 'imu_calibration', '--help')
+    assert done.returncode == 0, done.stderr
+    for verb in ('inspect', 'calibrate', 'compensate', 'simulate', 'compare'):
+        assert verb in done.stdout
