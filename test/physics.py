@@ -66,7 +66,8 @@ class Session:
     covariance: dict | None
     """Variances that the messages claim ('force', 'rate'), or None for unknown."""
     truth: dict
-    """'accelerometer' and 'gyroscope' (Triads), 'values' (effect name -> value), 'earth_n', 'profile', 'noise', and times of events."""
+    """'accelerometer' and 'gyroscope' (Triads), 'values' (effect name -> value), 'earth_n', 'temperature_c' (at the IMU samples), 'profile',
+    'noise', and times of events."""
 
     @property
     def block(self):
@@ -148,6 +149,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     session = Session(imu, joints, climate.publish(start_ns, moves.duration, _generator(seed, 'thermometer')) if temperature else None, _told(mapping, gravity, hidden),
                       _claims(model, imu_rate) if wrong_covariance else None,
                       {'accelerometer': triads[0], 'gyroscope': triads[1], 'values': values, 'earth_n': world.earth_n, 'gravity': gravity,
+                       'temperature_c': climate.at(sampling.time),
                        'profile': moves, 'noise': model, 'start_ns': start_ns, **events})
     return _drop(session, dropped, start_ns, events['gap'])
 

@@ -1,0 +1,66 @@
+"""The catalogue's forward equations reproduce what the physics made: one convention for signs, units and order of every parameter."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from physics import EFFECTS, make_session
+
+from imu_calibration.effects import owner_of
+from imu_calibration.joint_motion import JointMotion
+from imu_calibration.sensor_model import SensorModel, predict
+from imu_calibration.turntable import Table
+
+OPTIONS = {'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
+LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3, 'encoder_harmonic': 1e-3}
+"""Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; else 1 ns stamps."""
+
+
+@lru_cache(maxsize=1)
+def plain():
+    return make_session(11, None, 'none', **OPTIONS)
+
+
+def told_motion(session):
+    """Return the joints as their encoders tell them, at the IMU's stamps."""
+    profile, value = session.truth['profile'], session.truth['values'].get('encoder_harmonic')
+    time = (session.imu.stamp_ns - session.truth['start_ns']) * 1e-9
+    motion = profile.at(time)
+    if value is None:
+        return motion
+    from physics import _encoder_reading
+    step = 2e-3
+    readings = [_encoder_reading(profile.at(time + k * step).position, value)[0] for k in (-2, -1, 0, 1, 2)]
+    rate = (8 * (readings[3] - readings[1]) - (readings[4] - readings[0])) / (12 * step)
+    acceleration = (-readings[0] + 16 * readings[1] - 30 * readings[2] + 16 * readings[3] - readings[4]) / (12 * step**2)
+    return JointMotion(time, readings[2], rate, acceleration, motion.jerk)
+
+
+def predicted(session, name=None):
+    triads = session.truth['accelerometer'], session.truth['gyroscope']
+    model = SensorModel(joint_names=tuple(joint['name'] for joint in session.table['joints']))
+    parts = {('accelerometer', 'bias'): triads[0].bias, ('accelerometer', 'matrix'): triads[0].matrix,
+             ('gyroscope', 'bias'): triads[1].bias, ('gyroscope', 'matrix'): triads[1].matrix}
+    if name is not None:
+        sensor = owner_of(name)
+        model = model.with_effect(sensor, name)
+        parts[sensor, name] = session.truth['values'][name]
+    values = model.start()
+    for key, value in parts.items():
+        values[model.slices[key]] = np.ravel(value)
+    table = Table.from_mapping(session.table | {'gravity': session.truth['gravity']})
+    return predict(model, values, table, told_motion(session), session.truth['temperature_c'])
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_forward_equation_reproduces_the_physics(name):
+    session = make_session(11, {name: None}, 'none', **OPTIONS)
+    without, with_effect = predicted(session), predicted(session, name)
+    measured = session.imu.force_s, session.imu.rate_s
+    acts = 0
+    for got, before, after in zip(measured, without, with_effect):
+        change, rest = (np.sqrt(np.mean((got - guess) ** 2)) for guess in (before, after))
+        if change > 1e-5:
+            acts += 1
+            assert rest < LEFT.get(name, 1e-3) * change + 2e-7
+    assert acts
