@@ -77,31 +77,30 @@ def _per_sample(gain, step, first, second):
 
 
 def _quaternion(vectors):
-    """Return unit quaternions (w, x, y, z) of rotation vectors, shape (n, 4)."""
+    """Return unit quaternions of rotation vectors, rows w, x, y, z, shape (4, n)."""
     angle = np.linalg.norm(vectors, axis=1)
-    return np.column_stack([np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi)[:, None] * vectors])
+    return np.vstack([np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * vectors.T])
 
 
 def _multiply(left, right):
-    scalar = left[:, 0] * right[:, 0] - np.einsum('ij,ij->i', left[:, 1:], right[:, 1:])
-    vector = left[:, :1] * right[:, 1:] + right[:, :1] * left[:, 1:] + np.cross(left[:, 1:], right[:, 1:])
-    return np.column_stack([scalar, vector])
+    (a, b, c, d), (w, x, y, z) = left, right
+    return np.stack([a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
+                     a * z + b * y - c * x + d * w])
 
 
 def _prefix_product(quaternions):
     """Return q_0, q_0 q_1, q_0 q_1 q_2, ...: doubling the reach in every pass."""
     product, reach = quaternions.copy(), 1
-    while reach < len(product):
-        product[reach:] = _multiply(product[:-reach], product[reach:])
+    while reach < product.shape[1]:
+        product[:, reach:] = _multiply(product[:, :-reach], product[:, reach:])
         reach *= 2
-    return product / np.linalg.norm(product, axis=1, keepdims=True)
+    return product / np.linalg.norm(product, axis=0)
 
 
 def _matrix_to_sensor(quaternions):
     """Return the matrices that take coordinates in the first sensor frame to the turned one (the transposed attitude)."""
-    scalar, vector = quaternions[:, 0, None, None], quaternions[:, 1:]
-    cross = skew(vector)
-    return np.eye(3) - 2 * scalar * cross + 2 * cross @ cross
+    cross = skew(quaternions[1:].T)
+    return np.eye(3) - 2 * quaternions[0, :, None, None] * cross + 2 * cross @ cross
 
 
 def _right_jacobian(vectors):

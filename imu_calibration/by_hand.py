@@ -1,0 +1,236 @@
+"""Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from imu_calibration.by_hand_advice import missing_motion
+from imu_calibration.by_hand_poses import average_poses, collect_turns, distinct_attitudes, known_turn_data
+from imu_calibration.by_hand_solver import solve_joint
+from imu_calibration.by_hand_system import ACCELEROMETER, COMPONENTS, NOMINAL, PARAM_NAMES, Poses, State, norm_rows, unpack
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.settings import setting
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2; what is taken when the site is not known."""
+GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
+"""x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
+POSES_LEAST = 4
+"""Fewer attitudes leave even the accelerometer's biases to the prior."""
+POSES_FULL = 9
+"""The nine accelerometer parameters take one equation per attitude."""
+
+
+@dataclass(frozen=True)
+class ByHandSettings:
+    """Numbers for calibration by hand."""
+
+    pose_apart: float = setting(0.2, 'rad', 'attitudes closer than this count as one pose', (0.001, 1.5), '')
+    turn_maximum: float = setting(30.0, 's', 'longer stretches between two poses are not used for the gyroscope', (0.5, 3600.0),
+                                  'too small: few turns; too large: gyroscope drift and clipping enter')
+    gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
+                         'too large: rotation is lost in holes and shows as turn scatter')
+    pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
+    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it', (0.0, 1.0), '')
+    turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
+    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0), 'too small: scales too sure')
+    known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
+                                   'too small: misalignments too sure')
+    accelerometer_bias_tolerance: float = setting(9.80665e-3, 'm/s^2', 'sd that is good enough: 1 mg', (0.0, None), '')
+    accelerometer_matrix_tolerance: float = setting(1e-3, '1', 'sd that is good enough', (0.0, None), '')
+    gyroscope_bias_tolerance: float = setting(1.7453e-4, 'rad/s', 'sd that is good enough: 0.01 deg/s', (0.0, None), '')
+    gyroscope_matrix_tolerance: float = setting(1e-3, '1', 'sd that is good enough', (0.0, None), '')
+    accelerometer_bias_prior: float = setting(1.0, 'm/s^2', 'sd of the bias before any data (consumer grade, 100 mg)', (0.0, None), '')
+    accelerometer_matrix_prior: float = setting(0.05, '1', 'sd of scale and misalignment before any data', (0.0, None), '')
+    gyroscope_bias_prior: float = setting(0.2, 'rad/s', 'sd of the bias before any data (consumer grade, 10 deg/s)', (0.0, None), '')
+    gyroscope_matrix_prior: float = setting(0.05, '1', 'sd of scale and misalignment before any data', (0.0, None), '')
+
+    def per_parameter(self, kind):
+        """Return the 'tolerance' or 'prior' of each parameter in `PARAM_NAMES` order, shape (21,)."""
+        return np.array([getattr(self, f'{name.split(".")[0]}_{name.split(".")[1]}_{kind}') for name in PARAM_NAMES])
+
+
+@dataclass(frozen=True)
+class NominalScaling:
+    """How raw counts become SI units: ``value = (counts - offset) / scale``; numbers, or three of them."""
+
+    accelerometer_offset: object = 0.0
+    """Counts at zero specific force."""
+    accelerometer_scale: object = 1.0
+    """Counts per m/s^2."""
+    gyroscope_offset: object = 0.0
+    """Counts at zero rate."""
+    gyroscope_scale: object = 1.0
+    """Counts per rad/s."""
+
+    def apply(self, imu):
+        """Return `imu` in SI units."""
+        scales = np.abs(np.concatenate([np.atleast_1d(np.asarray(s, float)) for s in (self.accelerometer_scale, self.gyroscope_scale)]))
+        if not np.all(np.isfinite(scales) & (scales > 0)):
+            raise InputError(f'nominal scale factors must be finite and not zero, got {scales.tolist()}; give counts per SI unit')
+        return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
+                       rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
+
+
+@dataclass(frozen=True)
+class KnownTurn:
+    """A turn of known angle about a body axis that stays put."""
+
+    start: int
+    """First sample."""
+    stop: int
+    """After the last sample."""
+    axis: tuple
+    """Unit vector in the sensor frame; turns counter-clockwise seen from its tip."""
+    angle: float
+    """rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandCalibration:
+    """Forward model ``measured = bias + matrix @ true`` of both sensors, with its uncertainty."""
+
+    param_names: tuple
+    """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
+    values: np.ndarray
+    """Parameters in `param_names` order, SI, shape (21,)."""
+    covariance: np.ndarray
+    """Covariance of `values`, shape (21, 21)."""
+    statuses: tuple
+    """'determined', 'weak' or 'held' for each parameter."""
+    tolerances: np.ndarray
+    """Sd that would be good enough, shape (21,)."""
+    priors: np.ndarray
+    """Sd before any data, shape (21,)."""
+    gravity: float
+    """Reference, m/s^2."""
+    gauge: dict
+    """Conventions of origin and axes."""
+    advice: tuple
+    """({'parameters': {name: sd over tolerance}, 'needs': motion}, ...) for what is not determined."""
+    statistics: dict
+    """Counts, noise, scatter, chi-square: plain numbers."""
+    poses: Poses
+    """The poses that were used."""
+    state: State = field(repr=False, default=None)
+    """Directions and drifts of the poses."""
+
+    @property
+    def sd(self):
+        """Standard deviation of each parameter, shape (21,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, name):
+        """Return the parameter called `name`."""
+        return float(self.values[self.param_names.index(name)])
+
+    def sd_of(self, name):
+        """Return the standard deviation of the parameter called `name`."""
+        return float(self.sd[self.param_names.index(name)])
+
+    @property
+    def accelerometer(self):
+        """(bias, matrix) of the accelerometer."""
+        return unpack(self.values)[:2]
+
+    @property
+    def gyroscope(self):
+        """(bias, matrix) of the gyroscope."""
+        return unpack(self.values)[2:]
+
+    def compensate(self, force, rate):
+        """Return true specific force and rate for readings of shape (n, 3)."""
+        (bias_f, matrix_f), (bias_w, matrix_w) = self.accelerometer, self.gyroscope
+        return np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
+
+    def norm_residuals(self, force=None):
+        """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
+        return norm_rows(self.values, self.poses.force if force is None else force, self.gravity)[0]
+
+
+def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=()):
+    """
+    Calibrate accelerometer and gyroscope from poses held still and the turns between them.
+
+    One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
+    pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
+    drifts and turns is estimated along. A wrong `gravity` is the same as a common scale of the accelerometer.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        In SI units, or in counts with `nominal`; stamps must not go backwards.
+    gravity, gravity_sd : float
+        Local gravity and its sd, m/s^2.
+    stills : sequence of slices or (start, stop), optional
+        Intervals at rest; found by `windows.find_still` when not given.
+    settings : ByHandSettings
+    nominal : NominalScaling, optional
+        Conversion from counts; the result then refers to the converted values.
+    known_turns : sequence of KnownTurn
+        Full turns by hand, beside what gravity says.
+
+    Returns
+    -------
+    HandCalibration
+
+    Raises
+    ------
+    NotObservableError
+        With fewer than four different attitudes.
+
+    """
+    imu = imu if nominal is None else nominal.apply(imu)
+    time = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
+    poses, noise = average_poses(imu, _as_ranges(imu, stills))
+    attitudes = distinct_attitudes(poses.force, settings.pose_apart)
+    if attitudes < POSES_LEAST:
+        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all '
+                                 f'parameters), got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
+    turns, dropped = collect_turns(time, imu.rate_s, poses, noise, settings)
+    turns += [known_turn_data(time, imu.rate_s, turn, noise, settings) for turn in known_turns]
+    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, {'attitudes': attitudes, 'turns_dropped': dropped, **noise})
+
+
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics):
+    """Estimate from poses and turns that are at hand; see `calibrate_by_hand`."""
+    priors, tolerances = settings.per_parameter('prior'), settings.per_parameter('tolerance')
+    fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
+    found = solve_joint(poses, turns, gravity, gravity_sd, priors, fallback)
+    statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, tolerances)
+    pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
+    turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
+    advice = missing_motion(found.factor, found.state.values, statuses, PARAM_NAMES, priors, tolerances, gravity, pose_sd, turn_sd)
+    statistics = {**statistics, **_statistics(found, poses, turns, gravity)}
+    return HandCalibration(PARAM_NAMES, found.state.values, found.covariance, statuses, tolerances, priors, gravity, dict(GAUGE), advice,
+                           statistics, poses, found.state)
+
+
+def _statuses(sd, held, tolerances):
+    return tuple('held' if h else 'determined' if s <= t else 'weak' for s, h, t in zip(sd, held, tolerances))
+
+
+def _statistics(found, poses, turns, gravity):
+    before = norm_rows(NOMINAL, poses.force, gravity)[0]
+    after = norm_rows(found.state.values, poses.force, gravity)[0]
+    sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
+    spare = len(after) - int(np.sum(~found.held[ACCELEROMETER]))
+    result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
+              'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
+              'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}
+    for index, name in enumerate(COMPONENTS):
+        result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
+        result[f'{name}_dof'] = float(found.scatter.dof[index])
+    return result
+
+
+def _as_ranges(imu, stills):
+    if stills is None:
+        from imu_calibration.windows import find_still
+        stills = find_still(imu)
+    ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
+    ranges = [(a, b) for a, b in ranges if b - a >= 2]
+    if not ranges:
+        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, got no interval at rest; '
+                                 'hold the IMU still for a second or more in each attitude')
+    return ranges

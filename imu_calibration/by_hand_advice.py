@@ -1,0 +1,86 @@
+"""What to do next when a calibration by hand leaves a parameter weak: the pose or turn that would help most."""
+
+import itertools
+
+import numpy as np
+
+from imu_calibration.by_hand_system import ACCELEROMETER, AXES, GYRO_BIAS, GYRO_MATRIX, N_PARAMS, norm_rows, unpack
+from imu_calibration.reference import skew
+
+STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d))
+"""Six faces, twelve edges and eight corners turned up."""
+
+
+def missing_motion(factor, values, statuses, param_names, priors, tolerances, gravity, pose_sd, turn_sd):
+    """
+    Name the standard pose or turn that lowers the worst sd of each sensor most.
+
+    The declared standard motions (26 directions up; turns of 180 deg about each sensor axis held level, in two attitudes)
+    are added to the equations one at a time and the predicted sd over tolerance is compared.
+
+    Parameters
+    ----------
+    factor : array, shape (21, 21)
+        Weighted equations so far.
+    statuses : sequence of str
+    pose_sd, turn_sd : float
+        Accuracy expected of one more pose (m/s^2) and turn (rad).
+
+    Returns
+    -------
+    tuple of dict
+        {'parameters': {name: sd over tolerance}, 'needs': sentence} for each sensor that is not fully determined.
+
+    """
+    advice = []
+    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)), (slice(GYRO_BIAS.start, N_PARAMS), _turn_candidates(values, turn_sd)))
+    for group, candidates in groups:
+        index = np.arange(N_PARAMS)[group]
+        lacking = [k for k in index if statuses[k] != 'determined']
+        if not lacking:
+            continue
+        before = _predicted(factor, priors, tolerances)
+        scores = [(_score(_predicted(np.vstack([factor, rows]), priors, tolerances)[lacking]), needs) for rows, needs in candidates]
+        best = min(scores, key=lambda s: s[0])
+        advice.append({'parameters': {param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
+    return tuple(advice)
+
+
+def _score(ratio):
+    """Return one number for how bad a set of sd over tolerance is; the excess in each parameter counts, the worst most."""
+    return float(np.sum(np.maximum(ratio, 1.0)**2))
+
+
+def _predicted(rows, priors, tolerances):
+    factor = np.linalg.qr(np.vstack([rows, np.diag(1 / priors)]), mode='r')
+    return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
+
+
+def _pose_candidates(values, gravity, sd):
+    bias, matrix, _, _ = unpack(values)
+    for up in STANDARD_POSES:
+        columns = norm_rows(values, (bias + gravity * matrix @ up)[None], gravity)[1]
+        yield np.pad(columns / sd, ((0, 0), (0, N_PARAMS - columns.shape[1]))), f'hold it still with {_direction(up)} up'
+
+
+def _direction(up):
+    return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
+
+
+def _turn_candidates(values, sd):
+    """Half turns about each axis held level, gravity first along either of the other two."""
+    for axis, first in itertools.permutations(range(3), 2):
+        about, up = np.eye(3)[axis], np.eye(3)[first]
+        carried = -up  # after half a turn about a level axis
+        across = np.array([about, np.cross(about, up)])
+        rows = np.zeros((2, N_PARAMS))
+        rows[:, GYRO_MATRIX] = (across @ skew(carried) @ _psi_by_matrix(about)).reshape(2, 9)
+        yield rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, still before and after'
+
+
+def _psi_by_matrix(about, angle=np.pi):
+    """Derivative of the rotation error in the turned frame by the matrix entries, near the identity, shape (3, 9)."""
+    cross = skew(about)
+    # integral over the turn of the rotation still to come, C(angle - t)
+    to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross
+    return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)

@@ -1,0 +1,217 @@
+"""The equations of a calibration by hand: poses at rest, turns between them, and full turns of known angle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.reference import skew
+from imu_calibration.turn_integration import integrate_turn
+
+LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+"""Entries of the accelerometer matrix that the gauge leaves free."""
+AXES = 'xyz'
+PARAM_NAMES = (
+    *(f'accelerometer.bias.{a}' for a in AXES), *(f'accelerometer.matrix.{AXES[i]}{AXES[j]}' for i, j in LOWER),
+    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES))
+N_PARAMS = len(PARAM_NAMES)
+ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
+NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
+"""Zero bias and identity matrices."""
+COMPONENTS = ('pose', 'drift', 'turn')
+"""Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
+
+
+CALM = 0.05
+"""Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Means over the intervals at rest."""
+
+    force: np.ndarray
+    """Mean accelerometer reading, m/s^2, shape (k, 3)."""
+    rate: np.ndarray
+    """Mean gyroscope reading, rad/s, shape (k, 3)."""
+    force_sem: np.ndarray
+    """Sd of `force` from the scatter within the intervals, shape (k, 3)."""
+    rate_sem: np.ndarray
+    """Sd of `rate` from the scatter within the intervals, shape (k, 3)."""
+    start: np.ndarray
+    """Index of the first sample, shape (k,)."""
+    stop: np.ndarray
+    """Index after the last sample, shape (k,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TurnData:
+    """Samples of a stretch of motion."""
+
+    time: np.ndarray
+    """Seconds, shape (n,)."""
+    rate: np.ndarray
+    """Measured rate, rad/s, shape (n, 3)."""
+    first: int = -1
+    """Pose before the turn."""
+    last: int = -1
+    """Pose after the turn."""
+    noise_variance: float = 0.0
+    """Variance of the integrated rate noise per axis, rad^2."""
+    rotation: np.ndarray | None = None
+    """Known rotation vector about a body axis, rad, shape (3,); None when gravity is the reference."""
+    rotation_cov: np.ndarray | None = None
+    """Covariance of `rotation`, shape (3, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything that is estimated."""
+
+    values: np.ndarray
+    """Parameters in `PARAM_NAMES` order, shape (21,)."""
+    up: np.ndarray
+    """True direction of the specific force in each pose, unit vectors, shape (k, 3)."""
+    drift: np.ndarray
+    """Departure of the gyroscope's bias in each pose, rad/s, shape (k, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Linearised equations ``residual = nuisance @ dn + main @ dp + error``, error of variance `noise` + `component`'s."""
+
+    residual: np.ndarray
+    """Measured minus predicted, shape (m,)."""
+    nuisance: np.ndarray
+    """Columns of directions (2 per pose) and drifts (3 per pose), shape (m, 5k)."""
+    main: np.ndarray
+    """Columns of the parameters, shape (m, 21)."""
+    noise: np.ndarray
+    """Known variance of each row, shape (m,)."""
+    component: np.ndarray
+    """Index into `COMPONENTS`, or -1, shape (m,)."""
+
+
+def unpack(values):
+    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix)."""
+    matrix = np.zeros((3, 3))
+    for value, (i, j) in zip(values[3:9], LOWER):
+        matrix[i, j] = value
+    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3)
+
+
+def tangent(up):
+    """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
+    helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
+    one = np.cross(up, helper)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return np.stack([one, np.cross(up, one)], axis=2)
+
+
+def moved(state, step, n_poses):
+    """Return the state after a step (nuisance, then parameters)."""
+    turn = np.einsum('kij,kj->ki', tangent(state.up), step[:2 * n_poses].reshape(-1, 2))
+    up = state.up + turn
+    return State(state.values + step[5 * n_poses:], up / np.linalg.norm(up, axis=1, keepdims=True),
+                 state.drift + step[2 * n_poses:5 * n_poses].reshape(-1, 3))
+
+
+def norm_rows(values, force, gravity):
+    """
+    Return ``|matrix^-1 (force - bias)| - gravity`` and minus its derivative by the nine accelerometer parameters.
+
+    Parameters
+    ----------
+    values : array, shape (9,) or (21,)
+    force : array, shape (k, 3)
+        Mean readings at rest.
+    gravity : float
+
+    """
+    bias, matrix = unpack(np.concatenate([values[:9], NOMINAL[9:]]))[:2]
+    true = np.linalg.solve(matrix, (force - bias).T).T
+    norm = np.linalg.norm(true, axis=1)
+    back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
+    columns = [back] + [(back[:, i] * true[:, j])[:, None] for i, j in LOWER]
+    return norm - gravity, np.hstack(columns)
+
+
+def build_system(state, poses, turns, gravity):
+    """Stack the rows of poses, bias drifts and turns at the current state."""
+    rows = [_pose_rows(state, poses, gravity), _drift_rows(state, poses), _calm_rows(state, poses)]
+    rows += [_gravity_turn_rows(state, t) if t.rotation is None else _known_turn_rows(state, t) for t in turns]
+    return System(*(np.concatenate(parts) for parts in zip(*rows)))
+
+
+def _pose_rows(state, poses, gravity):
+    """``force = bias + matrix @ (gravity * up)``: three rows per pose, two of them spent on its direction."""
+    bias, matrix, _, _ = unpack(state.values)
+    count = len(state.up)
+    true = gravity * state.up
+    residual = poses.force - bias - true @ matrix.T
+    main = np.zeros((count, 3, N_PARAMS))
+    main[:, :, 0:3] = np.eye(3)
+    for column, (i, j) in enumerate(LOWER):
+        main[:, i, 3 + column] = true[:, j]
+    nuisance = np.zeros((count, 3, 5 * count))
+    blocks = gravity * matrix @ tangent(state.up)
+    for k in range(count):
+        nuisance[k, :, 2 * k:2 * k + 2] = blocks[k]
+    return _flat(residual, nuisance, main, poses.force_sem**2, 0)
+
+
+def _drift_rows(state, poses):
+    """``rate = bias + drift`` at rest."""
+    count = len(state.up)
+    residual = poses.rate - state.values[GYRO_BIAS] - state.drift
+    main = np.zeros((count, 3, N_PARAMS))
+    main[:, :, GYRO_BIAS] = np.eye(3)
+    return _flat(residual, _drift_columns(count), main, poses.rate_sem**2, -1)
+
+
+def _calm_rows(state, poses):
+    """``0 = drift`` within its own scatter."""
+    count = len(state.up)
+    return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, N_PARAMS)), (CALM * poses.rate_sem)**2, 1)
+
+
+def _drift_columns(count):
+    nuisance = np.zeros((count, 3, 5 * count))
+    for k in range(count):
+        nuisance[k, :, 2 * count + 3 * k:2 * count + 3 * k + 3] = np.eye(3)
+    return nuisance
+
+
+def _gravity_turn_rows(state, data):
+    """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows."""
+    _, _, bias, matrix = unpack(state.values)
+    count, i, j = len(state.up), data.first, data.last
+    turn = integrate_turn(data.time, data.rate, bias + 0.5 * (state.drift[i] + state.drift[j]), matrix)
+    carried = turn.mat_ji @ state.up[i]
+    across_i, across_j = tangent(state.up[[i, j]])
+    by_psi = across_j.T @ skew(carried)
+    main, nuisance = np.zeros((2, N_PARAMS)), np.zeros((2, 5 * count))
+    main[:, GYRO_BIAS] = by_psi @ turn.by_bias
+    main[:, GYRO_MATRIX] = (by_psi @ turn.by_matrix.reshape(3, 9))
+    nuisance[:, 2 * i:2 * i + 2] += across_j.T @ turn.mat_ji @ across_i
+    nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
+    for pose in (i, j):
+        nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, GYRO_BIAS]
+    return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2)
+
+
+def _known_turn_rows(state, data):
+    """``matrix^-1 integral(measured - bias) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
+    _, _, bias, matrix = unpack(state.values)
+    turn = integrate_turn(data.time, data.rate, bias, matrix)
+    inverse = np.linalg.inv(matrix)
+    rotation = inverse @ turn.integral
+    main = np.zeros((3, N_PARAMS))
+    main[:, GYRO_BIAS] = -turn.duration * inverse
+    main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
+    white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
+    return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
+
+
+def _flat(residual, nuisance, main, noise, component):
+    return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, N_PARAMS), noise.ravel(),
+            np.full(residual.size, component))
