@@ -79,13 +79,12 @@ def normal_bands(knots, interval, values):
     return bands
 
 
-def penalty_bands(size):
-    """Return the lower bands of D.T @ D with D the third differences of the coefficients, shape (6, size)."""
-    bands = np.zeros((ORDER, size))
-    n_rows = size - 3
+def penalty_bands(weights):
+    """Return the lower bands of D.T @ diag(weights) @ D with D the third differences of the coefficients, shape (6, n_weights + 3)."""
+    bands = np.zeros((ORDER, len(weights) + 3))
     for first in range(4):
         for second in range(first, 4):
-            bands[second - first, first:first + n_rows] += _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second]
+            bands[second - first, first:first + len(weights)] += _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second] * weights
     return bands
 
 
