@@ -1,0 +1,251 @@
+"""Streams brought together, chunk by chunk of a fixed grid in time: the joints at the IMU's stamps and what they do."""
+
+import numpy as np
+
+from imu_calibration import joint_phases, quietness
+from imu_calibration.joint_motion import fit_joint_curve
+from imu_calibration.joint_phases import LOST, MOVING, STILL
+from imu_calibration.quietness import QuietFloor, quiet_samples
+from imu_calibration.sample_buffer import SampleBuffer
+from imu_calibration.window_cutting import PhasedSamples
+
+JOINT_WAIT = 60.0
+"""The IMU or the joints may be ahead of each other by this much before the missing ones are given up, s."""
+TEMPERATURE_WAIT = 5.0
+"""Temperature may come later than the IMU by this much, s."""
+_LEAST_MARGIN = max(joint_phases.REACH, quietness.REACH) + 0.4
+_LEAST_JOINTS = 4
+NEVER = 1 << 62
+
+
+class MotionChunks:
+    """
+    One epoch of the clock: takes samples as they come and hands out `PhasedSamples`, in order.
+
+    Chunk k holds the IMU samples from ``start + k * chunk`` on, for `chunk` seconds; `start` is the first IMU sample. What comes out depends on
+    samples within the chunk and a margin only, and a chunk is worked on when all streams have passed its margin (or are
+    given up), so the cut of the streams into blocks plays no role. Memory is bounded by the waiting times.
+    """
+
+    def __init__(self, settings, noise_rad, floor):
+        self.counts = {}
+        self.time_origin = 0.0
+        self._settings, self._noise_rad, self._floor = settings, noise_rad, floor
+        self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
+        self.margin = max(settings.overlap, _LEAST_MARGIN)
+        self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
+        self._start_ns = None
+        self._first_joint_ns = None
+        self._chunk = 0
+        self._previous_ns = None
+        self._after_loss = False
+
+    @property
+    def short_rest(self):
+        """Length of the rests that have a curve of the joints throughout, s."""
+        return min(self._settings.settling + self._settings.static_minimum, self.margin)
+
+    @property
+    def n_buffered(self):
+        """Samples held, of all streams."""
+        return sum(len(buffer) for buffer in (self._imu, self._joints, self._temperature))
+
+    @property
+    def end_time(self):
+        """Session time at the newest IMU sample, s."""
+        return self.time_origin if self._imu.newest_ns is None else self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
+
+    def add(self, imu=None, joints=None, temperature=None):
+        """Take cleaned samples, each stream in the order of its stamps."""
+        if imu is not None and len(imu):
+            if self._start_ns is None:
+                self._start_ns = int(imu.stamp_ns[0])
+            self._imu.add(self._not_late(imu, 'late IMU sample'))
+        if joints is not None and len(joints):
+            if self._first_joint_ns is None:
+                self._first_joint_ns = int(joints.stamp_ns[0])
+            self._joints.add(self._not_late(joints, None))
+        if temperature is not None and len(temperature):
+            self._temperature.add(temperature)
+
+    def take(self, final=False):
+        """Yield the chunks that can be worked on (all with `final`) as `PhasedSamples` without those that have no joints."""
+        if self._start_ns is not None:
+            passed = np.inf if final else self._passed_ns()
+            while self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed and self._advance(passed, final):
+                chunk = self._work(self._next_start_ns(), final)
+                self._chunk += 1
+                if chunk is not None:
+                    yield chunk
+        self._forget()
+
+    def joints_left(self):
+        """Return the joint samples that are still held, or None."""
+        return self._joints.between(-NEVER, NEVER)
+
+    def _next_start_ns(self):
+        return self._start_ns + self._chunk * self._chunk_ns
+
+    def _passed_ns(self):
+        """Return the stamp that all streams have passed or will never pass."""
+        imu, joints, temperature = (-NEVER if b.newest_ns is None else b.newest_ns for b in (self._imu, self._joints, self._temperature))
+        wait = _ns(JOINT_WAIT)
+        return min(max(imu, joints - wait), max(joints, imu - wait), max(temperature, imu - _ns(TEMPERATURE_WAIT)))
+
+    def _advance(self, passed, final):
+        """Go to the next chunk that has IMU samples; False when there is none yet."""
+        oldest = self._imu.first_from(self._next_start_ns())
+        if oldest is None:
+            if not final:
+                self._chunk = max(self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns))
+            return False
+        self._chunk = (oldest - self._start_ns) // self._chunk_ns
+        return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
+
+    def _not_late(self, samples, reason):
+        """Return `samples` without those that belong to chunks already worked on."""
+        if self._start_ns is None or self._chunk == 0:
+            return samples
+        late = int(np.searchsorted(samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)))
+        if reason:
+            self._count(reason, late)
+        return samples.select(slice(late, None)) if late else samples
+
+    def _forget(self):
+        if self._start_ns is not None:
+            oldest = self._next_start_ns() - self._margin_ns
+        elif self._joints.newest_ns is not None:
+            oldest = self._joints.newest_ns - _ns(JOINT_WAIT)
+        else:
+            oldest = (self._temperature.newest_ns or 0) - _ns(JOINT_WAIT)
+        for buffer, keep_one in ((self._imu, False), (self._joints, False), (self._temperature, True)):
+            buffer.forget_before(oldest, keep_one)
+
+    def _count(self, reason, number):
+        if number:
+            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+
+    def _work(self, start_ns, final):
+        """Return the chunk from `start_ns` on, or None when nothing in it can be used."""
+        stop_ns = start_ns + self._chunk_ns
+        imu = self._imu.between(start_ns - self._margin_ns, stop_ns + self._margin_ns)
+        core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
+        time = (imu.stamp_ns - self._start_ns) / 1e9
+        period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
+        runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
+        phase, level = self._phases(time, runs, final)
+        resting = phase == STILL
+        quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor, resting)
+        after_gap = self._after_gaps(imu.stamp_ns[core], limit)
+        motion = np.zeros((4,) + level[core].shape)
+        motion[0] = level[core]
+        self._draw_curves(motion, time[core], phase[core], runs)
+        temperature = self._temperatures(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        return self._without_lost(PhasedSamples(
+            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, temperature, phase[core],
+            quiet[core], after_gap, np.zeros(len(after_gap), bool)))
+
+    def _joint_runs(self, first_ns, last_ns, period):
+        """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
+        joints = self._joints.between(first_ns, last_ns)
+        limit = max(self._settings.gap, 5 * period)
+        if joints is None or not len(joints):
+            return [], limit
+        time = (joints.stamp_ns - self._start_ns) / 1e9
+        step = np.diff(time)
+        joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
+        bounds = np.concatenate([[0], np.flatnonzero(step > joint_limit) + 1, [len(time)]])
+        runs = [_JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], self._settings, self._noise_rad)
+                for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= _LEAST_JOINTS]
+        return runs, limit
+
+    def _phases(self, time, runs, final):
+        """Return the phase of each IMU sample and the level of the joints there."""
+        phase = np.full(len(time), LOST, np.int8)
+        level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
+        for k, run in enumerate(runs):
+            first = self._first_joint_ns is not None and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
+            inside = run.covered(time, before=first, after=final and k == len(runs) - 1)
+            phase[inside], level[inside] = run.at(time[inside])
+        return phase, level
+
+    def _draw_curves(self, motion, time, phase, runs):
+        """Put the joints' motion on the samples near which joints move."""
+        for run in runs:
+            need = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
+            if not len(need):
+                continue
+            parts = np.split(need, np.flatnonzero(np.diff(time[need]) > 2 * self._settings.overlap) + 1)
+            for part in parts:
+                stretch = slice(part[0], part[-1] + 1)
+                curve = run.curve(time[stretch], self._settings.overlap, self._noise_rad)
+                for target, values in zip(motion, (curve.position, curve.rate, curve.acceleration, curve.jerk), strict=True):
+                    target[stretch] = values
+
+    def _after_gaps(self, stamp_ns, limit):
+        before = stamp_ns[0] - (1 << 40) if self._previous_ns is None else self._previous_ns
+        self._previous_ns = int(stamp_ns[-1])
+        return np.diff(np.concatenate([[before], stamp_ns])) > _ns(limit)
+
+    def _temperatures(self, stamp_ns, last_ns):
+        readings = self._temperature.between(-NEVER, last_ns)
+        if readings is None or not len(readings):
+            return np.full(len(stamp_ns), np.nan)
+        return np.interp((stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9, readings.temperature_c)
+
+    def _without_lost(self, samples):
+        lost = samples.phase == LOST
+        before = np.concatenate([[self._after_loss], lost[:-1]])
+        self._after_loss = bool(lost[-1])
+        samples.after_gap[before] = True
+        samples.after_loss[before] = True
+        if not lost.any():
+            return samples
+        self._count('no joint state', np.count_nonzero(lost))
+        return None if lost.all() else samples.select(~lost)
+
+
+class _JointRun:
+    """Joint readings without gaps."""
+
+    def __init__(self, time, position, velocity, settings, noise_rad):
+        self.time, self.position, self.velocity = time, position, velocity
+        self.phase, self.level = joint_phases.joint_phases(time, position, settings, noise_rad)
+        self._moving = time[self.phase != STILL]
+
+    def covered(self, time, before, after):
+        """Tell which instants lie between the readings or, where the joints rest, within two periods of the first or last."""
+        reach = 2 * np.median(np.diff(self.time))
+        low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)
+        high = self.time[-1] + (reach if after and self.phase[-1] == STILL else 0.0)
+        return (time >= low) & (time <= high)
+
+    def at(self, time):
+        """Return the phase (that of both neighbours, else moving) and the level at instants."""
+        right = np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)
+        left = np.maximum(right - 1, 0)
+        phase = np.where(self.phase[left] == self.phase[right], self.phase[right], MOVING)
+        level = np.stack([np.interp(time, self.time, column) for column in self.level.T], axis=1)
+        return phase.astype(np.int8), level
+
+    def near_motion(self, time, distance):
+        """Tell which instants between the readings are within `distance` of one with moving joints."""
+        if not len(self._moving):
+            return np.zeros(len(time), bool)
+        right = np.searchsorted(self._moving, time)
+        ahead = self._moving[np.minimum(right, len(self._moving) - 1)]
+        behind = self._moving[np.maximum(right - 1, 0)]
+        near = np.minimum(np.abs(ahead - time), np.abs(time - behind)) <= distance
+        return near & (time >= self.time[0]) & (time <= self.time[-1])
+
+    def curve(self, time, overlap, noise_rad):
+        """Return the `JointMotion` of a smooth curve at instants."""
+        first, stop = np.searchsorted(self.time, [time[0] - overlap, time[-1] + overlap])
+        first, stop = max(0, min(first, len(self.time) - _LEAST_JOINTS)), min(len(self.time), max(stop, _LEAST_JOINTS))
+        piece = slice(first, stop)
+        velocity = None if np.isnan(self.velocity[piece]).all() else self.velocity[piece]
+        return fit_joint_curve(self.time[piece], self.position[piece], velocity, noise_rad).at(time)
+
+
+def _ns(seconds):
+    return int(round(seconds * 1e9))

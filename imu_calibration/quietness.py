@@ -1,0 +1,130 @@
+"""When the IMU is quiet: short-time variance against the lowest that the recording shows; free of scale, so counts will do."""
+
+from collections import deque
+
+import numpy as np
+
+SPANS = (0.25, 1.0)
+"""Variances are taken over these times, s: the short one sees a knock, the long one a slow swing."""
+REACH = 1.1
+"""Samples further away than this do not change quietness, s."""
+_LEAST_SAMPLES = 10
+_GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
+_GROWTH = 2.0
+_GUARD = 0.05  # s kept out on both sides of a disturbance, whose first samples can hide in a quiet span
+
+
+class QuietFloor:
+    """Running estimate of the quiet variances: the median over the last chunks, so that a noisy one does not set it."""
+
+    def __init__(self):
+        self._history = {}
+
+    def update(self, key, value):
+        """Add the floor of one chunk (None: nothing was at rest) and return the running one, or None."""
+        history = self._history.setdefault(key, deque(maxlen=9))
+        if value is not None:
+            history.append(value)
+        return np.median(np.array(history), axis=0) if history else None
+
+
+def quiet_samples(force_s, rate_s, period, ratio, longest, floor, resting=None):
+    """
+    Tell which samples lie in a quiet span.
+
+    A span is quiet when the variances of specific force and of angular rate, summed over the axes, are below ``ratio^2``
+    times their floors; a sample is quiet when some quiet span of each length contains it.
+
+    Parameters
+    ----------
+    force_s, rate_s : array, shape (n, 3)
+        Readings in any unit.
+    period : float
+        Sampling period, s.
+    ratio : float
+        Largest ratio of standard deviations to the quiet ones.
+    longest : float
+        Spans are not longer than this, s.
+    floor : QuietFloor
+        Running floor, updated here.
+    resting : array of bool, shape (n,), optional
+        Samples with the joints at rest; the floor comes from spans within them. None: from the quietest tenth of all.
+
+    Returns
+    -------
+    array of bool, shape (n,)
+
+    """
+    n = len(force_s)
+    cell = max(1, min(int(_GRID / period), n))
+    edges = np.append(np.arange(0, n - cell + 1, cell), n)  # the last cell takes the remainder
+    sums = [_CellSums(values, edges) for values in (force_s, rate_s)]
+    least = np.array([least_variance(values) for values in (force_s, rate_s)])
+    at_rest = None if resting is None else np.logical_and.reduceat(resting, edges[:-1])
+    quiet, shorter = np.ones(len(edges) - 1, bool), np.inf
+    for span in SPANS:
+        width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
+        variance = np.stack([item.variance(width) for item in sums], axis=1)
+        limit = floor.update(span, _chunk_floor(variance, width, at_rest))
+        if limit is None:
+            return np.zeros(n, bool)
+        # at rest the variance hardly grows with the span; where it does, the quietest part was moving as well
+        shorter = limit = np.maximum(np.minimum(limit, _GROWTH * shorter), least)
+        quiet &= _covered(np.all(variance <= ratio ** 2 * limit, axis=1), width)
+    return np.repeat(_shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+
+
+def _chunk_floor(variance, width, at_rest):
+    separate = variance[::width]
+    if at_rest is None:
+        return np.quantile(separate, 0.1, axis=0)
+    busy = np.concatenate([[0], np.cumsum(~at_rest)])
+    separate = separate[(busy[width:] == busy[:-width])[::width]]
+    return np.quantile(separate, 0.25, axis=0) if len(separate) >= 3 else None
+
+
+def least_variance(values):
+    """Return the variance, axes added, below which nothing counts: that of half a converter step, or of 1e-5 of the readings."""
+    some = np.ascontiguousarray(values[:4000].T)
+    change = np.abs(np.diff(some, axis=1))
+    step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
+    step = np.where(np.isfinite(step), step, 0.0)
+    return np.sum(step ** 2 / 4) + 3 * (1e-5 * np.abs(some).max(initial=1e-2)) ** 2
+
+
+class _CellSums:
+    """Sums over cells of samples, from which variances over any span of cells follow."""
+
+    def __init__(self, values, edges):
+        rows = np.ascontiguousarray(values.T)
+        centred = rows - rows.mean(axis=1, keepdims=True)
+        self._count = edges
+        self._sum = _running(np.add.reduceat(centred, edges[:-1], axis=1))
+        self._square = _running(np.add.reduceat(np.einsum('ij,ij->j', centred, centred), edges[:-1]))
+
+    def variance(self, width):
+        """Return the variance over `width` cells from each cell on, axes added."""
+        count = self._count[width:] - self._count[:-width]
+        total = self._sum[:, width:] - self._sum[:, :-width]
+        square = self._square[width:] - self._square[:-width]
+        return np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0) / np.maximum(count - 1, 1)
+
+
+def _running(values):
+    sums = np.zeros(values.shape[:-1] + (values.shape[-1] + 1,), values.dtype)
+    np.cumsum(values, axis=-1, out=sums[..., 1:])
+    return sums
+
+
+def _covered(calm, width):
+    """Return for each cell whether one of the calm spans of `width` cells contains it."""
+    sums = np.concatenate([[0], np.cumsum(calm)])
+    cell = np.arange(len(calm) + width - 1)
+    return sums[np.minimum(cell, len(calm) - 1) + 1] > sums[np.maximum(cell - width + 1, 0)]
+
+
+def _shrunk(mask, margin):
+    """Return `mask` without the cells that are within `margin` cells of one that is not in it."""
+    sums = np.concatenate([[0], np.cumsum(~mask)])
+    cell = np.arange(len(mask))
+    return sums[np.minimum(cell + margin + 1, len(mask))] == sums[np.maximum(cell - margin, 0)]

@@ -1,0 +1,58 @@
+"""Samples waiting to be used."""
+
+import numpy as np
+
+
+class SampleBuffer:
+    """Samples of one stream in the order of their stamps; joins its blocks only when read."""
+
+    def __init__(self):
+        self.newest_ns = None
+        self._blocks = []
+
+    def __len__(self):
+        return sum(len(block) for block in self._blocks)
+
+    def add(self, samples):
+        """Append samples, all newer than those before."""
+        if len(samples):
+            self.newest_ns = int(samples.stamp_ns[-1])
+            self._blocks.append(samples)
+
+    def between(self, first_ns, stop_ns):
+        """Return the samples with stamps in [first, stop), or None when the buffer never had any."""
+        samples = self._joined()
+        if samples is None:
+            return None
+        return samples.select(slice(*np.searchsorted(samples.stamp_ns, [first_ns, stop_ns])))
+
+    def first_from(self, stamp_ns):
+        """Return the first stamp that is not before `stamp_ns`, or None."""
+        samples = self._joined()
+        if samples is None:
+            return None
+        place = np.searchsorted(samples.stamp_ns, stamp_ns)
+        return int(samples.stamp_ns[place]) if place < len(samples) else None
+
+    def forget_before(self, stamp_ns, keep_one=False):
+        """Drop samples before `stamp_ns`; with `keep_one` not the last one of them."""
+        while len(self._blocks) > 1 and self._blocks[1].stamp_ns[0] < stamp_ns:
+            del self._blocks[0]
+        if self._blocks and self._blocks[0].stamp_ns[0] < stamp_ns:
+            block = self._blocks[0]
+            place = max(0, int(np.searchsorted(block.stamp_ns, stamp_ns)) - keep_one)
+            if place:
+                kept = block.select(slice(place, None))
+                self._blocks[0] = _owned(kept)
+                if not len(kept) and len(self._blocks) > 1:
+                    del self._blocks[0]
+
+    def _joined(self):
+        if len(self._blocks) > 1:
+            self._blocks = [type(self._blocks[0]).concatenate(self._blocks)]
+        return self._blocks[0] if self._blocks else None
+
+
+def _owned(samples):
+    """Return `samples` in memory of their own: a slice would keep the whole block it was cut from."""
+    return type(samples).concatenate([samples])
