@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.earth import earth_rate_n
 from imu_calibration.reference import Reference, skew
 
-_BLOCK = 4096  # samples whose intermediates fit in the processor's cache
+_BLOCK = 8192  # samples whose intermediates fit in the processor's cache
 
 
 def rotation(vector):
@@ -54,10 +54,10 @@ def reference_motion(table, motion, temperature_c=None):
     n_samples = len(motion.time)
     mat_sn, force_s = np.empty((n_samples, 3, 3)), np.empty((n_samples, 3))
     rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
-    steps = _chain_steps(table, motion)
+    base, steps = _base_columns(table), _chain_steps(table, motion)
     for start in range(0, n_samples, _BLOCK):
         part = slice(start, min(start + _BLOCK, n_samples))
-        columns = _run_chain(table, motion, steps, part)
+        columns = _run_chain(base, motion, steps, part)
         mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
     return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=table.gravity_value,
@@ -98,15 +98,22 @@ def _to_coordinate_axis(axis):
     return align(axis), 1.0, 2
 
 
-def _run_chain(table, motion, steps, part):
-    """Return mat_sn (three columns), rate, angular acceleration and specific force as (3, 6, n)."""
+def _base_columns(table):
+    """Return mat_bn (three columns), rate, angular acceleration and specific force of the base, in the base frame, shape (3, 6, 1)."""
     columns = np.zeros((3, 6, 1))
-    columns[:, :3, 0] = table.mat_nb.T
-    columns[:, 5, 0] = table.mat_nb.T @ [0.0, 0.0, table.gravity_value]
+    mat_bn = table.mat_nb.T
+    columns[:, :3, 0] = mat_bn
     if table.latitude is not None and table.azimuth_deg is not None:
-        columns[:, 3, 0] = table.mat_nb.T @ earth_rate_n(table.latitude, table.azimuth_n_deg)
+        columns[:, 3, 0] = mat_bn @ earth_rate_n(table.latitude, table.azimuth_n_deg)
+    columns[:, 5, 0] = table.gravity_value * mat_bn[:, 2]
+    return columns
+
+
+def _run_chain(columns, motion, steps, part):
+    """Return the columns of `_base_columns` at the sensor, in its frame, shape (3, 6, n)."""
     for matrix, offset, column, sense, third in steps:
         if offset.any():
+            columns = columns.copy()
             columns[:, 5] += _arm_force(columns[:, 3], columns[:, 4], offset)
         if not np.array_equal(matrix, np.eye(3)):
             columns = np.tensordot(matrix, columns, 1)
