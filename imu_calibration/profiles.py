@@ -107,10 +107,10 @@ def _short(builder, rng):
 
 
 def _quick(builder, rng):
-    tasks = poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 1.9)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=speed, dwell=1.8) for axis, speed in zip(np.eye(3), SPEEDS_DEG)]
+    tasks = poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0)
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=speed, dwell=2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)]
     tasks += swings(((10.0, 1.0),), 3.0)
-    tasks += simultaneous((150.0, 100.0), 1.8)[:3]
+    tasks += simultaneous((150.0, 100.0), 2.0)[:3]
     run(builder, rng, tasks, reference_every=100)
 
 
@@ -118,17 +118,20 @@ def _static_only(builder, rng):
     run(builder, rng, poses(np.concatenate([FACES, EDGES, CORNERS]), 8.0))
 
 
-def _separating(builder, rng):
+def _separating(builder, rng, n_angles=16, n_oblique=4, cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), swing_time=4.0):
     """Many angles, three speeds both ways, swings at several frequencies: what tells neighbours among the effects apart."""
-    rings = [ring for k in range(16) for ring in _rings(2 * np.pi * (k + 0.25) / 16)]
+    rings = [direction for k in range(n_angles) for direction in _rings(2 * np.pi * (k + 0.25) / n_angles)]
     tasks = poses(rings, 2.2)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(60.0, 150.0, 300.0), dwell=2.5) for axis in np.eye(3)]
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(150.0, 300.0), dwell=2.5) for axis in CORNERS[:4]]
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(60.0, 150.0, 300.0), dwell=2.0) for axis in np.eye(3)]
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(150.0, 300.0), dwell=2.0) for axis in CORNERS[:n_oblique]]
     tasks += [partial(spin_joint, joint=2, at_deg=[0, 0, 0], speeds_deg=(30.0, 120.0), dwell=4.0)]
     tasks += [partial(spin_joint, joint=1, at_deg=[90, 0, inner], speeds_deg=(40.0, 100.0), dwell=4.0) for inner in (0, 90)]
-    tasks += swings(((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), 4.0)
-    tasks += simultaneous((250.0, 100.0), 3.0)
+    tasks += swings(cycles, swing_time)
+    tasks += simultaneous((250.0, 100.0), 2.5)
     run(builder, rng, tasks, reference_every=20)
+
+
+_separating_short = partial(_separating, n_angles=8, n_oblique=1, cycles=((20.0, 0.5), (5.0, 1.5), (2.0, 4.0)), swing_time=3.0)
 
 
 def _rings(angle):
@@ -165,19 +168,23 @@ def _tumbling(builder, rng):
     builder.rest(5.0)
 
 
-def _random(builder, rng):
-    """About five minutes of drawn poses, spins both ways at three speeds, swings and two-axis turns."""
-    tasks = poses([_near(rng, up_b, 0.25) for up_b in np.concatenate([FACES, CORNERS])], 2.6)
-    speeds = np.array([rng.uniform(*limits, 3) for limits in ((40, 80), (100, 150), (170, 220))])
-    tasks += [partial(spin_vertical, up_b=_near(rng, axis, 0.2), speeds_deg=speeds[:, k], dwell=1.8) for k, axis in enumerate(np.eye(3))]
-    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=1.8) for _ in range(2)]
+def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2, n_swings=2,
+            n_simultaneous=4):
+    """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
+    tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
+    speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
+    tasks += [partial(spin_vertical, up_b=_near(rng, axis, 0.2), speeds_deg=speeds[:, k], dwell=2.0) for k, axis in enumerate(np.eye(3))]
+    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=2.0) for _ in range(n_oblique)]
     tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, 3), speeds_deg=rng.uniform(50, 120), dwell=3.0) for joint in (1, 2)]
     for axis in range(3):
         tasks += [partial(swing, axis=axis, amplitude_deg=rng.uniform(7, 14) / frequency, frequency=frequency, duration=3.5)
-                  for frequency in (rng.uniform(0.5, 1.0), rng.uniform(1.5, 3.0))]
-    rates = rng.uniform(80, 180, (4, 2)) * rng.choice([-1, 1], (4, 2))
-    tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5)[:4], rates)]
+                  for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]]
+    rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
+    tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5), rates)]
     run(builder, rng, tasks, reference_every=15)
+
+
+_random_short = partial(_random, directions=np.concatenate([FACES, CORNERS[::2]]), speed_ranges=((60, 90), (150, 210)), n_oblique=1, n_swings=1, n_simultaneous=3)
 
 
 def _near(rng, direction, spread):
@@ -201,13 +208,18 @@ def _any_table(builder, rng):
     run(builder, rng, tasks)
 
 
+_ON_ARM = {**paper_profiles.GIMBALS, 'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]}}
+
 _REGISTRY = {
     'calibration': _Entry('full session on a three-axis table, about 11 min: 26 poses, spins, swings, two axes at once', _calibration, n_joints=3, adapts=True),
     'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
     'quick': _Entry('the least that determines everything, about 2 min', _quick, n_joints=3, adapts=True),
     'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
     'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
+    'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
     'separating': _Entry('many angles, three speeds both ways, four frequencies: tells similar effects apart', _separating, n_joints=3, adapts=True),
+    'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
+    'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins leave 1 g', _separating, _ON_ARM, 3),
     'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),
     'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling', _navigation, n_joints=3),
     'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)', _tumbling, n_joints=3),

@@ -17,6 +17,8 @@ PEAK_RATE_OF_MOVE = 2.1875
 """Largest rate of a move, in units of distance over duration."""
 PEAK_ACCELERATION_OF_MOVE = 7.5132
 """Largest acceleration of a move, in units of distance over duration squared."""
+SHORTEST_DWELL = 0.8
+"""Rests and spins cut to less than this share would be too short for windows."""
 PEAK_ACCELERATION_OF_RAMP = 1.875
 """Largest acceleration of a ramp, in units of change of rate over duration."""
 
@@ -229,8 +231,7 @@ def stretch(build, duration):
 
     """
     length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]
-    dwell = 1.0 + (duration - length[0]) / (length[1] - length[0])
-    shortest = length[0] - 0.7 * (length[1] - length[0])
-    if dwell < 0.3 - 1e-9:
+    change = length[1] - length[0]
+    if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
         raise InputError(f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose a longer one or another profile')
-    return build(dwell)
+    return build(1.0 + (duration - length[0]) / change)

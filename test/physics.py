@@ -75,7 +75,7 @@ class Session:
         return SampleBlock(self.imu, self.joints, self.temperature)
 
 
-def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_rate=100.0, joint_rate=100.0, duration=300.0, profile='random',
+def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_rate=100.0, joint_rate=100.0, duration=None, profile='random',
                  table='three_axis', arms=False, mount_rpy_deg=None, temperature='warm_up', velocity='good', encoder_resolution=None,
                  dropped=None, knock=False, wrong_covariance=False, oversampling=8):
     """
@@ -92,6 +92,8 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too.
     grade : str
         IMU grade in `imu_calibration.noise.GRADES`.
+    duration : float, optional
+        Length of the session, s; default the profile's own.
     profile : str
         Name in `imu_calibration.profiles`.
     table : str or dict

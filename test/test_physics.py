@@ -16,7 +16,7 @@ from imu_calibration.earth import normal_gravity
 from imu_calibration.profiles import make_profile
 from imu_calibration.turntable import Table, reference_motion, tilt
 
-SHORT = {'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
+SHORT = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def odd_table():
@@ -270,7 +270,7 @@ def test_same_seed_same_session_and_effects_leave_the_noise_alone():
 
 
 def test_noise_has_the_size_of_its_grade():
-    session = make_session(3, None, 'white', duration=200.0)
+    session = make_session(3, None, 'white', duration=200.0, profile='random_short')
     _, (force, rate) = predicted(session)
     model = session.truth['noise']
     # 20000 samples x 3 axes: 0.3 % sampling error; stamps add nothing.
@@ -280,6 +280,7 @@ def test_noise_has_the_size_of_its_grade():
 
 def test_traps():
     session = make_session(4, None, 'realistic', imu_rate=400.0, joint_rate=50.0, duration=180.0, dropped='both', velocity='none',
+                           profile='random_short',
                            encoder_resolution=np.radians(0.01), mount_rpy_deg=(0.0, 45.0, 0.0), temperature=None, wrong_covariance=True, knock=True)
     assert isinstance(session, Session) and session.temperature is None
     assert np.isnan(session.joints.velocity).all()
@@ -290,13 +291,13 @@ def test_traps():
     steps = session.joints.position / np.radians(0.01)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
     assert session.covariance['force'] < session.truth['noise'].accel_density ** 2 * 400.0
-    assert make_session(4, None, table='two_axis', **SHORT).joints.position.shape[1] == 2
-    still = make_session(4, None, 'none', profile='static_only', **(SHORT | {'duration': 200.0}))
+    assert make_session(4, None, table='two_axis', **(SHORT | {'duration': 350.0})).joints.position.shape[1] == 2
+    still = make_session(4, None, 'none', **(SHORT | {'profile': 'static_only', 'duration': 260.0}))
     assert len(still.truth['profile'].find('spin')) == 0
 
 
 def test_arm_leaves_one_g():
-    session = clean(table='centrifuge', profile='separating', duration=400.0)
+    session = clean(table='centrifuge', profile='separating_short', duration=None)
     assert np.linalg.norm(session.imu.force_s, axis=1).max() > 1.3 * G
 
 

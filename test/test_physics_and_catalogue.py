@@ -11,7 +11,7 @@ from imu_calibration.joint_motion import JointMotion
 from imu_calibration.sensor_model import SensorModel, predict
 from imu_calibration.turntable import Table
 
-OPTIONS = {'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
+OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3, 'encoder_harmonic': 1e-3}
 """Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; else 1 ns stamps."""
 
