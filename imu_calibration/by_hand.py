@@ -1,15 +1,18 @@
 """Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.by_hand_advice import missing_motion
-from imu_calibration.by_hand_poses import average_poses, collect_turns, distinct_attitudes, known_turn_data
+from imu_calibration.by_hand_poses import average_poses, collect_turns, distinct_attitudes, g_sensitivity_evidence, known_turn_data
 from imu_calibration.by_hand_solver import solve_joint
-from imu_calibration.by_hand_system import ACCELEROMETER, COMPONENTS, NOMINAL, PARAM_NAMES, Poses, State, norm_rows, unpack
+from imu_calibration.by_hand_system import (
+    ACCELEROMETER, COMPONENTS, N_PARAMS, NOMINAL, PARAM_NAMES, SENSITIVITY, Poses, State, norm_rows, unpack)
+from imu_calibration.effects import find_effect
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.settings import setting
+from imu_calibration.still_search import find_still
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2; what is taken when the site is not known."""
@@ -17,6 +20,8 @@ GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
 POSES_LEAST = 4
 """Fewer attitudes leave even the accelerometer's biases to the prior."""
+G_SENSITIVITY_P = 1e-3
+"""The response of the gyroscope to attitude enters the model when chance would show it less often."""
 POSES_FULL = 9
 """The nine accelerometer parameters take one equation per attitude."""
 
@@ -36,18 +41,7 @@ class ByHandSettings:
     known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0), 'too small: scales too sure')
     known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
                                    'too small: misalignments too sure')
-    accelerometer_bias_tolerance: float = setting(9.80665e-3, 'm/s^2', 'sd that is good enough: 1 mg', (0.0, None), '')
-    accelerometer_matrix_tolerance: float = setting(1e-3, '1', 'sd that is good enough', (0.0, None), '')
-    gyroscope_bias_tolerance: float = setting(1.7453e-4, 'rad/s', 'sd that is good enough: 0.01 deg/s', (0.0, None), '')
-    gyroscope_matrix_tolerance: float = setting(1e-3, '1', 'sd that is good enough', (0.0, None), '')
-    accelerometer_bias_prior: float = setting(1.0, 'm/s^2', 'sd of the bias before any data (consumer grade, 100 mg)', (0.0, None), '')
-    accelerometer_matrix_prior: float = setting(0.05, '1', 'sd of scale and misalignment before any data', (0.0, None), '')
-    gyroscope_bias_prior: float = setting(0.2, 'rad/s', 'sd of the bias before any data (consumer grade, 10 deg/s)', (0.0, None), '')
-    gyroscope_matrix_prior: float = setting(0.05, '1', 'sd of scale and misalignment before any data', (0.0, None), '')
-
-    def per_parameter(self, kind):
-        """Return the 'tolerance' or 'prior' of each parameter in `PARAM_NAMES` order, shape (21,)."""
-        return np.array([getattr(self, f'{name.split(".")[0]}_{name.split(".")[1]}_{kind}') for name in PARAM_NAMES])
+    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it", symptom="off: it shows as drift and turn scatter")
 
 
 @dataclass(frozen=True)
@@ -88,20 +82,20 @@ class KnownTurn:
 
 @dataclass(frozen=True, eq=False)
 class HandCalibration:
-    """Forward model ``measured = bias + matrix @ true`` of both sensors, with its uncertainty."""
+    """Forward model ``measured = bias + matrix @ true (+ g-sensitivity @ force)`` of both sensors, with its uncertainty."""
 
     param_names: tuple
     """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
     values: np.ndarray
-    """Parameters in `param_names` order, SI, shape (21,)."""
+    """Parameters in `param_names` order, SI, shape (n,)."""
     covariance: np.ndarray
-    """Covariance of `values`, shape (21, 21)."""
+    """Covariance of `values`, shape (n, n)."""
     statuses: tuple
     """'determined', 'weak' or 'held' for each parameter."""
     tolerances: np.ndarray
-    """Sd that would be good enough, shape (21,)."""
+    """Sd that would be good enough, shape (n,)."""
     priors: np.ndarray
-    """Sd before any data, shape (21,)."""
+    """Sd before any data, shape (n,)."""
     gravity: float
     """Reference, m/s^2."""
     gauge: dict
@@ -112,12 +106,12 @@ class HandCalibration:
     """Counts, noise, scatter, chi-square: plain numbers."""
     poses: Poses
     """The poses that were used."""
-    state: State = field(repr=False, default=None)
-    """Directions and drifts of the poses."""
+    state: State
+    """Directions and drifts of the poses; its `values` hold every parameter of the equations, modelled or not."""
 
     @property
     def sd(self):
-        """Standard deviation of each parameter, shape (21,)."""
+        """Standard deviation of each parameter, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def value(self, name):
@@ -131,24 +125,26 @@ class HandCalibration:
     @property
     def accelerometer(self):
         """(bias, matrix) of the accelerometer."""
-        return unpack(self.values)[:2]
+        return unpack(self.state.values)[:2]
 
     @property
     def gyroscope(self):
-        """(bias, matrix) of the gyroscope."""
-        return unpack(self.values)[2:]
+        """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
+        return unpack(self.state.values)[2:]
 
     def compensate(self, force, rate):
         """Return true specific force and rate for readings of shape (n, 3)."""
-        (bias_f, matrix_f), (bias_w, matrix_w) = self.accelerometer, self.gyroscope
-        return np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
+        (bias_f, matrix_f), (bias_w, matrix_w, sensitivity) = self.accelerometer, self.gyroscope
+        true_force = np.linalg.solve(matrix_f, (force - bias_f).T).T
+        return true_force, np.linalg.solve(matrix_w, (rate - bias_w - true_force @ sensitivity.T).T).T
 
     def norm_residuals(self, force=None):
         """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
-        return norm_rows(self.values, self.poses.force if force is None else force, self.gravity)[0]
+        return norm_rows(self.state.values, self.poses.force if force is None else force, self.gravity)[0]
 
 
-def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=()):
+def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
+                      tolerances=None):
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
@@ -169,6 +165,8 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
         Conversion from counts; the result then refers to the converted values.
     known_turns : sequence of KnownTurn
         Full turns by hand, beside what gravity says.
+    tolerances : dict, optional
+        {sensor: {effect: sd that is good enough}}; the catalogue's where not given.
 
     Returns
     -------
@@ -187,23 +185,46 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     if attitudes < POSES_LEAST:
         raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all '
                                  f'parameters), got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
-    turns, dropped = collect_turns(time, imu.rate_s, poses, noise, settings)
-    turns += [known_turn_data(time, imu.rate_s, turn, noise, settings) for turn in known_turns]
-    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, {'attitudes': attitudes, 'turns_dropped': dropped, **noise})
+    turns, dropped = collect_turns(time, imu, poses, noise, settings)
+    turns += [known_turn_data(time, imu, turn, noise, settings) for turn in known_turns]
+    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, {'attitudes': attitudes, 'turns_dropped': dropped, **noise}, tolerances)
 
 
-def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics):
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None):
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`."""
-    priors, tolerances = settings.per_parameter('prior'), settings.per_parameter('tolerance')
+    goals, priors = _from_catalogue(tolerances or {})
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
-    found = solve_joint(poses, turns, gravity, gravity_sd, priors, fallback)
-    statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, tolerances)
+    modelled, evidence = _modelled(poses, settings)
+    found = solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback)
+    statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
-    advice = missing_motion(found.factor, found.state.values, statuses, PARAM_NAMES, priors, tolerances, gravity, pose_sd, turn_sd)
-    statistics = {**statistics, **_statistics(found, poses, turns, gravity)}
-    return HandCalibration(PARAM_NAMES, found.state.values, found.covariance, statuses, tolerances, priors, gravity, dict(GAUGE), advice,
-                           statistics, poses, found.state)
+    advice = missing_motion(found.factor, found.state.values, statuses, PARAM_NAMES, modelled, priors, goals, gravity, pose_sd, turn_sd)
+    statistics = {**statistics, **evidence, **_statistics(found, poses, turns, gravity)}
+    index = np.flatnonzero(modelled)
+    return HandCalibration(tuple(PARAM_NAMES[k] for k in index), found.state.values[index], found.covariance[np.ix_(index, index)],
+                           tuple(statuses[k] for k in index), goals[index], priors[index], gravity, dict(GAUGE), advice, statistics, poses,
+                           found.state)
+
+
+def _from_catalogue(tolerances):
+    """Return (tolerances, prior sds) in `PARAM_NAMES` order."""
+    names = [name.split('.')[:2] for name in PARAM_NAMES]
+    effects = [find_effect(sensor, effect) for sensor, effect in names]
+    goals = [tolerances.get(sensor, {}).get(effect, known.tolerance) for (sensor, effect), known in zip(names, effects)]
+    return np.array(goals, float), np.array([known.prior_sd for known in effects])
+
+
+def _modelled(poses, settings):
+    """Return (which parameters are in the model, what the poses say about g-sensitivity)."""
+    if settings.g_sensitivity not in ('auto', 'on', 'off'):
+        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
+    evidence = g_sensitivity_evidence(poses)
+    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
+                                                and evidence['g_sensitivity_heldout_ratio'] < 1)
+    modelled = np.ones(N_PARAMS, bool)
+    modelled[SENSITIVITY] = wanted
+    return modelled, evidence
 
 
 def _statuses(sd, held, tolerances):
@@ -226,7 +247,6 @@ def _statistics(found, poses, turns, gravity):
 
 def _as_ranges(imu, stills):
     if stills is None:
-        from imu_calibration.windows import find_still
         stills = find_still(imu)
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
     ranges = [(a, b) for a, b in ranges if b - a >= 2]

@@ -11,7 +11,7 @@ STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.produc
 """Six faces, twelve edges and eight corners turned up."""
 
 
-def missing_motion(factor, values, statuses, param_names, priors, tolerances, gravity, pose_sd, turn_sd):
+def missing_motion(factor, values, statuses, param_names, modelled, priors, tolerances, gravity, pose_sd, turn_sd):
     """
     Name the standard pose or turn that lowers the worst sd of each sensor most.
 
@@ -20,9 +20,11 @@ def missing_motion(factor, values, statuses, param_names, priors, tolerances, gr
 
     Parameters
     ----------
-    factor : array, shape (21, 21)
+    factor : array, shape (30, 30)
         Weighted equations so far.
     statuses : sequence of str
+    modelled : array of bool, shape (30,)
+        Parameters that are in the model.
     pose_sd, turn_sd : float
         Accuracy expected of one more pose (m/s^2) and turn (rad).
 
@@ -32,15 +34,15 @@ def missing_motion(factor, values, statuses, param_names, priors, tolerances, gr
         {'parameters': {name: sd over tolerance}, 'needs': sentence} for each sensor that is not fully determined.
 
     """
-    advice = []
-    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)), (slice(GYRO_BIAS.start, N_PARAMS), _turn_candidates(values, turn_sd)))
+    advice, sure = [], np.where(modelled, priors, 1e-9 * priors)
+    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)), (slice(GYRO_BIAS.start, GYRO_MATRIX.stop), _turn_candidates(values, turn_sd)))
     for group, candidates in groups:
-        index = np.arange(N_PARAMS)[group]
+        index = np.arange(N_PARAMS)[group][modelled[group]]
         lacking = [k for k in index if statuses[k] != 'determined']
         if not lacking:
             continue
-        before = _predicted(factor, priors, tolerances)
-        scores = [(_score(_predicted(np.vstack([factor, rows]), priors, tolerances)[lacking]), needs) for rows, needs in candidates]
+        before = _predicted(factor, sure, tolerances)
+        scores = [(_score(_predicted(np.vstack([factor, rows]), sure, tolerances)[lacking]), needs) for rows, needs in candidates]
         best = min(scores, key=lambda s: s[0])
         advice.append({'parameters': {param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
     return tuple(advice)
@@ -57,7 +59,7 @@ def _predicted(rows, priors, tolerances):
 
 
 def _pose_candidates(values, gravity, sd):
-    bias, matrix, _, _ = unpack(values)
+    bias, matrix, *_ = unpack(values)
     for up in STANDARD_POSES:
         columns = norm_rows(values, (bias + gravity * matrix @ up)[None], gravity)[1]
         yield np.pad(columns / sd, ((0, 0), (0, N_PARAMS - columns.shape[1]))), f'hold it still with {_direction(up)} up'

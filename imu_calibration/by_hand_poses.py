@@ -1,6 +1,7 @@
 """From samples to the data of a calibration by hand: means over the poses held still, and the turns between them."""
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from imu_calibration.by_hand_system import Poses, TurnData
 
@@ -50,9 +51,9 @@ def distinct_attitudes(force, apart):
     return len(kept)
 
 
-def collect_turns(time, rate, poses, noise, settings):
+def collect_turns(time, imu, poses, noise, settings):
     """Return (turns between consecutive poses, {reason: count of those left out})."""
-    turns, dropped = [], {}
+    turns, dropped, rate = [], {}, imu.rate_s
     limit = max(settings.gap, 5 * noise['period'])
     extreme = np.max(np.abs(rate), axis=0)
     for first in range(len(poses.start) - 1):
@@ -62,7 +63,7 @@ def collect_turns(time, rate, poses, noise, settings):
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
         density = np.mean((np.array(noise['rate_noise_sd']) * noise['rate_noise_colour'])**2) * noise['period']
-        turns.append(TurnData(time[piece], rate[piece], first, first + 1, density * (time[piece][-1] - time[piece][0])))
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0])))
     return turns, dropped
 
 
@@ -77,11 +78,43 @@ def _unusable(time, rate, extreme, gap, longest):
     return ''
 
 
-def known_turn_data(time, rate, turn, noise, settings):
+def known_turn_data(time, imu, turn, noise, settings):
+    """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
     cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
     piece = slice(turn.start, turn.stop)
     density = np.mean(np.square(noise['rate_noise_sd'])) * noise['period']
-    return TurnData(time[piece], rate[piece], noise_variance=density * (time[piece][-1] - time[piece][0]), rotation=turn.angle * axis,
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=density * (time[piece][-1] - time[piece][0]), rotation=turn.angle * axis,
                     rotation_cov=cov)
+
+
+def g_sensitivity_evidence(poses):
+    """
+    Test whether the gyroscope's readings at rest follow the direction of gravity, beyond their scatter from pose to pose.
+
+    Returns
+    -------
+    dict
+        `g_sensitivity_p_value` of the F test of ``rate = bias + sensitivity @ force`` against the bias alone, and
+        `g_sensitivity_heldout_ratio`, the rms with over that without it for poses left out one at a time.
+
+    """
+    count = len(poses.force)
+    if count < 8:
+        return {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
+    full = np.column_stack([np.ones(count), poses.force])
+    (kept, kept_out), (rest, rest_out) = _residuals(poses.rate, full), _residuals(poses.rate, full[:, :1])
+    scale = np.sqrt(np.mean(rest**2, axis=0)) + 1e-300
+    square = [np.sum((r / scale)**2) for r in (kept, rest)]
+    dof = 3 * (count - 4)
+    ratio = (square[1] - square[0]) / 9 / max(square[0] / dof, 1e-300)
+    heldout = np.sqrt(np.sum((kept_out / scale)**2) / np.sum((rest_out / scale)**2))
+    return {'g_sensitivity_p_value': float(f_distribution.sf(ratio, 9, dof)), 'g_sensitivity_heldout_ratio': float(heldout)}
+
+
+def _residuals(values, design):
+    """Return residuals of least squares, and those of each row when it is left out."""
+    basis = np.linalg.qr(design)[0]
+    residual = values - basis @ (basis.T @ values)
+    return residual, residual / np.maximum(1 - np.sum(basis**2, axis=1), 1e-6)[:, None]

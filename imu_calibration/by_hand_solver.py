@@ -22,18 +22,18 @@ class Solution:
     state: State
     """Parameters, directions and drifts."""
     covariance: np.ndarray
-    """Covariance of the parameters, shape (21, 21)."""
+    """Covariance of the parameters, shape (30, 30)."""
     held: np.ndarray
-    """True where the prior's value was kept, shape (21,)."""
+    """True where the prior's value was kept, shape (30,)."""
     scatter: Scatter
     """Scatter of poses, drifts and turns beyond the noise."""
     factor: np.ndarray
-    """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (21, 21)."""
+    """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (30, 30)."""
     steps: int
     """Gauss-Newton steps taken."""
 
 
-def solve_joint(poses, turns, gravity, gravity_sd, priors, fallback):
+def solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback):
     """
     Estimate all parameters from poses and turns.
 
@@ -42,7 +42,9 @@ def solve_joint(poses, turns, gravity, gravity_sd, priors, fallback):
     poses : Poses
     turns : list of TurnData
     gravity, gravity_sd : float
-    priors : array, shape (21,)
+    modelled : array of bool, shape (30,)
+        Parameters that are part of the model; the others keep their nominal value for certain.
+    priors : array, shape (30,)
         Sd of each parameter about its nominal value before any data.
     fallback : array, shape (3,)
         Variances of `COMPONENTS` where the data are too few to estimate them.
@@ -52,13 +54,15 @@ def solve_joint(poses, turns, gravity, gravity_sd, priors, fallback):
     Solution
 
     """
-    nobody = np.zeros(N_PARAMS, bool)
-    state, scatter, steps = _iterate(_first_state(poses, gravity, priors), poses, turns, gravity, nobody, priors, fallback, fallback)
-    held = choose_held(_factor(state, poses, turns, gravity, scatter), priors)
+    state, scatter, steps = _iterate(_first_state(poses, gravity, priors), poses, turns, gravity, modelled, priors, fallback, fallback)
+    held = np.zeros(N_PARAMS, bool)
+    held[modelled] = choose_held(_factor(state, poses, turns, gravity, scatter)[:, modelled], priors[modelled])
     state = State(np.where(held, NOMINAL, state.values), state.up, state.drift)
-    state, scatter, more = _iterate(state, poses, turns, gravity, held, LOOSE * priors, np.maximum(scatter.variance, 0.01 * fallback), fallback)
+    start = np.maximum(scatter.variance, 0.01 * fallback)
+    state, scatter, more = _iterate(state, poses, turns, gravity, modelled & ~held, LOOSE * priors, start, fallback)
     factor = _factor(state, poses, turns, gravity, scatter)
-    return Solution(state, _covariance(factor, held, priors, state.values, gravity_sd / gravity), held, scatter, factor, steps + more)
+    cov = _covariance(factor, modelled & ~held, held, priors, state.values, gravity_sd / gravity)
+    return Solution(state, cov, held, scatter, factor, steps + more)
 
 
 def choose_held(factor, priors):
@@ -98,15 +102,15 @@ def _first_state(poses, gravity, priors):
         values[ACCELEROMETER] += step
         if np.max(np.abs(step)) < 1e-10:
             break
-    bias, matrix, _, _ = unpack(values)
+    bias, matrix, *_ = unpack(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[GYRO_BIAS] = poses.rate.mean(0)
     return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
 
 
-def _iterate(state, poses, turns, gravity, held, priors, variance, fallback):
+def _iterate(state, poses, turns, gravity, free, priors, variance, fallback):
     """Repeat steps and scatter estimates until neither moves."""
-    count, free = len(poses.start), ~held
+    count = len(poses.start)
     scatter = Scatter(np.array(variance, float), np.full(len(fallback), np.inf), np.full(len(fallback), np.nan))
     for number in range(1, ITERATIONS + 1):
         system = build_system(state, poses, turns, gravity)
@@ -136,9 +140,8 @@ def _factor(state, poses, turns, gravity, scatter):
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]
 
 
-def _covariance(factor, held, priors, values, gravity_ratio):
+def _covariance(factor, free, held, priors, values, gravity_ratio):
     """Covariance of all parameters; those held bring their prior into the others."""
-    free = ~held
     cov = np.zeros((len(priors), len(priors)))
     root = np.linalg.qr(factor[:, free], mode='r')
     inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)))

@@ -12,11 +12,12 @@ LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 AXES = 'xyz'
 PARAM_NAMES = (
     *(f'accelerometer.bias.{a}' for a in AXES), *(f'accelerometer.matrix.{AXES[i]}{AXES[j]}' for i, j in LOWER),
-    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES))
+    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES),
+    *(f'gyroscope.gyro_g_sensitivity.{a}{b}' for a in AXES for b in AXES))
 N_PARAMS = len(PARAM_NAMES)
-ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
-NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
-"""Zero bias and identity matrices."""
+ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX, SENSITIVITY = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 30)
+NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 9], float)
+"""Zero bias, identity matrices, no g-sensitivity."""
 COMPONENTS = ('pose', 'drift', 'turn')
 """Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
 
@@ -51,6 +52,8 @@ class TurnData:
     """Seconds, shape (n,)."""
     rate: np.ndarray
     """Measured rate, rad/s, shape (n, 3)."""
+    force: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
     first: int = -1
     """Pose before the turn."""
     last: int = -1
@@ -68,7 +71,7 @@ class State:
     """Everything that is estimated."""
 
     values: np.ndarray
-    """Parameters in `PARAM_NAMES` order, shape (21,)."""
+    """Parameters in `PARAM_NAMES` order, shape (30,)."""
     up: np.ndarray
     """True direction of the specific force in each pose, unit vectors, shape (k, 3)."""
     drift: np.ndarray
@@ -84,7 +87,7 @@ class System:
     nuisance: np.ndarray
     """Columns of directions (2 per pose) and drifts (3 per pose), shape (m, 5k)."""
     main: np.ndarray
-    """Columns of the parameters, shape (m, 21)."""
+    """Columns of the parameters, shape (m, 30)."""
     noise: np.ndarray
     """Known variance of each row, shape (m,)."""
     component: np.ndarray
@@ -92,11 +95,11 @@ class System:
 
 
 def unpack(values):
-    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix)."""
+    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix, g-sensitivity)."""
     matrix = np.zeros((3, 3))
     for value, (i, j) in zip(values[3:9], LOWER):
         matrix[i, j] = value
-    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3)
+    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3), values[SENSITIVITY].reshape(3, 3)
 
 
 def tangent(up):
@@ -121,7 +124,7 @@ def norm_rows(values, force, gravity):
 
     Parameters
     ----------
-    values : array, shape (9,) or (21,)
+    values : array, shape (9,) or (30,)
     force : array, shape (k, 3)
         Mean readings at rest.
     gravity : float
@@ -137,14 +140,14 @@ def norm_rows(values, force, gravity):
 
 def build_system(state, poses, turns, gravity):
     """Stack the rows of poses, bias drifts and turns at the current state."""
-    rows = [_pose_rows(state, poses, gravity), _drift_rows(state, poses), _calm_rows(state, poses)]
+    rows = [_pose_rows(state, poses, gravity), _drift_rows(state, poses, gravity), _calm_rows(state, poses)]
     rows += [_gravity_turn_rows(state, t) if t.rotation is None else _known_turn_rows(state, t) for t in turns]
     return System(*(np.concatenate(parts) for parts in zip(*rows)))
 
 
 def _pose_rows(state, poses, gravity):
     """``force = bias + matrix @ (gravity * up)``: three rows per pose, two of them spent on its direction."""
-    bias, matrix, _, _ = unpack(state.values)
+    bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
     true = gravity * state.up
     residual = poses.force - bias - true @ matrix.T
@@ -159,12 +162,13 @@ def _pose_rows(state, poses, gravity):
     return _flat(residual, nuisance, main, poses.force_sem**2, 0)
 
 
-def _drift_rows(state, poses):
-    """``rate = bias + drift`` at rest."""
+def _drift_rows(state, poses, gravity):
+    """``rate = bias + sensitivity @ (gravity * up) + drift`` at rest."""
     count = len(state.up)
-    residual = poses.rate - state.values[GYRO_BIAS] - state.drift
+    residual = poses.rate - state.values[GYRO_BIAS] - gravity * state.up @ unpack(state.values)[4].T - state.drift
     main = np.zeros((count, 3, N_PARAMS))
     main[:, :, GYRO_BIAS] = np.eye(3)
+    main[:, :, SENSITIVITY] = np.einsum('ip,kq->kipq', np.eye(3), gravity * state.up).reshape(count, 3, 9)
     return _flat(residual, _drift_columns(count), main, poses.rate_sem**2, -1)
 
 
@@ -183,15 +187,16 @@ def _drift_columns(count):
 
 def _gravity_turn_rows(state, data):
     """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows."""
-    _, _, bias, matrix = unpack(state.values)
+    _, _, bias, matrix, sensitivity = unpack(state.values)
     count, i, j = len(state.up), data.first, data.last
-    turn = integrate_turn(data.time, data.rate, bias + 0.5 * (state.drift[i] + state.drift[j]), matrix)
+    turn = integrate_turn(data.time, data.rate, bias + 0.5 * (state.drift[i] + state.drift[j]), matrix, sensitivity, _true_force(state, data))
     carried = turn.mat_ji @ state.up[i]
     across_i, across_j = tangent(state.up[[i, j]])
     by_psi = across_j.T @ skew(carried)
     main, nuisance = np.zeros((2, N_PARAMS)), np.zeros((2, 5 * count))
     main[:, GYRO_BIAS] = by_psi @ turn.by_bias
-    main[:, GYRO_MATRIX] = (by_psi @ turn.by_matrix.reshape(3, 9))
+    main[:, GYRO_MATRIX] = by_psi @ turn.by_matrix.reshape(3, 9)
+    main[:, SENSITIVITY] = by_psi @ turn.by_sensitivity.reshape(3, 9)
     nuisance[:, 2 * i:2 * i + 2] += across_j.T @ turn.mat_ji @ across_i
     nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
     for pose in (i, j):
@@ -201,8 +206,8 @@ def _gravity_turn_rows(state, data):
 
 def _known_turn_rows(state, data):
     """``matrix^-1 integral(measured - bias) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
-    _, _, bias, matrix = unpack(state.values)
-    turn = integrate_turn(data.time, data.rate, bias, matrix)
+    _, _, bias, matrix, sensitivity = unpack(state.values)
+    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, _true_force(state, data))
     inverse = np.linalg.inv(matrix)
     rotation = inverse @ turn.integral
     main = np.zeros((3, N_PARAMS))
@@ -210,6 +215,11 @@ def _known_turn_rows(state, data):
     main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
     return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
+
+
+def _true_force(state, data):
+    bias, matrix = unpack(state.values)[:2]
+    return np.linalg.solve(matrix, (data.force - bias).T).T
 
 
 def _flat(residual, nuisance, main, noise, component):

@@ -20,17 +20,19 @@ class Turn:
     """Derivative of psi by the bias, ``delta mat_ji = -[psi x] mat_ji``, shape (3, 3), s."""
     by_matrix: np.ndarray
     """Derivative of psi by the entries [row, column] of the forward matrix, shape (3, 3, 3)."""
+    by_sensitivity: np.ndarray
+    """Derivative of psi by the entries [row, column] of the g-sensitivity, shape (3, 3, 3); zeros without forces."""
     integral: np.ndarray
-    """Integral of ``measured - bias``, shape (3,), rad."""
+    """Integral of ``measured - bias - sensitivity @ force``, shape (3,), rad."""
     angle: float
     """Path of the rotation: integral of the rate's length, rad."""
     duration: float
     """Seconds from first to last sample."""
 
 
-def integrate_turn(time, rate_measured, bias, matrix):
+def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=None):
     """
-    Integrate ``rate = matrix^-1 (measured - bias)`` over one stretch of samples.
+    Integrate ``rate = matrix^-1 (measured - bias - sensitivity @ force)`` over one stretch of samples.
 
     Between two samples the rate is taken as linear in time and the rotation vector is the Magnus series to second order
     (fourth order in the step); the steps are multiplied by a prefix product, log2(n) passes over the samples.
@@ -42,7 +44,11 @@ def integrate_turn(time, rate_measured, bias, matrix):
     rate_measured : array, shape (n, 3)
         Gyroscope readings, rad/s.
     bias, matrix : arrays, shape (3,) and (3, 3)
-        Forward model ``measured = bias + matrix @ rate``.
+        Forward model ``measured = bias + matrix @ rate + sensitivity @ force``.
+    sensitivity : array, shape (3, 3), optional
+        Response to specific force, (rad/s)/(m/s^2).
+    force : array, shape (n, 3), optional
+        Specific force, m/s^2.
 
     Returns
     -------
@@ -50,7 +56,7 @@ def integrate_turn(time, rate_measured, bias, matrix):
 
     """
     inverse = np.linalg.inv(matrix)
-    centred = rate_measured - bias
+    centred = rate_measured - bias if force is None else rate_measured - bias - force @ sensitivity.T
     rate = centred @ inverse.T
     step = np.diff(time)
     first, second = rate[:-1], rate[1:]
@@ -62,9 +68,10 @@ def integrate_turn(time, rate_measured, bias, matrix):
     weight = _per_sample(gain, step, first, second)
     by_inverse = np.einsum('mir,mc->irc', weight, centred)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
+    by_sensitivity = np.zeros((3, 3, 3)) if force is None else -np.einsum('mip,mq->ipq', weight @ inverse, force)
     path = float(np.sum(0.5 * step * np.linalg.norm(first + second, axis=1)))
     integral = 0.5 * np.sum(step[:, None] * (centred[:-1] + centred[1:]), axis=0)
-    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, integral, path, float(time[-1] - time[0]))
+    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_sensitivity, integral, path, float(time[-1] - time[0]))
 
 
 def _per_sample(gain, step, first, second):
