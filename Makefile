@@ -47,7 +47,7 @@ $(STAMP): $(wildcard constraints/*.txt) setup.py setup.cfg
 	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
 	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
-	@$(PIP) --constraint $(PINS) setuptools wheel
+	@$(PIP) $$(cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS)) | grep -oE '^(setuptools|wheel)==[0-9.]+')
 	@$(PIP) --prefer-binary --no-build-isolation --use-pep517 --requirement $(PINS)
 	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
 	@touch $@
