@@ -124,7 +124,7 @@ def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
     problem = _Problem(accumulator, model, prior)
     values = problem.start()
     noises = noise or problem.first_noise(values)
-    for iteration in range(3):
+    for _ in range(2):
         values = problem.minimise(values, noises, _free(model, None))
         if noise is not None:
             break

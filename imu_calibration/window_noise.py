@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
 
@@ -107,23 +108,62 @@ def whiten(values, variance, times, sessions, wander_sd, wander_time):
     return white, logs
 
 
-def restricted_likelihood(rows, variance, times, sessions, wander, information):
+class OffsetLikelihood:
     """
-    Return minus twice the restricted log likelihood of mean rows ``[design | residual]``, shape (n, 3, q + 1).
+    Minus twice the restricted log likelihood of mean rows ``[design | residual]`` as a function of the offsets' variances.
 
-    Parameters
-    ----------
-    information : ndarray, shape (q + 1, q + 1)
-        Gram matrix ``[J r]' [J r]`` of everything else that is known about the q parameters.
-
+    With ``V = D + s^2 K``, K exponential in time, ``V^-1 = D^-1 - D^-1 (D^-1 + K^-1 / s^2)^-1 D^-1``, and K^-1 is tridiagonal: linear
+    time.
     """
-    white, logs = whiten(rows, variance, times, sessions, *wander)
-    flat = white.reshape(-1, rows.shape[2])
-    gram = flat.T @ flat + information
+
+    def __init__(self, rows, white, times, sessions, information):
+        order = np.concatenate(sessions)
+        self.rows, self.white, self.information = rows[order], white[order], information
+        steps = np.diff(times[order])
+        steps[np.cumsum([len(index) for index in sessions])[:-1] - 1] = np.inf
+        self.steps = steps
+
+    def __call__(self, offset, wander=0.0, time=100.0):
+        """Return the value for an offset sd, a wander sd and its correlation time."""
+        variance = self.white + offset**2
+        logs, gram = np.log(variance).sum(), self.information.copy()
+        scaled = self.rows / np.sqrt(variance)[:, :, None]
+        flat = scaled.reshape(-1, self.rows.shape[2])
+        gram += flat.T @ flat
+        if wander > 0:
+            decay = np.exp(-self.steps / time)
+            rest = -np.expm1(-2 * self.steps / time)
+            logs += 3 * (len(self.rows) * 2 * np.log(wander) + np.log(rest).sum())
+            bands = self._inverse_kernel(decay, rest, wander)
+            for axis in range(3):
+                logs += self._take_wander(gram, bands, self.rows[:, axis], variance[:, axis])
+        return logs + _profile(gram)
+
+    def _inverse_kernel(self, decay, rest, wander):
+        """Return K^-1 / s^2 of the wander as lower bands, shape (2, n)."""
+        bands = np.zeros((2, len(self.rows)))
+        bands[0] = 1.0
+        bands[0, :-1] += decay**2 / rest
+        bands[0, 1:] += decay**2 / rest
+        bands[1, :-1] = -decay / rest
+        return bands / wander**2
+
+    def _take_wander(self, gram, bands, rows, variance):
+        """Subtract the wander's part from the Gram matrix in place; return the log determinant that goes with it."""
+        banded = bands.copy()
+        banded[0] += 1 / variance
+        factor = cholesky_banded(banded, lower=True, check_finite=False)
+        weighted = rows / variance[:, None]
+        gram -= weighted.T @ cho_solve_banded((factor, True), weighted, check_finite=False)
+        return 2 * np.log(factor[0]).sum()
+
+
+def _profile(gram):
+    """Return log|A| + (y' y - b' A^-1 b) for the Gram matrix [[A, b], [b', y' y]]."""
     scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-300))
-    factor = np.linalg.cholesky(gram[:-1, :-1] / np.outer(scale, scale) + 1e-13 * np.eye(len(scale)))
+    factor = np.linalg.cholesky(gram[:-1, :-1] / np.outer(scale, scale) + 1e-12 * np.eye(len(scale)))
     solved = np.linalg.solve(factor, gram[:-1, -1] / scale)
-    return logs.sum() + 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() + gram[-1, -1] - solved @ solved
+    return 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() + gram[-1, -1] - solved @ solved
 
 
 WANDER_GAIN = 9.2
@@ -145,38 +185,29 @@ def estimate_offsets(rows, white, times, sessions, information):
 
     """
     typical = float(np.sqrt(np.median(white)))
-
-    def cost(offset, wander, time):
-        return restricted_likelihood(rows, white + offset**2, times, sessions, (wander, time), information)
-
-    ratios = np.array([0.0, 0.3, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
-    costs = [cost(ratio * typical, 0.0, 100.0) for ratio in ratios]
-    offset = _refine(lambda x: cost(np.exp(x[0]), 0.0, 100.0), [ratios[int(np.argmin(costs))] * typical], typical, min(costs), costs[0])
-    alone = cost(offset[0], 0.0, 100.0)
+    cost = OffsetLikelihood(rows, white, times, sessions, information)
+    ratios = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
+    costs = [cost(ratio * typical) for ratio in ratios]
+    offset = _refine(cost, ratios[int(np.argmin(costs))] * typical, costs[0])
+    alone = cost(offset)
     if len(rows) < 12:
-        return offset[0], 0.0, 100.0
-    best = (alone, (offset[0], 0.0, 100.0))
-    for time in (40.0, 120.0, 400.0):
-        for ratio in (1.0, 3.0, 10.0, 30.0):
-            for share in (0.0, 0.3):
-                trial = (share * ratio * typical, ratio * typical, time)
-                value = cost(*trial)
-                if value < best[0]:
-                    best = (value, trial)
-    if best[0] == alone:
-        return offset[0], 0.0, 100.0
-    start = [max(best[1][0], 0.1 * typical), best[1][1], best[1][2]]
-    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), float(np.exp(np.clip(x[2], 1.6, 8.0)))), np.log(start), method='Nelder-Mead',
-                     options={'maxfev': 120, 'xatol': 0.02, 'fatol': 0.02})
-    if alone - min(found.fun, best[0]) < WANDER_GAIN:
-        return offset[0], 0.0, 100.0
-    offset_sd, wander_sd, wander_time = np.exp(found.x)
-    return float(offset_sd), float(wander_sd), float(np.exp(np.clip(found.x[2], 1.6, 8.0)))
+        return offset, 0.0, 100.0
+    trials = [(share * ratio * typical, ratio * typical, time)
+              for time in (40.0, 120.0, 400.0) for ratio in (1.0, 3.0, 10.0, 30.0) for share in (0.0, 0.3)]
+    values = [cost(*trial) for trial in trials]
+    best = int(np.argmin(values))
+    start = np.log([max(trials[best][0], 0.1 * typical), trials[best][1], trials[best][2]])
+    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), np.exp(np.clip(x[2], 1.6, 8.0))), start, method='Nelder-Mead',
+                     options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03})
+    if alone - min(found.fun, values[best]) < WANDER_GAIN:
+        return offset, 0.0, 100.0
+    offset_sd, wander_sd, wander_time = np.exp(np.append(found.x[:2], np.clip(found.x[2], 1.6, 8.0)))
+    return float(offset_sd), float(wander_sd), float(wander_time)
 
 
-def _refine(cost, start, typical, best, at_zero):
-    """Return the offset sd near a grid point, zero when zero is as good."""
-    if start[0] == 0:
-        return [0.0]
-    found = minimize(cost, np.log(start), method='Nelder-Mead', options={'maxfev': 40, 'xatol': 0.02, 'fatol': 0.01})
-    return [float(np.exp(found.x[0]))] if found.fun < at_zero - OFFSET_GAIN else [0.0]
+def _refine(cost, start, at_zero):
+    """Return the offset sd near a grid point, zero when zero does nearly as well."""
+    if start == 0:
+        return 0.0
+    found = minimize(lambda x: cost(np.exp(x[0])), [np.log(start)], method='Nelder-Mead', options={'maxfev': 40, 'xatol': 0.02, 'fatol': 0.01})
+    return float(np.exp(found.x[0])) if found.fun < at_zero - OFFSET_GAIN else 0.0

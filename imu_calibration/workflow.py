@@ -7,6 +7,7 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration import observability
+from imu_calibration.by_hand_document import calibrate_recording_by_hand
 from imu_calibration.calibration import DETERMINED, Calibration, statuses, tolerances_of
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior, solve
@@ -164,6 +165,26 @@ def _values_in(model, solution):
     return values
 
 
+def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None, provenance=None):
+    """
+    Calibrate by hand: gravity is the reference (see `by_hand`).
+
+    Raises
+    ------
+    InputError
+        When more than one recording comes, or a model with further effects is asked for.
+
+    """
+    if len(sources) != 1:
+        raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
+    for model in (options.accelerometer_model, options.gyroscope_model):
+        if model not in (None, 'bias+matrix', 'axial', 'rate'):
+            raise InputError(f"calibration by hand estimates bias+matrix, '{model}' was asked for; give --table for more")
+    calibration, hand, gathered, tolerances = calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance)
+    calibration = replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity})
+    return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances)
+
+
 def finish(gathered, model, table, options=CalibrationOptions(), provenance=None):
     """Solve what was gathered and judge it: the reduce step of calibration; the live node calls it after each window."""
     narrow = settle_model(model, options, gathered)
@@ -230,14 +251,13 @@ def statistics(solution, gathered):
     return result
 
 
-STREAM_COUNTS = ('used', 'gap', 'gaps', 'imu', 'joints', 'samples', 'clock reset')
-"""Counts that do not mean lost samples."""
+ACCEPTED = ('static', 'spin', 'dynamic', 'settling', 'not quiet', 'turn-on', 'too short')
+"""Counts of samples that arrived whole; the last four are kept out of windows on purpose."""
 
 
 def dropped(counts):
     """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
-    return {reason: int(count) for reason, count in sorted(counts.items())
-            if isinstance(count, (int, np.integer)) and count and not any(reason.startswith(name) for name in STREAM_COUNTS)}
+    return {reason: int(count) for reason, count in sorted(counts.items()) if count and reason not in ACCEPTED}
 
 
 def _finite(value):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from imu_calibration import workflow
+from imu_calibration.compensation_stream import CompensationStream, refuse_corrected
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.errors import InputError
@@ -28,7 +28,8 @@ def run(options):
         raise InputError(f'the output bag {options.output} must not exist yet; choose another name or remove it')
     recording = recordings.open_bag(options.bag, options, want_joints=False)
     with recording, progress_bar('compensate', recording.message_counts.get(recording.imu_topic, 0)) as advance:
-        stream = workflow.CompensationStream(calibration, recordings.temperatures(recording, options))
+        refuse_corrected(recording.imu_topic)
+        stream = CompensationStream(calibration, temperature=recordings.temperatures(options.bag, options))
 
         def correct(imu):
             advance(len(imu))

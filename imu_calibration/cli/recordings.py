@@ -106,3 +106,12 @@ def provenance_of(paths, options):
     kept = {name: value for name, value in sorted(vars(options).items())
             if name in ('accelerometer_model', 'gyroscope_model', 'reference_model', 'imu_topic', 'joint_topic', 'temperature_topic', 'setting') and value}
     return {'bags': [{'name': Path(path).name, 'sha256': files.hash_of(path)} for path in paths], 'options': kept}
+
+
+def temperatures(path, options):
+    """Return all temperatures of a recording, or None."""
+    parts = []
+    with open_bag(path, options, want_joints=False) as recording:
+        if recording.temperature_topic:
+            parts = [block.temperature for block in recording.blocks() if block.temperature is not None and len(block.temperature)]
+    return type(parts[0]).concatenate(parts) if parts else None

@@ -1,9 +1,10 @@
 """``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
 
-from imu_calibration import workflow
+from imu_calibration.by_hand_document import read_imu
 from imu_calibration.cli import recordings
 from imu_calibration.cli.show import console, with_sd
 from imu_calibration.errors import InputError
+
 
 NAME = 'arm'
 HELP = 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.'
@@ -17,14 +18,15 @@ def add_arguments(parser):
 
 def run(options):
     """Estimate and print."""
+    from imu_calibration.relative_arm import estimate_arm
     if len(options.imu_topic) != 2:
         raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
     imus = []
     for topic in options.imu_topic:
         options.joint_topic = options.temperature_topic = None
         recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
-        imus.append(workflow.read_imu(recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()))
-    result = workflow.relative_arm(*imus)
+        imus.append(read_imu(recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)())[0])
+    result = estimate_arm(*imus)
     out = console()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):
         shown, spread = with_sd(value * 1e3, sd * 1e3)

@@ -1,0 +1,24 @@
+"""``imu_calibration fleet``: many units, one result each, a summary table."""
+
+from imu_calibration.cli import files, recordings
+
+NAME = 'fleet'
+HELP = 'Calibrate a folder of many units: one result each, and a summary table with the spread of each parameter.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('folder', metavar='FOLDER', help='folder that holds one bag per unit')
+    parser.add_argument('--table', metavar='TABLE', required=True, help='table description (YAML)')
+    parser.add_argument('--output', metavar='DIR', required=True, help='folder for one result per unit and summary.csv')
+    parser.add_argument('--jobs', type=int, default=2, help='units calibrated side by side, default 2')
+    parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
+    parser.add_argument('--no-report', action='store_true', help='no report.html per unit')
+    recordings.add_topic_arguments(parser)
+    recordings.add_model_arguments(parser)
+
+
+def run(options):
+    """Calibrate all units, continuing past a bad bag."""
+    from imu_calibration.cli.fleet_run import run_fleet
+    return run_fleet(options, files.read_table(options.table), recordings.calibration_options(options))
