@@ -89,8 +89,9 @@ class MotionChunks:
     def _passed_ns(self):
         """Return the stamp that all streams have passed or will never pass."""
         imu, joints, temperature = (-NEVER if b.newest_ns is None else b.newest_ns for b in (self._imu, self._joints, self._temperature))
-        wait = _ns(JOINT_WAIT)
-        return min(max(imu, joints - wait), max(joints, imu - wait), max(temperature, imu - _ns(TEMPERATURE_WAIT)))
+        given_up = _ns(JOINT_WAIT)
+        imu, joints = max(imu, joints - given_up), max(joints, imu - given_up)
+        return min(imu, joints, max(temperature, imu - _ns(TEMPERATURE_WAIT)))
 
     def _advance(self, passed, final):
         """Go to the next chunk that has IMU samples; False when there is none yet."""

@@ -20,7 +20,7 @@ class SampleBuffer:
             self._blocks.append(samples)
 
     def between(self, first_ns, stop_ns):
-        """Return the samples with stamps in [first, stop), or None when the buffer never had any."""
+        """Return the samples with stamps in [first, stop), or None when the buffer is empty."""
         samples = self._joined()
         if samples is None:
             return None
@@ -43,9 +43,7 @@ class SampleBuffer:
             place = max(0, int(np.searchsorted(block.stamp_ns, stamp_ns)) - keep_one)
             if place:
                 kept = block.select(slice(place, None))
-                self._blocks[0] = _owned(kept)
-                if not len(kept) and len(self._blocks) > 1:
-                    del self._blocks[0]
+                self._blocks[:1] = [_owned(kept)] if len(kept) else []
 
     def _joined(self):
         if len(self._blocks) > 1:
