@@ -1,7 +1,6 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
 from collections import Counter
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -127,7 +126,7 @@ class Recording:
         parts, n_samples = {}, 0
         for stretch in self._source.stretches(list(decoders)):
             for topic, packed in stretch.items():
-                samples = decoders[topic](packed)
+                samples = decoders[topic].decode(packed)
                 if samples is not None:
                     parts.setdefault(type(samples), []).append(samples)
                     n_samples += len(samples)
@@ -145,11 +144,11 @@ class Recording:
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
             standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
-            deserialize = _lazy(message_type, source)
+            deserialize = None if standard else deserializer(message_type, source.definitions, source.ros1)
             if message_type == JOINT_STATE_TYPE:
-                decoders[topic] = JointDecoder(joint_names, deserialize, standard)
+                decoders[topic] = JointDecoder(joint_names, deserialize)
             else:
-                decoders[topic] = Decoder(message_type, deserialize, standard)
+                decoders[topic] = Decoder(message_type, deserialize)
         return decoders
 
     def close(self):
@@ -171,12 +170,6 @@ def _block(parts, decoders):
         decoder.dropped.clear()
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
     return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dict(dropped) or None)
-
-
-def _lazy(message_type, source):
-    """Return a deserializer that is built at its first use: most recordings never need it, and building it takes time."""
-    build = cache(lambda: deserializer(message_type, source.definitions, source.ros1))
-    return lambda data: build()(data)
 
 
 def _open_source(path):

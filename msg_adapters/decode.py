@@ -1,18 +1,21 @@
-"""Serialized messages of one topic to samples: whole groups of one layout at once, and the rest message by message."""
+"""Messages of one topic to samples: whole groups of one layout at once, or object by object."""
 
 from collections import Counter
 
 import numpy as np
 
 from imu_calibration.errors import InputError
-from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, imu_from_message
-from msg_adapters.joint_state import (JOINT_STATE_TYPE, JointsNotInMessage, decode_joints, find_joint_layout, joints_from_message)
-from msg_adapters.layout import group_by_layout
-from msg_adapters.stamps import MessageError
-from msg_adapters.temperature import TEMPERATURE_TYPE, decode_temperature, find_temperature_layout, temperature_from_message
+from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, imu_from_rows, imu_row
+from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout, joint_row, joints_from_rows
+from msg_adapters.layout import Packed, group_by_layout
+from msg_adapters.stamps import MessageError, UnusableMessage
+from msg_adapters.temperature import (TEMPERATURE_TYPE, decode_temperature, find_temperature_layout, temperature_from_rows,
+                                      temperature_row)
 
 JOINT_PATIENCE = 1000
 """So many JointState messages may pass before one fits the table."""
+KEPT_NAMES = 3
+"""Different lists of joint names that an error shows."""
 
 
 class Decoder:
@@ -22,101 +25,128 @@ class Decoder:
     Parameters
     ----------
     message_type : str
-        Imu, JointState or Temperature.
+        Imu or Temperature; JointState has its own class.
     deserialize : callable, optional
-        Message bytes -> message object, for what the layouts do not cover; raises ValueError or the like.
-    standard : bool
-        Whether the bag's definition is the standard one, as plain CDR; otherwise every message takes the general path.
+        Message bytes -> message object, for messages that are not standard CDR: every one then takes this general path.
 
     """
 
-    def __init__(self, message_type, deserialize=None, standard=True):
-        self.find_layout, self.decode_group, self.from_message = _FUNCTIONS[message_type]
+    def __init__(self, message_type, deserialize=None):
+        self.find_layout, self.decode_layout, self.read_row, self.from_rows = _FUNCTIONS[message_type]
         self.name = message_type.rpartition('/')[2]
-        self.deserialize, self.standard = deserialize, standard
+        self.deserialize = deserialize
         self.dropped = Counter()
 
-    def __call__(self, packed):
-        """Return the samples of a Packed in its order, or None when it holds none; counts what it drops in `dropped`."""
-        groups, rest = group_by_layout(packed, self.find_layout) if self.standard else ([], np.arange(len(packed)))
-        parts = [(index, self._decode_group(layout, packed, index)) for layout, index in groups]
-        parts += [(np.array([k]), self._decode_one(packed.message(k))) for k in rest]
-        parts = sorted(((index, samples) for index, samples in parts if samples is not None), key=lambda part: part[0][0])
-        if len(parts) < 2:
-            return parts[0][1] if parts else None
-        joined = type(parts[0][1]).concatenate(samples for _, samples in parts)
-        return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
-
-    def _decode_group(self, layout, packed, index):
-        return self.decode_group(layout, packed, index)
-
-    def _decode_one(self, data):
+    def decode(self, packed):
+        """Return the samples of a Packed in its order, or None when there are none; counts in `dropped` what it cannot use."""
         if self.deserialize is not None:
-            try:
-                return self.from_message(self.deserialize(data))
-            except Exception as error:   # rosbags' generated readers raise many kinds on broken bytes
-                return self._count(error)
-        return self._count(None)
+            objects = (self._deserialized(packed.message(k)) for k in range(len(packed)))
+            return self.decode_objects(message for message in objects if message is not None)
+        groups, rest = group_by_layout(packed, self.find_layout)
+        parts = [(index, self._decode_group(layout, group)) for layout, index, group in groups]
+        parts += [(rest[k:k + 1], self._decode_alone(packed.message(number))) for k, number in enumerate(rest)]
+        return _in_order([(index, samples) for index, samples in parts if samples is not None])
 
-    def _count(self, error):
-        self.dropped[f'{self.name} message that cannot be decoded'] += 1
+    def decode_objects(self, messages):
+        """Return the samples of message objects, from rclpy or rosbags, or None when there are none."""
+        rows = [row for row in map(self._row, messages) if row is not None]
+        return self.from_rows(rows) if rows else None
+
+    def _decode_group(self, layout, packed):
+        try:
+            return self.decode_layout(layout, packed)
+        except MessageError as error:
+            return self._drop(error, len(packed))
+
+    def _decode_alone(self, data):
+        try:
+            layout = self.find_layout(data)
+        except MessageError as error:
+            return self._drop(error, 1)
+        return self._decode_group(layout, Packed.join([data]))
+
+    def _deserialized(self, data):
+        try:
+            return self.deserialize(data)
+        except Exception as error:   # rosbags' generated readers raise many kinds on broken bytes
+            return self._drop(error, 1)
+
+    def _row(self, message):
+        try:
+            return self.read_row(message)
+        except (AttributeError, TypeError, ValueError, IndexError) as error:   # fields of another definition
+            return self._drop(error, 1)
+
+    def _drop(self, error, n_messages):
+        reason = str(error) if isinstance(error, UnusableMessage) else f'{self.name} message that cannot be decoded'
+        self.dropped[reason] += n_messages
 
 
 class JointDecoder(Decoder):
-    """Decoder of JointState that brings every message to one order of joints."""
+    """
+    Decode JointState, every message brought to one order of joints.
 
-    def __init__(self, joint_names=None, deserialize=None, standard=True):
-        super().__init__(JOINT_STATE_TYPE, deserialize, standard)
-        self.asked = tuple(joint_names) if joint_names is not None else None
-        self.names = self.asked
-        self.seen = {}
+    Parameters
+    ----------
+    joint_names : sequence of str, optional
+        Joints of the table; default: those of the first message that names any.
+    deserialize : callable, optional
+        As for Decoder.
+
+    """
+
+    def __init__(self, joint_names=None, deserialize=None):
+        super().__init__(JOINT_STATE_TYPE, deserialize)
+        self.asked = joint_names is not None
+        self.names = tuple(joint_names) if self.asked else ()
+        self.seen = []
         self.n_messages, self.n_fitting = 0, 0
+        self.decode_layout = lambda layout, packed: decode_joints(layout, packed, self._expected(layout.names))
+        self.read_row = lambda message: joint_row(message, self._expected(tuple(message.name)))
+        self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
-    def __call__(self, packed):
-        """Decode; raises InputError when the names have not matched for long."""
-        samples = super().__call__(packed)
-        self.n_messages += len(packed)
-        self.n_fitting += len(samples) if samples is not None else 0
+    def decode(self, packed):
+        """As for Decoder; raises InputError when the names have not matched those of the table for long."""
+        return self._checked(super().decode(packed), len(packed) if self.deserialize is None else 0)
+
+    def decode_objects(self, messages):
+        """As for Decoder; raises InputError when the names have not matched those of the table for long."""
+        messages = list(messages)
+        return self._checked(super().decode_objects(messages), len(messages))
+
+    def check(self):
+        """Raise InputError when no message so far has held the joints of the table."""
+        if self.asked and self.seen and not self.n_fitting:
+            came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
+            raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}; '
+                             'correct the names in the table description, or choose another topic by --joint-topic')
+
+    def _checked(self, samples, n_messages):
+        self.n_messages += n_messages
+        self.n_fitting += 0 if samples is None else len(samples)
         if self.n_messages >= JOINT_PATIENCE:
             self.check()
         return samples
 
-    def check(self):
-        """Raise InputError when no message so far has held the joints of the table."""
-        if self.n_messages and not self.n_fitting and self.asked is not None and self.seen:
-            came = '; '.join(', '.join(names) or '(no names)' for names in list(self.seen)[:3])
-            raise InputError(f'JointState must name the joints of the table ({", ".join(self.asked)}), got {came}; '
-                             'correct the names in the table description or choose another topic by --joint-topic')
-
-    def _decode_group(self, layout, packed, index):
-        try:
-            return decode_joints(layout, packed, index, self._expect(layout.names))
-        except JointsNotInMessage as reason:
-            self.dropped[str(reason)] += len(index)
-            return None
-
-    def from_message_object(self, message):
-        return joints_from_message(message, self._expect(tuple(message.name)))
-
-    def _decode_one(self, data):
-        self.from_message = self.from_message_object
-        return super()._decode_one(data)
-
-    def _count(self, error):
-        if isinstance(error, JointsNotInMessage):
-            self.dropped[str(error)] += 1
-        else:
-            super()._count(error)
-
-    def _expect(self, names):
-        self.seen[names] = None
-        if self.names is None and names:
+    def _expected(self, names):
+        if names not in self.seen and len(self.seen) < KEPT_NAMES:
+            self.seen.append(names)
+        if not self.asked and not self.names:
             self.names = names
-        return self.names or ()
+        return self.names
+
+
+def _in_order(parts):
+    """Join (index, samples) pairs in the order of the indices; None when there are none."""
+    if len(parts) < 2:
+        return parts[0][1] if parts else None
+    parts = sorted(parts, key=lambda part: part[0][0])   # so that the frame is that of the first message
+    joined = type(parts[0][1]).concatenate(samples for _, samples in parts)
+    return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
 
 
 _FUNCTIONS = {
-    IMU_TYPE: (find_imu_layout, decode_imu, imu_from_message),
-    JOINT_STATE_TYPE: (find_joint_layout, None, None),
-    TEMPERATURE_TYPE: (find_temperature_layout, decode_temperature, temperature_from_message),
+    IMU_TYPE: (find_imu_layout, decode_imu, imu_row, imu_from_rows),
+    JOINT_STATE_TYPE: (find_joint_layout, decode_joints, joint_row, joints_from_rows),
+    TEMPERATURE_TYPE: (find_temperature_layout, decode_temperature, temperature_row, temperature_from_rows),
 }

@@ -79,39 +79,32 @@ def find_imu_layout(data):
     return Layout(order, len(data), bytes(data), fixed, offsets, (frame.decode(errors='replace'),))
 
 
-def decode_imu(layout, packed, index):
-    """
-    Decode messages of one layout; readings that a message declares absent (covariance -1) come as NaN.
-
-    Returns
-    -------
-    ImuSamples
-        In the order of `index`.
-
-    """
+def decode_imu(layout, packed):
+    """Return the ImuSamples of messages of one layout; what a message declares absent (covariance -1) comes as NaN."""
     readings = {}
     for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
-        values = layout.column(packed, index, name)
-        absent = _first(layout, cov).column(packed, index, cov)[:, 0] == -1.0
+        values = layout.column(packed, name)
+        absent = layout.column(packed, cov, 1)[:, 0] == -1.0
         if absent.any():
             values[absent] = np.nan
         readings[name] = values
-    return ImuSamples(layout.stamp_ns(packed, index), frame_id=layout.names[0], **readings)
+    return ImuSamples(layout.stamp_ns(packed), frame_id=layout.names[0], **readings)
 
 
-def imu_from_message(message):
-    """Return one-row ImuSamples from a message object of rclpy or rosbags."""
-    def reading(value, covariance):
-        return np.full((1, 3), np.nan) if covariance[0] == -1.0 else np.array([[value.x, value.y, value.z]], dtype=float)
-
-    return ImuSamples(np.array([header_stamp_ns(message)], dtype=np.int64),
-                      reading(message.linear_acceleration, message.linear_acceleration_covariance),
-                      reading(message.angular_velocity, message.angular_velocity_covariance), message.header.frame_id)
+def imu_row(message):
+    """Return (stamp_ns, force, rate, frame_id) of a message object of rclpy or rosbags; absent readings as NaN."""
+    force = _reading(message.linear_acceleration, message.linear_acceleration_covariance)
+    return header_stamp_ns(message), force, _reading(message.angular_velocity, message.angular_velocity_covariance), message.header.frame_id
 
 
-def _first(layout, name):
-    """The same layout with only the first number of field `name`."""
-    return Layout(layout.order, layout.size, layout.sample, layout.fixed, {name: (layout.offsets[name][0], 1)})
+def imu_from_rows(rows):
+    """Return ImuSamples from what `imu_row` gave."""
+    stamp_ns, force_s, rate_s, frames = zip(*rows, strict=True)
+    return ImuSamples(np.array(stamp_ns, dtype=np.int64), np.array(force_s, dtype=float), np.array(rate_s, dtype=float), frames[0])
+
+
+def _reading(vector, covariance):
+    return (np.nan,) * 3 if covariance[0] == -1.0 else (vector.x, vector.y, vector.z)
 
 
 def _open_message(data):

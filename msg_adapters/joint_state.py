@@ -6,16 +6,12 @@ import numpy as np
 
 from imu_calibration.samples import JointSamples
 from msg_adapters.layout import Layout
-from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, align, byte_order, header_stamp_ns
+from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, UnusableMessage, align, byte_order, header_stamp_ns
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
-
-
-class JointsNotInMessage(MessageError):
-    """A well-formed JointState that cannot be used; its text is the reason to count it under."""
 
 
 def find_joint_layout(data):
@@ -35,44 +31,47 @@ def find_joint_layout(data):
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
 
 
-def decode_joints(layout, packed, index, joint_names):
+def decode_joints(layout, packed, joint_names):
     """
     Decode messages of one layout, columns in the order of `joint_names`.
 
     Raises
     ------
-    JointsNotInMessage
+    UnusableMessage
         When a joint is missing or the message has no positions.
 
     """
     columns = joint_columns(layout.names, layout.offsets['position'][1], joint_names)
-    position = layout.column(packed, index, 'position')[:, columns]
+    position = layout.column(packed, 'position')[:, columns]
     if layout.offsets['velocity'][1] == len(layout.names):
-        velocity = layout.column(packed, index, 'velocity')[:, columns]
+        velocity = layout.column(packed, 'velocity')[:, columns]
     else:
         velocity = np.full_like(position, np.nan)
-    return JointSamples(layout.stamp_ns(packed, index), position, velocity, tuple(joint_names))
+    return JointSamples(layout.stamp_ns(packed), position, velocity, tuple(joint_names))
 
 
-def joints_from_message(message, joint_names):
-    """Return one-row JointSamples from a message object of rclpy or rosbags (raises JointsNotInMessage)."""
+def joint_row(message, joint_names):
+    """Return (stamp_ns, positions, velocities) of a message object of rclpy or rosbags (raises UnusableMessage)."""
     columns = joint_columns(message.name, len(message.position), joint_names)
-    position = np.asarray(message.position, dtype=float)[columns]
-    if len(message.velocity) == len(message.name):
-        velocity = np.asarray(message.velocity, dtype=float)[columns]
-    else:
-        velocity = np.full_like(position, np.nan)
-    stamp_ns = np.array([header_stamp_ns(message)], dtype=np.int64)
-    return JointSamples(stamp_ns, position[np.newaxis], velocity[np.newaxis], tuple(joint_names))
+    has_velocity = len(message.velocity) == len(message.name)
+    velocity = [message.velocity[k] for k in columns] if has_velocity else [np.nan] * len(columns)
+    return header_stamp_ns(message), [message.position[k] for k in columns], velocity
+
+
+def joints_from_rows(rows, joint_names):
+    """Return JointSamples from what `joint_row` gave."""
+    stamp_ns, position, velocity = zip(*rows, strict=True)
+    return JointSamples(np.array(stamp_ns, dtype=np.int64), np.array(position, dtype=float), np.array(velocity, dtype=float),
+                        tuple(joint_names))
 
 
 def joint_columns(names, n_positions, joint_names):
-    """Return where in a message that names `names` the joints stand (raises JointsNotInMessage)."""
+    """Return where in a message that names `names` the joints stand (raises UnusableMessage)."""
     names = list(names)
     if any(name not in names for name in joint_names):
-        raise JointsNotInMessage(MISSING_JOINT)
+        raise UnusableMessage(MISSING_JOINT)
     if n_positions != len(names):
-        raise JointsNotInMessage(NO_POSITION)
+        raise UnusableMessage(NO_POSITION)
     return [names.index(name) for name in joint_names]
 
 

@@ -29,6 +29,10 @@ class Packed:
         start = int(self.start[index])
         return self.buffer[start:start + int(self.size[index])].tobytes()
 
+    def select(self, index):
+        """Return some of the messages."""
+        return Packed(self.buffer, self.start[index], self.size[index])
+
     @classmethod
     def join(cls, messages):
         """Pack a list of bytes objects."""
@@ -54,26 +58,30 @@ class Layout:
     names: tuple = ()
     """Strings of the message: the frame_id, or the joint names."""
 
-    def matches(self, packed, index):
-        """Return a mask over `index`: which of these messages have this layout."""
-        same = packed.size[index] == self.size
-        words = _words(packed.buffer, '<u8')
-        start = np.where(same, packed.start[index], packed.start[index[0]])
+    def matches(self, packed):
+        """Return which messages have this layout, bool, shape (n,)."""
+        same = packed.size == self.size
+        start = packed.start if same.all() else np.where(same, packed.start, packed.start[np.argmax(same)])
+        words = overlapping(packed.buffer, '<u8')
         for offset, mask, expected in _checks(self.fixed, self.sample):
             same &= (words[start + offset] & mask) == expected
         return same
 
-    def stamp_ns(self, packed, index):
-        """Return the header stamps, int64."""
-        word = _words(packed.buffer, self.order + 'u4')
-        start = packed.start[index] + ENCAPSULATION_SIZE
-        return word[start].view(self.order + 'i4').astype(np.int64) * NS_PER_S + word[start + 4].astype(np.int64)
+    def stamp_ns(self, packed):
+        """Return the header stamps of messages that have this layout, int64, shape (n,)."""
+        pairs = overlapping(packed.buffer, 'V8')[packed.start + ENCAPSULATION_SIZE]
+        sec, nanosec = pairs.view(self.order + 'i4')[::2], pairs.view(self.order + 'u4')[1::2]
+        return sec.astype(np.int64) * NS_PER_S + nanosec
 
-    def column(self, packed, index, name):
-        """Return the doubles of field `name`, shape (n, count)."""
-        offset, count = self.offsets[name]
-        word = _words(packed.buffer, self.order + 'f8')
-        return word[(packed.start[index] + offset)[:, np.newaxis] + 8 * np.arange(count)].astype(float, copy=False)
+    def column(self, packed, name, count=None):
+        """Return the doubles of field `name`, or its first `count`, of messages that have this layout, shape (n, count)."""
+        offset, length = self.offsets[name]
+        count = length if count is None else count
+        if not count:
+            return np.empty((len(packed), 0))
+        # One gather of the whole row: several times faster than a gather number by number.
+        rows = overlapping(packed.buffer, f'V{8 * count}')[packed.start + offset]
+        return rows.view(self.order + 'f8').reshape(-1, count).astype(float, copy=False)
 
 
 def group_by_layout(packed, find_layout):
@@ -89,8 +97,8 @@ def group_by_layout(packed, find_layout):
 
     Returns
     -------
-    groups : list of (Layout, index)
-        Integer indices in ascending order per group.
+    groups : list of (Layout, index, Packed)
+        Integer indices in ascending order per group, and these messages.
     rest : ndarray
         Indices of the messages that no group holds: broken ones, and what is left after `MAX_LAYOUTS`.
 
@@ -103,16 +111,24 @@ def group_by_layout(packed, find_layout):
             broken.append(rest[:1])
             rest = rest[1:]
             continue
-        same = layout.matches(packed, rest)
-        groups.append((layout, rest[same]))
+        left = packed.select(rest) if len(rest) < len(packed) else packed
+        same = layout.matches(left)
+        if same.all():
+            return [*groups, (layout, rest, left)], np.array(broken, dtype=int).ravel()
+        groups.append((layout, rest[same], left.select(same)))
         rest = rest[~same]
     return groups, np.sort(np.concatenate([*broken, rest]))
 
 
-def _words(buffer, dtype):
-    """View the buffer as overlapping, unaligned words: element k is the word that starts at byte k."""
+def overlapping(buffer, dtype):
+    """View bytes as overlapping, unaligned words: element k is the word that starts at byte k."""
     dtype = np.dtype(dtype)
     return np.ndarray((max(len(buffer) - dtype.itemsize + 1, 0),), dtype, buffer, strides=(1,))
+
+
+def is_any(values, wanted):
+    """Return where an integer array equals one of a few numbers."""
+    return np.logical_or.reduce([values == number for number in wanted]) if wanted else np.zeros(len(values), dtype=bool)
 
 
 def _checks(fixed, sample):

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters.compressed import decompress_chunk
-from msg_adapters.layout import Packed
+from msg_adapters.layout import Packed, is_any
 from msg_adapters.mcap_records import (CHANNEL, CHUNK, CHUNK_INDEX, DATA_END, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, PREFIX, SCHEMA, STATISTICS,
                                        McapDamage, indexed_messages, is_record, parse_channel, parse_message_index, parse_schema,
                                        parse_statistics, unpack_chunk, walk)
 from msg_adapters.read_ahead import read_ahead
 
-STRETCH_BYTES = 8 << 20
+STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
 
@@ -81,7 +81,7 @@ class McapFile:
             stretch = {}
             for topic in topics:
                 numbers = [number for number, channel in self.channels.items() if channel.topic == topic]
-                mine = np.flatnonzero(np.isin(messages.channel, numbers))
+                mine = np.flatnonzero(is_any(messages.channel, numbers))
                 if len(mine):
                     packed = Packed(buffer, messages.start[mine], messages.size[mine])
                     stretch[topic] = packed if self.unpack is None else Packed.join(

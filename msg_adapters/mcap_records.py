@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msg_adapters.layout import overlapping
+
 MAGIC = b'\x89MCAP0\r\n'
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
 STATISTICS, DATA_END = 0x0B, 0x0F
@@ -133,9 +135,9 @@ def indexed_messages(buffer, indexes):
     offset, channel = offset[order], channel[order]
     if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
         return None
-    length = _words(buffer, '<u8')[offset + 1].astype(np.int64)
+    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
     gapless = offset[0] == 0 and np.array_equal(offset + PREFIX.size + length, np.append(offset[1:], len(buffer)))
-    if not gapless or (buffer[offset] != MESSAGE).any() or (_words(buffer, '<u2')[offset + PREFIX.size] != channel).any():
+    if not gapless or (buffer[offset] != MESSAGE).any() or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
         return None
     return Messages(channel, offset + MESSAGE_PREFIX, length - 22)
 
@@ -170,8 +172,8 @@ def walk(buffer):
             behind = int(offsets[-1][-1]) + PREFIX.size + length
         position = behind
     offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
-    length = _words(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
-    channel = _words(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
+    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
+    channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
     return Messages(channel, offset + MESSAGE_PREFIX, length - 22), others, position
 
 
@@ -183,14 +185,8 @@ def is_record(opcode):
 def _run(buffer, position, stride, reach):
     """Return offsets of up to `reach` records from `position` on that follow each other with the same opcode and length."""
     offset = position + stride * np.arange(min((len(buffer) - position) // stride, reach))
-    same = (buffer[offset] == MESSAGE) & (_words(buffer, '<u8')[offset + 1] == stride - PREFIX.size)
+    same = (buffer[offset] == MESSAGE) & (overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size)
     return offset[:len(offset) if same.all() else int(np.argmin(same))]
-
-
-def _words(buffer, dtype):
-    """View the buffer as overlapping, unaligned words."""
-    dtype = np.dtype(dtype)
-    return np.ndarray((max(len(buffer) - dtype.itemsize + 1, 0),), dtype, buffer, strides=(1,))
 
 
 def _strings(content, position, count):

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from msg_adapters.layout import Packed
+from msg_adapters.layout import Packed, is_any
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.sqlite_pages import PageReader
 
@@ -72,7 +72,7 @@ class SqliteFile:
         for ids, pack in self._all_rows():
             stretch = {}
             for topic in topics:
-                mine = np.flatnonzero(np.isin(ids, self.topic_ids.get(topic, [])))
+                mine = np.flatnonzero(is_any(ids, self.topic_ids.get(topic, [])))
                 if len(mine):
                     stretch[topic] = self._unpacked(pack(mine))
             if stretch:

@@ -11,12 +11,16 @@ from typing import NamedTuple
 import numpy as np
 
 INTERIOR, LEAF = 0x05, 0x0D
-STRETCH_PAGES = 2048
+STRETCH_PAGES = 1024
 MAX_DEPTH = 20
 """Of a b-tree by the file format's page numbers; deeper means a loop in a damaged file."""
 
 _INTEGER_SIZE = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0, 0, 0], dtype=np.int64)
 """Bytes of a value by its serial type (file format, section 2.1)."""
+
+
+MARGIN = 64
+"""Zeros behind the pages, so that six varints never reach behind the buffer."""
 
 
 class Rows(NamedTuple):
@@ -76,8 +80,9 @@ class PageReader:
         n_cells[8 + 2 * n_cells > self.usable] = 0
         page = np.repeat(starts, n_cells)
         number = np.arange(n_cells.sum()) - np.repeat(np.cumsum(n_cells) - n_cells, n_cells)
-        cell = page + word[page + 8 + 2 * number]
-        rows, sensible = _parse_cells(buffer, cell, page + self.usable, self.usable - 35)
+        page_end = page + self.usable
+        cell = np.minimum(page + word[page + 8 + 2 * number], page_end)
+        rows, sensible = _parse_cells(buffer, cell, page_end, self.usable - 35)
         self.damaged_rows += int((~sensible).sum())
         return rows if sensible.all() else Rows(buffer, *(column[sensible] for column in rows[1:]))
 
@@ -120,7 +125,7 @@ class PageReader:
             ordered = np.sort(pages)
             cuts = np.flatnonzero(np.diff(ordered) > 8) + 1
             runs = [(run[0], run[-1] + 1) for run in np.split(ordered, cuts)]
-        buffer = np.empty(sum(int(last - first) for first, last in runs) * self.page_size, dtype=np.uint8)
+        buffer = np.zeros(sum(int(last - first) for first, last in runs) * self.page_size + MARGIN, dtype=np.uint8)
         filled, firsts, bases = 0, [], []
         for first, last in runs:
             size = int(last - first) * self.page_size
@@ -144,17 +149,16 @@ def _read_into(descriptor, target, offset):
 
 def _parse_cells(buffer, cell, page_end, largest):
     """Return (Rows, mask of the sensible ones) for the table cells at `cell`, which must end before `page_end`."""
-    limit = len(buffer) - 1
-    payload_size, position = _varint(buffer, cell, limit)
-    row_id, position = _varint(buffer, position, limit)
-    header_size, field = _varint(buffer, position, limit)
+    payload_size, position = _varint(buffer, cell)
+    row_id, position = _varint(buffer, position)
+    header_size, field = _varint(buffer, position)
     value = position + header_size
     types = []
     for _ in range(4):   # id, topic_id, timestamp, data
-        serial, field = _varint(buffer, field, limit)
+        serial, field = _varint(buffer, field)
         types.append(serial)
     sizes = [_INTEGER_SIZE[np.clip(serial, 0, 11)] for serial in types[:3]]
-    topic_id = _integer(buffer, value + sizes[0], types[1], limit)
+    topic_id = _integer(buffer, value + sizes[0], types[1])
     start = value + sizes[0] + sizes[1] + sizes[2]
     size = (types[3] - 12) >> 1
     inside = payload_size <= largest
@@ -163,28 +167,30 @@ def _parse_cells(buffer, cell, page_end, largest):
     return Rows(buffer, row_id, topic_id, start, size, inside), sensible
 
 
-def _varint(buffer, position, limit):
+def _varint(buffer, position):
     """Decode SQLite varints at `position`; return (value, position behind)."""
-    position = np.minimum(position, limit)
-    byte = buffer[position].astype(np.int64)
-    value, position = byte & 0x7F, position + 1
+    byte = buffer[position]
+    value, position = byte.astype(np.int64), position + 1
+    if byte.max(initial=0) < 0x80:
+        return value, position
+    value &= 0x7F
     going = np.flatnonzero(byte & 0x80)
     for count in range(2, 10):
         if not len(going):
             break
-        byte = buffer[np.minimum(position[going], limit)].astype(np.int64)
+        byte = buffer[position[going]].astype(np.int64)
         value[going] = (value[going] << 8 | byte) if count == 9 else (value[going] << 7 | byte & 0x7F)
         position[going] += 1
         going = going[(byte & 0x80) != 0]
     return value, position
 
 
-def _integer(buffer, position, serial, limit):
+def _integer(buffer, position, serial):
     """Decode big-endian integers of up to four bytes; topic ids are small."""
     value = np.where(serial == 9, 1, 0)
     for size in (1, 2, 3, 4):
         mine = np.flatnonzero(serial == size)
         if len(mine):
-            at = position[mine, np.newaxis] + np.arange(size)
-            value[mine] = buffer[np.minimum(at, limit)].astype(np.int64) @ (256 ** np.arange(size)[::-1])
+            at = np.clip(position[mine, np.newaxis] + np.arange(size), 0, len(buffer) - 1)
+            value[mine] = buffer[at].astype(np.int64) @ (256 ** np.arange(size)[::-1])
     return value

@@ -12,6 +12,10 @@ class MessageError(ValueError):
     """A serialized message does not have the layout that its type asks for."""
 
 
+class UnusableMessage(MessageError):
+    """A well-formed message that gives no sample; its text is the reason to count it under."""
+
+
 def byte_order(data):
     """
     Return '<' or '>' from the encapsulation header of a serialized message.

@@ -26,11 +26,17 @@ def find_temperature_layout(data):
     return Layout(order, len(data), bytes(data), ((0, 2), (_FRAME, _FRAME + 4 + length)), {'temperature_c': (body, 1)}, (frame,))
 
 
-def decode_temperature(layout, packed, index):
+def decode_temperature(layout, packed):
     """Decode messages of one layout into TemperatureSamples."""
-    return TemperatureSamples(layout.stamp_ns(packed, index), layout.column(packed, index, 'temperature_c')[:, 0])
+    return TemperatureSamples(layout.stamp_ns(packed), layout.column(packed, 'temperature_c')[:, 0])
 
 
-def temperature_from_message(message):
-    """Return one-row TemperatureSamples from a message object of rclpy or rosbags."""
-    return TemperatureSamples(np.array([header_stamp_ns(message)], dtype=np.int64), np.array([message.temperature], dtype=float))
+def temperature_row(message):
+    """Return (stamp_ns, temperature) of a message object of rclpy or rosbags."""
+    return header_stamp_ns(message), message.temperature
+
+
+def temperature_from_rows(rows):
+    """Return TemperatureSamples from what `temperature_row` gave."""
+    stamp_ns, temperature_c = zip(*rows, strict=True)
+    return TemperatureSamples(np.array(stamp_ns, dtype=np.int64), np.array(temperature_c, dtype=float))

@@ -1,0 +1,88 @@
+"""What arrives on topics, gathered into blocks: the same samples that a bag would give."""
+
+import threading
+from collections import deque
+
+from imu_calibration.samples import SampleBlock
+from msg_adapters.decode import Decoder, JointDecoder
+from msg_adapters.imu import IMU_TYPE
+from msg_adapters.layout import Packed
+from msg_adapters.temperature import TEMPERATURE_TYPE
+
+
+class LiveGatherer:
+    """
+    Keep messages until `flush` turns them into a SampleBlock.
+
+    Adding is cheap and may happen in another thread than `flush`. Every topic gives either serialized messages (a
+    subscription with ``raw=True``), which are decoded many at once, or message objects, which are read by attribute.
+
+    Parameters
+    ----------
+    joint_names : sequence of str, optional
+        Joints of the table, in its order; default: those of the first message.
+    max_messages : int
+        Messages of one kind that are kept at most; the oldest go first and are counted as dropped.
+
+    """
+
+    def __init__(self, joint_names=None, max_messages=1_000_000):
+        self._topics = {'imu': _Topic(Decoder(IMU_TYPE), max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
+                        'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
+
+    def add_imu(self, message):
+        """Add an Imu message: bytes or a message object."""
+        self._topics['imu'].add(message)
+
+    def add_joints(self, message):
+        """Add a JointState message: bytes or a message object."""
+        self._topics['joints'].add(message)
+
+    def add_temperature(self, message):
+        """Add a Temperature message: bytes or a message object."""
+        self._topics['temperature'].add(message)
+
+    def __len__(self):
+        return sum(len(topic.waiting) for topic in self._topics.values())
+
+    def flush(self):
+        """
+        Return what was added since the last call as a SampleBlock.
+
+        Raises
+        ------
+        InputError
+            When the JointState messages have not named the joints of the table for long.
+
+        """
+        samples = {name: topic.take() for name, topic in self._topics.items()}
+        dropped = {}
+        for topic in self._topics.values():
+            dropped.update(topic.decoder.dropped)
+            topic.decoder.dropped.clear()
+        return SampleBlock(**samples, dropped=dropped or None)
+
+
+class _Topic:
+    """Messages of one topic that wait for `flush`."""
+
+    def __init__(self, decoder, max_messages):
+        self.decoder, self.max_messages = decoder, max_messages
+        self.lock, self.waiting, self.n_lost = threading.Lock(), deque(), 0
+
+    def add(self, message):
+        with self.lock:
+            self.waiting.append(message)
+            if len(self.waiting) > self.max_messages:
+                self.waiting.popleft()
+                self.n_lost += 1
+
+    def take(self):
+        with self.lock:
+            messages, self.waiting = self.waiting, deque()
+            n_lost, self.n_lost = self.n_lost, 0
+        if n_lost:
+            self.decoder.dropped[f'{self.decoder.name} message that came faster than it was used'] += n_lost
+        if messages and isinstance(messages[0], (bytes, bytearray, memoryview)):
+            return self.decoder.decode(Packed.join(list(messages)))
+        return self.decoder.decode_objects(messages)
