@@ -177,7 +177,8 @@ def drift_over(reference, force_s, rate_s, seconds=50.0, earth_rate_n=(0.0, 0.0,
     """
     edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
     if len(edges) < 2:
-        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {reference.time[-1] - reference.time[0]:.3g} s; ask for less')
+        length = reference.time[-1] - reference.time[0]
+        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; ask for less')
     ends = []
     for first, last in zip(edges[:-1], edges[1:] + 1):
         cut = slice(first, last)

@@ -111,14 +111,14 @@ def fit_static(force_b, outputs, weights=None):
 
 def closed_form(means_static, means_spin, rate, directions, spin_axes=None, as_printed=False):
     """
-    Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (3, 3), one sensor per row.
+    Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (..., 3, 3), one sensor per row.
 
     ``r_ik = (d_ik - d_il - d_im) / (2 rate^2 cos(axis_i, spin axis k))`` with ``d = spin mean - static mean`` of sensor i; the
     sensors' biases drop out.
 
     Parameters
     ----------
-    means_static, means_spin : arrays, shape (3, 3)
+    means_static, means_spin : arrays, shape (..., 3, 3)
         Means of sensor i (column) at rest and spinning about axis k (row), m/s^2.
     rate : float
         Spin rate, rad/s.
@@ -143,10 +143,11 @@ def closed_form(means_static, means_spin, rate, directions, spin_axes=None, as_p
         sensor, spin = np.argwhere(np.abs(cosines) < 1e-12)[0]
         raise NotObservableError(f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
                                  'skew the fixture, add oscillations, or use the joint fit')
-    change = (np.asarray(means_spin, float) - means_static).T
-    numerator = 2 * change - np.sum(change, axis=1, keepdims=True)
+    means_static, means_spin = np.asarray(means_static, float), np.asarray(means_spin, float)
+    change = np.swapaxes(means_spin - means_static, -1, -2)
+    numerator = 2 * change - np.sum(change, axis=-1, keepdims=True)
     if as_printed:
-        numerator[:, 0] += np.asarray(means_static)[0] - np.asarray(means_spin)[0]
+        numerator[..., 0] -= change[..., 0]
     return numerator / (2 * rate**2 * cosines) @ axes
 
 

@@ -19,6 +19,8 @@ PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
 """Parameters of one accelerometer: m/s^2, 1, m."""
 TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 """0.1 mg, 0.1 mg/g, 0.1 mm."""
+
+
 def predict(runs, values):
     """Return the readings of one accelerometer, shape (n_rows,), for parameters in `PARAM_NAMES` order."""
     force, arm_matrix, _ = stack_runs(runs)
@@ -45,6 +47,12 @@ def judge_design(runs, matrix, arms, tolerances=TOLERANCES):
 def weak_arms(judged):
     """Return names such as 'r_xy' (sensor x, component y) of arms whose predicted sd exceeds the tolerance."""
     return [f'r_{sensor}{PARAM_NAMES[k][-1]}' for sensor, one in zip('xyz', judged) for k in (4, 5, 6) if one.sd_over_tolerance[k] > 1]
+
+
+def arm_errors(runs, matrix_row, arm, rng, n_draws):
+    """Draw errors of one estimated arm from the covariance that the runs predict, m, shape (n_draws, 3)."""
+    factor = np.linalg.qr(jacobian(runs, np.concatenate([[0.0], matrix_row, arm])), mode='r')
+    return np.linalg.solve(factor, rng.normal(size=(len(PARAM_NAMES), n_draws))).T[:, 4:]
 
 
 @dataclass(frozen=True, eq=False)

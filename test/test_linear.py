@@ -65,7 +65,8 @@ def test_units_of_a_parameter_do_not_change_eqcond_or_the_fit():
     assert scaled.cond > 1e10 * plain.cond
 
 
-@pytest.mark.parametrize('column, expected', [(np.zeros(12), {'curve'}), (np.sin(np.pi * np.arange(12)), {'curve'}), (None, {'slope', 'curve'})])
+@pytest.mark.parametrize('column, expected', [
+    (np.zeros(12), {'curve'}), (np.sin(np.pi * np.arange(12)), {'curve'}), (None, {'slope', 'curve'})])
 def test_singular_design_is_refused_by_parameter_name(column, expected):
     rng = np.random.default_rng(5)
     design = vandermonde(rng)

@@ -1,0 +1,157 @@
+"""Dead reckoning: exact cases, and Zhang's navigation claims (targets N1-N3)."""
+
+import numpy as np
+import pytest
+from figures import show
+
+from imu_calibration import navigation, zhang, zhang_claims, zhang_designs, zhang_joint
+from imu_calibration.errors import InputError
+from imu_calibration.reference import Reference
+
+G = zhang.STANDARD_GRAVITY
+MODEL = zhang.printed_static_model()
+COSINES = zhang.static_model_from_matrix(MODEL.matrix, MODEL.bias).cosines
+ARMS = zhang.TABLE_3_ARMS
+
+
+def reference_of(motion, gravity=G):
+    mat_sn = np.swapaxes(motion.mat_ns, 1, 2)
+    return Reference(motion.time, mat_sn, mat_sn @ np.array([0, 0, gravity]), motion.rate, motion.alpha, gravity)
+
+
+def test_rotation_vectors_turn_counter_clockwise_and_compose():
+    quarter = navigation.rotation_from_vector([0, 0, np.pi / 2])
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(50, 3))
+    np.testing.assert_allclose(navigation.rotation_from_vector(vectors) @ navigation.rotation_from_vector(vectors),
+                               navigation.rotation_from_vector(2 * vectors), atol=1e-14)
+    np.testing.assert_allclose(navigation.rotation_from_vector(np.zeros(3)), np.eye(3), atol=0)
+
+
+def test_attitude_of_a_constant_turn_is_exact_and_stays_orthonormal():
+    time = np.linspace(0, 20, 4001)
+    rate = np.array([0.4, -1.1, 0.7])
+    mat_ns = navigation.integrate_attitude(time, np.tile(rate, (len(time), 1)))
+    np.testing.assert_allclose(mat_ns, navigation.rotation_from_vector(np.outer(time, rate)), atol=1e-11)
+    np.testing.assert_allclose(mat_ns[-1] @ mat_ns[-1].T, np.eye(3), atol=1e-11)
+
+
+def test_attitude_of_coning_converges_with_the_square_of_the_step():
+    """A cone of half angle 0.3 rad, known in closed form; the trapezoid's own error is (spin step)^2 / 12 = 4e-4."""
+    def error(step):
+        time = np.arange(0, 2 + step / 2, step)
+        half, spin = 0.3, 7.0
+        tip = np.column_stack([np.cos(spin * time), np.sin(spin * time), 0 * time])
+        exact = navigation.rotation_from_vector(half * tip)
+        across = np.sin(half) * np.column_stack([-np.sin(spin * time), np.cos(spin * time), 0 * time])
+        mat_ns = navigation.integrate_attitude(time, spin * (across - [0, 0, 1 - np.cos(half)]), exact[0])
+        return np.max(np.abs(mat_ns - exact))
+
+    coarse, fine = error(0.02), error(0.01)
+    assert fine < 6e-4 and coarse / fine == pytest.approx(4, rel=0.05)
+
+
+def test_earth_rate_turns_the_level_frame():
+    """A sensor at rest on the ground senses Earth rate and must keep its attitude against n."""
+    time, earth = np.linspace(0, 1000, 2001), np.array([4.6e-5, -1e-5, 5.6e-5])
+    start = navigation.rotation_from_vector([0.3, -0.5, 1.0])
+    rate_s = np.tile(start.T @ earth, (len(time), 1))
+    mat_ns = navigation.integrate_attitude(time, rate_s, start, earth)
+    np.testing.assert_allclose(mat_ns, np.broadcast_to(start, mat_ns.shape), atol=1e-12)
+
+
+def test_dead_reckoning_of_constant_and_circular_motion():
+    time = np.linspace(0, 10, 2001)
+    velocity, position = navigation.dead_reckon(time, np.tile([0.2, 0, G], (len(time), 1)), G)
+    np.testing.assert_allclose(velocity[:, 0], 0.2 * time, atol=1e-12)
+    np.testing.assert_allclose(position[-1], [10.0, 0, 0], atol=1e-9)
+    assert navigation.constant_error_growth(0.2, 10.0) == pytest.approx((2.0, 10.0))
+    swing = np.column_stack([np.sin(2 * time), 0 * time, np.full(len(time), G)])
+    velocity, position = navigation.dead_reckon(time, swing, G)
+    np.testing.assert_allclose(velocity[:, 0], (1 - np.cos(2 * time)) / 2, atol=1e-5)
+    np.testing.assert_allclose(position[:, 0], time / 2 - np.sin(2 * time) / 4, atol=1e-4)
+
+
+def test_drift_is_zero_for_perfect_samples_and_follows_one_fault():
+    motion = zhang_claims.tumble((20, 20, 20), (0.3, 0.4, 0.5), seconds=20, sample_rate=100)
+    reference = reference_of(motion)
+    clean = navigation.drift_over(reference, reference.force_s, reference.rate_s, seconds=5.0)
+    assert len(clean.start) == 4 and clean.median() == (0.0, 0.0, 0.0)
+    turned = navigation.drift_over(reference, reference.force_s, reference.rate_s + [1e-4, 0, 0], seconds=5.0)
+    assert 4e-4 < turned.median()[2] < 5e-4  # the axis of the fault turns with the body, so a little less than rate times time
+    still = Reference(np.arange(0, 100.01, 0.01), np.tile(np.eye(3), (10001, 1, 1)), np.tile([0, 0, G], (10001, 1)),
+                      np.zeros((10001, 3)), np.zeros((10001, 3)), G)
+    pushed = navigation.drift_over(still, still.force_s + [0.01, 0, 0], still.rate_s, seconds=50.0)
+    np.testing.assert_allclose(pushed.velocity, 0.5, rtol=1e-9)
+    np.testing.assert_allclose(pushed.position, 12.5, rtol=1e-9)
+    with pytest.raises(InputError, match='50 s'):
+        navigation.drift_over(still.select(slice(0, 100)), still.force_s[:100], still.rate_s[:100])
+
+
+def test_wrong_times_are_refused():
+    with pytest.raises(InputError, match='increasing'):
+        navigation.integrate_attitude(np.array([0.0, 0.0]), np.zeros((2, 3)))
+
+
+def test_n1_static_navigation_without_drift():
+    result = zhang_claims.static_navigation(MODEL, 0.0, np.random.default_rng(11))
+    v0, p0, v1, p1 = result.medians()
+    show('N1', '50 s, no drift: before m/s, m', [v0, p0], '7.78 195')
+    show('N1', 'after m/s, m', [v1, p1], '<= 0.016 0.45')
+    show('N1', 'ratio', [v0 / v1, p0 / p1], '>= 450 (592/540)')
+    assert (v0, p0) == (pytest.approx(7.78, rel=0.01), pytest.approx(195, rel=0.01))
+    assert v1 <= 0.016 and p1 <= 0.45 and v0 / v1 >= 450 and p0 / p1 >= 450
+
+
+def test_n1_static_navigation_with_the_sensors_own_drift():
+    v0, p0, v1, p1 = zhang_claims.static_navigation(MODEL, 0.75e-3, np.random.default_rng(12)).medians()
+    show('N1', '50 s, 0.75 mg drift: after m/s, m, ratio', [v1, p1, v0 / v1], '0.73 18 8-14')
+    assert 8 <= v0 / v1 <= 14 and 8 <= p0 / p1 <= 14
+
+
+def test_n1_table_2_explains_the_printed_curve():
+    """The printed 4 m/s and 100 m are the z channel before compensation after 47.4 s."""
+    velocity, position = navigation.constant_error_growth(abs(zhang.TABLE_2_G[2, 0]) * G, 47.4)
+    show('N1', 'Table 2 z before, 47.4 s: m/s, m', [velocity, position], '4.23 100.4')
+    assert (velocity, position) == (pytest.approx(4.23, abs=0.01), pytest.approx(100.4, abs=0.1))
+
+
+def test_n2_a_spin_about_a_body_axis_does_not_drift():
+    growth = zhang_claims.spin_growth(COSINES, ARMS, (1, 0, 0))
+    level, body = navigation.largest(growth['level'][0]), navigation.largest(growth['body'][0])
+    show('N2', 'x spin 100 deg/s, 100 s: level frame, body sum, m/s', [level, body], '0.048 3.69 (+-2 %)')
+    show('N2', 'positions, m', [navigation.largest(growth['level'][1]), navigation.largest(growth['body'][1])], '2.4 185')
+    assert (level, body) == (pytest.approx(0.048, rel=0.02), pytest.approx(3.69, rel=0.02))
+
+
+def test_n2_a_spin_about_the_diagonal_does():
+    growth = zhang_claims.spin_growth(COSINES, ARMS, (1, 1, 1), seconds=60.0)
+    end = [float(np.linalg.norm(part[-1])) for part in growth['level']]
+    show('N2', '(1,1,1) spin 60 s: axial mg, m/s, m', [growth['axial_mg'], *end], '2.717 1.60 48.0')
+    assert abs(growth['axial_mg']) == pytest.approx(2.717, abs=2e-3)
+    assert end == [pytest.approx(1.60, abs=0.005), pytest.approx(48.0, abs=0.1)]
+
+
+def test_n3_tumbling_uncompensated_and_with_exact_arms():
+    responses = zhang_claims.arm_responses(zhang_claims.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
+    velocity, position = zhang_claims.peaks(responses, ARMS)[:, 0]
+    exact = zhang_claims.peaks(responses, ARMS - ARMS)[0, 0]
+    show('N3', 'uncompensated m/s, m', [velocity, position], '5.256 179.6 (+-0.5 %)')
+    show('N3', 'exact arms m/s', exact, '< 1e-9')
+    assert (velocity, position) == (pytest.approx(5.256, rel=5e-3), pytest.approx(179.6, rel=5e-3))
+    assert exact < 1e-9
+
+
+@pytest.mark.parametrize('design, wanted', [('M', '>= 100 (146/152)'), ('O', '>= 80 (115)'), ('Z60', '(41)'), ('Z0', '<= 3 (1.0)')])
+def test_n3_tumbling_with_estimated_arms(design, wanted):
+    """300 draws of the arms from the design's full covariance, 0.1 mg means."""
+    rng = np.random.default_rng(13)
+    runs = zhang_designs.design_runs(design)
+    responses = zhang_claims.arm_responses(zhang_claims.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
+    wrong = np.stack([zhang_joint.arm_errors(runs, COSINES[i], ARMS[i], rng, 300) for i in range(3)], axis=1)
+    gains = zhang_claims.peaks(responses, ARMS)[:, :1] / zhang_claims.peaks(responses, wrong)
+    velocity, position = np.median(gains, axis=1)
+    show('N3', f'{design}: median improvement, velocity, position', [velocity, position], wanted)
+    low, high = {'M': (100, 200), 'O': (80, 160), 'Z60': (25, 60), 'Z0': (0, 3)}[design]
+    assert low <= velocity <= high and low <= position <= high
