@@ -1,0 +1,144 @@
+"""Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+FAMILY_WISE = 0.01
+"""Chance of a finding in a recording whose model is right."""
+LEAST_GAIN = 4.0
+"""Least gain of held-out log likelihood, nats."""
+PRICE = 1.0
+"""Price of a parameter beside what held-out prediction charges, nats."""
+TIE = 8.0
+"""Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
+MOST_FINDINGS = 6
+CLASS_SIZE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Evidence for one effect beside the model so far."""
+
+    question: object
+    """The Question."""
+    gain: float
+    """Gain of held-out log likelihood, nats."""
+    p_value: float
+    """Chi-square p-value times the number of effects asked about, at most 1."""
+    allowed: bool
+    """Whether the estimate is physically possible."""
+
+    @property
+    def net(self):
+        """Gain less the price of the parameters."""
+        return self.gain - PRICE * self.question.price
+
+    @property
+    def significant(self):
+        """Return whether the effect may be named."""
+        return self.allowed and self.p_value < FAMILY_WISE and self.net > 0 and self.gain > LEAST_GAIN
+
+
+class Search:
+    """Forward selection with reconsideration over a fixed set of questions."""
+
+    def __init__(self, evidence, baseline, questions):
+        self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
+        self.n_effects = max(len({q.name for q in questions}), 1)
+        self.history = []
+
+    def used(self, chosen):
+        """Return the parameters of the baseline and of the chosen effects."""
+        return self.baseline + tuple(k for q in chosen for k in q.parameters)
+
+    def others(self, chosen):
+        """Return the questions about effects that are not chosen."""
+        names = {q.name for q in chosen}
+        return [q for q in self.questions if q.name not in names]
+
+    def cost(self, chosen):
+        """Return the held-out cost of a choice, nats, price included."""
+        return 0.5 * self.evidence.heldout(self.used(chosen)) + PRICE * sum(q.price for q in chosen)
+
+    def score(self, chosen, question):
+        """Return the Score of one more effect."""
+        smaller, larger = self.used(chosen), self.used(chosen + [question])
+        gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
+        p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
+        return Score(question, gain, p_value, self.allowed(chosen + [question], question))
+
+    def allowed(self, chosen, question):
+        """Return whether the effect's estimate is physically possible: a lag is not negative, and no size is absurd."""
+        used = self.used(chosen)
+        values, inverse = self.evidence.fit(used)
+        places = [used.index(k) for k in question.parameters]
+        value, sd = values[places], np.sqrt(np.diag(inverse)[places])
+        at = self.evidence.space.lifted.model.warp_point(question.effect)[0] if question.effect.name.endswith('_bandwidth') else 0.0
+        if question.effect.name.endswith('_bandwidth') and value[0] + at < 0:
+            return False
+        largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
+        return bool(np.all(np.abs(value) - 3 * sd < 20 * largest))
+
+    def run(self):
+        """Return the chosen questions in the order in which they were found."""
+        chosen = []
+        for _ in range(2 * MOST_FINDINGS):
+            scores = [self.score(chosen, q) for q in self.others(chosen)]
+            self.history.append(scores)
+            good = [s for s in scores if s.significant]
+            if not good or len(chosen) >= MOST_FINDINGS:
+                break
+            best = max(good, key=lambda s: s.net)
+            before = [q.label for q in chosen]
+            chosen = self.reconsidered(chosen + [best.question])
+            if [q.label for q in chosen] == before:
+                break
+        return chosen
+
+    def reconsidered(self, chosen):
+        """Return the choice after dropping what is no longer needed and replacing what a better explanation replaces."""
+        for _ in range(6):
+            smaller = self._dropped(chosen)
+            if smaller is not None:
+                chosen = smaller
+                continue
+            other = self._replaced(chosen)
+            if other is None:
+                return chosen
+            chosen = other
+        return chosen
+
+    def _dropped(self, chosen):
+        if len(chosen) < 2:
+            return None
+        for question in sorted(chosen, key=lambda q: -q.price):
+            rest = [q for q in chosen if q is not question]
+            if not self.score(rest, question).significant:
+                return rest
+        return None
+
+    def _replaced(self, chosen):
+        best, cost = None, self.cost(chosen) - 1e-6
+        for place, question in enumerate(chosen):
+            rest = chosen[:place] + chosen[place + 1:]
+            for other in self.others(rest):
+                if other is question:
+                    continue
+                trial = chosen[:place] + [other] + chosen[place + 1:]
+                value = self.cost(trial)
+                if value < cost and self.allowed(trial, other):
+                    best, cost = trial, value
+        return best
+
+    def class_mates(self, chosen, question):
+        """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most two."""
+        place, cost = chosen.index(question), self.cost(chosen)
+        found = {}
+        for other in self.others(chosen):
+            trial = chosen[:place] + [other] + chosen[place + 1:]
+            difference = self.cost(trial) - cost
+            if difference < TIE and self.allowed(trial, other):
+                if other.name not in found or difference < found[other.name][1]:
+                    found[other.name] = (other, difference)
+        return sorted(found.values(), key=lambda pair: pair[1])[:CLASS_SIZE - 1]

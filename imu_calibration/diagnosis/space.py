@@ -1,0 +1,93 @@
+"""From columns to parameters: each window's contribution to a linear problem in the parameters of everything that is asked."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.diagnosis.candidates import Question, special
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.sensor_model import coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Parameters of the diagnosis: those of the extended model, then the banks of warm-ups (constant by axis, per sensor)."""
+
+    lifted: object
+    """The Lifted recording."""
+    names: tuple
+    """Parameter names."""
+    prior_sd: np.ndarray
+    """Prior standard deviations, shape (q,)."""
+    prior_mean: np.ndarray
+    """Prior minus the values of the linearisation, shape (q,)."""
+    index: dict
+    """Sensor -> three index arrays: the parameters that act on each axis."""
+    mean: dict
+    """Sensor -> three arrays (k, q_a + 1): mean rows ``[design | residual]``."""
+    within: dict
+    """Sensor -> three arrays (k, q_a + 1, q_a + 1): products of the centred rows."""
+
+    @property
+    def size(self):
+        """Number of parameters."""
+        return len(self.names)
+
+
+def parameter_space(lifted):
+    """Return the Space of a lifted recording: the Jacobian of the coefficients joins columns to parameters."""
+    model, n_bank = lifted.model, len(lifted.constants)
+    names = list(model.param_names)
+    prior, sd = model.prior()
+    shift = np.where(np.isfinite(prior), prior - lifted.values, 0.0)
+    for short in ('accel', 'gyro'):
+        names += [f'{short}_warm_up.{k}.{axis}' for k in range(n_bank) for axis in 'xyz']
+    q_model, q = len(model.param_names), len(names)
+    bank_sd = np.concatenate([np.full(3 * n_bank, 0.5), np.full(3 * n_bank, 0.05)])
+    index, mean, within = {}, {}, {}
+    for number, sensor in enumerate(SENSORS):
+        jacobian = _jacobian(model, sensor, lifted.values)
+        p = len(jacobian)
+        index[sensor], mean[sensor], within[sensor] = [], [], []
+        for axis in range(3):
+            full = np.zeros((p + n_bank, q))
+            full[:p, :q_model] = jacobian[:, axis]
+            full[p + np.arange(n_bank), q_model + 3 * n_bank * number + 3 * np.arange(n_bank) + axis] = 1.0
+            used = np.flatnonzero(np.any(full != 0, axis=0))
+            take = np.r_[np.arange(p + n_bank), p + n_bank + axis]
+            join = np.zeros((len(take), len(used) + 1))
+            join[:-1, :-1], join[-1, -1] = full[:, used], 1.0
+            index[sensor].append(used)
+            mean[sensor].append(lifted.mean[sensor][:, take] @ join)
+            within[sensor].append(join.T @ (lifted.gram[sensor][:, take[:, None], take[None, :]] @ join))
+    return Space(lifted, tuple(names), np.concatenate([sd, bank_sd]), np.concatenate([shift, np.zeros(6 * n_bank)]), index, mean, within)
+
+
+def _jacobian(model, sensor, values):
+    own = np.concatenate([np.full(e.size, e.sensor in (sensor, 'reference')) for e in model.effects])
+    columns = []
+    for k in range(len(values)):
+        if own[k]:
+            moved = values.astype(complex)
+            moved[k] += 1e-30j
+            columns.append(coefficients(model, sensor, moved).imag / 1e-30)
+        else:
+            columns.append(None)
+    zero = np.zeros_like(next(c for c in columns if c is not None))
+    return np.stack([zero if c is None else c for c in columns], axis=2)
+
+
+def questions(space, effects):
+    """Return a Question for each effect; a warm-up gives one per pair of neighbouring time constants."""
+    model, constants = space.lifted.model, space.lifted.constants
+    n_bank, q_model = len(constants), len(model.param_names)
+    asked = []
+    for effect in effects:
+        if (effect.sensor, effect.name) in model.slices:
+            part = model.slices[effect.sensor, effect.name]
+            asked.append(Question(effect, tuple(range(part.start, part.stop)), effect.size, effect.name))
+        elif special(effect) and effect.name.endswith('_bias_drift'):
+            start = q_model + 3 * n_bank * SENSORS.index(effect.sensor)
+            for k in range(n_bank - 1):
+                asked.append(Question(effect, tuple(range(start + 3 * k, start + 3 * k + 6)), 4, f'{effect.name}@{k}'))
+    return asked
