@@ -6,7 +6,7 @@ from imu_calibration.errors import DocumentError, InputError
 
 def to_text(document):
     """
-    Return a mapping as YAML: block style for mappings, flow style for lists of numbers.
+    Return a mapping as YAML: block style for mappings, lists of numbers on one line each.
 
     Parameters
     ----------
@@ -23,12 +23,12 @@ def to_text(document):
             return True
 
     def sequence(dumper, items):
-        flat = all(not isinstance(item, dict) for item in items)
+        flat = all(not isinstance(item, (dict, list, tuple)) for item in items)
         return dumper.represent_sequence('tag:yaml.org,2002:seq', items, flow_style=flat)
 
     Dumper.add_representer(list, sequence)
     Dumper.add_representer(tuple, sequence)
-    return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=160, allow_unicode=True)
+    return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=100_000, allow_unicode=True)
 
 
 def from_text(text, what='document'):

@@ -1,0 +1,66 @@
+"""
+The main job in one run: simulate, calibrate, compensate another session, compare.
+
+Run: ``python examples/demo.py --output demo`` (or ``make demo``).
+"""
+
+import argparse
+import shutil
+from argparse import Namespace
+from pathlib import Path
+
+from imu_calibration import evaluation
+from imu_calibration.cli import files, main, recordings
+from imu_calibration.cli.show import console
+
+NO_TOPICS = Namespace(imu_topic=None, joint_topic=None, temperature_topic=None)
+
+
+def verb(*arguments):
+    """Run one verb as a user would, and show the command."""
+    print('\n$ imu_calibration ' + ' '.join(str(a) for a in arguments))
+    code = main([str(a) for a in arguments])
+    if code == 1:
+        raise SystemExit(1)
+    return code
+
+
+def run(folder):
+    """Carry out the demonstration in `folder`."""
+    first, second = folder / 'session', folder / 'other_session'
+    verb('simulate', '--profile', 'calibration', '--seed', 1, '--imu-seed', 5, '--output', first)
+    verb('calibrate', first, '--table', first / 'table.yaml', '--output', folder)
+    verb('simulate', '--profile', 'navigation', '--seed', 2, '--imu-seed', 5, '--output', second)
+    verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
+    table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
+    truth = evaluation.session_truth(recordings.source_of(second, NO_TOPICS, table.joint_names)(), table)
+    show(evaluation.before_and_after(truth, calibration))
+    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
+    print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'nothing; every parameter is within its tolerance'))
+    print(f'report: {(folder / "report.html").resolve()}')
+
+
+def show(figures):
+    """Print the table of errors on the other session."""
+    from rich.table import Table
+    table = Table(title='Errors on a different session of the same IMU', title_justify='left', box=None, pad_edge=False)
+    for heading in ('', 'accelerometer', 'gyroscope', 'velocity after 50 s', 'position after 50 s'):
+        table.add_column(heading, justify='left' if not heading else 'right')
+    for name, f in zip(('before', 'after'), figures):
+        table.add_row(name, f'{f.force_mg:.3f} mg', f'{f.rate_deg_s:.5f} deg/s', f'{f.velocity:.3f} m/s', f'{f.position:.2f} m')
+    print()
+    console().print(table)
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--output', default='demo', help='folder for everything, made anew')
+    target = Path(parser.parse_args().output)
+    if target.exists():
+        known = {'session', 'other_session', 'other_session_corrected', 'calibration.yaml', 'report.html'}
+        strangers = sorted(p.name for p in target.iterdir() if p.name not in known)
+        if strangers:
+            raise SystemExit(f'{target} must be empty or hold an earlier demonstration, it holds {strangers[0]}; choose another --output')
+        shutil.rmtree(target)
+    target.mkdir(parents=True)
+    run(target)
