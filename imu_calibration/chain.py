@@ -20,10 +20,12 @@ def rotation(vector):
 def align(direction):
     """Return the smallest rotation that takes the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
     x, y, z = direction
-    if z < -1 + 1e-12:
+    across = x * x + y * y
+    if z < 0 and across < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
     cross = skew([y, -x, 0.0])
-    return np.eye(3) + cross + cross @ cross / (1 + z)
+    # 1 + z cancels when z is near -1.
+    return np.eye(3) + cross + cross @ cross / (1 + z if z > 0 else across / (1 - z))
 
 
 def reference_motion(table, motion, temperature_c=None):
