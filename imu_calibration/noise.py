@@ -70,7 +70,7 @@ GRADES = {
     'consumer': ImuGrade(
         NoiseModel(400 * MICRO_G, 0.005 * DEG, 100 * MICRO_G, 20 * DEG_H, 100.0, 61e-6 * STANDARD_GRAVITY, DEG / 131.0),
         0.05 * STANDARD_GRAVITY, 2.0 * DEG, 0.02, 0.01, 3e-3,
-        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability is not in it: typical of measured Allan deviations'),
+        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none'),
     'industrial': ImuGrade(
         NoiseModel(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
         5e-3 * STANDARD_GRAVITY, 0.2 * DEG, 5e-3, 3e-3, 3e-3,

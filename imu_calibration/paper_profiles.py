@@ -17,7 +17,8 @@ EQUAL_ANGLES_DEG = np.arange(0.0, 401.0, 10.0)
 def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, height=170.0, rpy_deg=(0.0, 0.0, 0.0)):
     names = ('outer', 'middle', 'inner') if len(axes) == 3 else ('turn',)
     joints = [{'name': name, 'axis': list(axis)} for name, axis in zip(names, axes, strict=True)]
-    return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': height, 'azimuth_deg': 0.0, 'mount': {'rpy_deg': list(rpy_deg), 'xyz': None}}
+    mount = {'rpy_deg': list(rpy_deg), 'xyz': None}
+    return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': height, 'azimuth_deg': 0.0, 'mount': mount}
 
 
 GIMBALS = _table([AXIS[axis] for axis in 'ZYX'])
@@ -92,7 +93,7 @@ SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_e
 """A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three sensor axes."""
 
 REGISTRY = {
-    **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base outwards; gravity along base z (_up_x, _up_y)',
+    **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn gravity',
                                     _equal_angles, _table([AXIS[axis] for axis in order], up), 3)
        for order in ORDERS for suffix, up in (('', AXIS['Z']), ('_up_x', AXIS['X']), ('_up_y', AXIS['Y']))},
     'avrutov_111': ("the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)", _equal_angles,
@@ -102,7 +103,8 @@ REGISTRY = {
     **{f'avrutov_gimbals_{sample}': (f'gyroscope series of sample {sample} commanded to the gimbals, which are not body rates',
                                      partial(_gimbal_rates, sample=sample), GIMBALS, 3) for sample in (3, 4)},
     'zhang_z0': ('six faces, spins about the sensor axes at 100, 150, 200 deg/s', _zhang_spins, GIMBALS, 3),
-    'zhang_z60': ('the same with a fixture skewed by 60 deg about (1, 1, 1)', _zhang_spins, _table([AXIS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG), 3),
+    'zhang_z60': ('the same with a fixture skewed by 60 deg about (1, 1, 1)', _zhang_spins,
+                  _table([AXIS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG), 3),
     'zhang_o': ('six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz', _zhang_oscillations, GIMBALS, 3),
     'zhang_m': ('six faces, three spins, three swings, three simultaneous turns', _zhang_mixed, GIMBALS, 3),
 }

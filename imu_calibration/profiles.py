@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration import paper_profiles
 from imu_calibration.errors import InputError
 from imu_calibration.session_tasks import (
-    CORNERS, EDGES, FACES, at_angles, pose_deg, poses, rest_at_zero, run, simultaneous, spin_joint, spin_vertical, swing, swing_joints, swings, tumble,
-    two_axes,
+    CORNERS, EDGES, FACES, at_angles, poses, rest_at_zero, run, simultaneous, spin_joint, spin_vertical, swing, swing_joints,
+    swings, tumble, two_axes,
 )
 from imu_calibration.trajectory import MotionBuilder, Profile, stretch
 
@@ -64,7 +64,7 @@ def make_profile(name, seed=0, table=None, duration=None):
     joint_names = _joint_names(entry, table)
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
-        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table' or another table")
+        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'")
     build = entry.build if fits else _any_table
 
     def segments(dwell):
@@ -168,14 +168,16 @@ def _tumbling(builder, rng):
     builder.rest(5.0)
 
 
-def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2, n_swings=2,
-            n_simultaneous=4):
+def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2,
+            n_swings=2, n_simultaneous=4):
     """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
     tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
     speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
     tasks += [partial(spin_vertical, up_b=_near(rng, axis, 0.2), speeds_deg=speeds[:, k], dwell=2.0) for k, axis in enumerate(np.eye(3))]
-    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=2.0) for _ in range(n_oblique)]
-    tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, 3), speeds_deg=rng.uniform(50, 120), dwell=3.0) for joint in (1, 2)]
+    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=2.0)
+              for _ in range(n_oblique)]
+    tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, 3), speeds_deg=rng.uniform(50, 120), dwell=3.0)
+              for joint in (1, 2)]
     for axis in range(3):
         tasks += [partial(swing, axis=axis, amplitude_deg=rng.uniform(7, 14) / frequency, frequency=frequency, duration=3.5)
                   for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]]
@@ -184,7 +186,8 @@ def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ran
     run(builder, rng, tasks, reference_every=15)
 
 
-_random_short = partial(_random, directions=np.concatenate([FACES, CORNERS[::2]]), speed_ranges=((60, 90), (150, 210)), n_oblique=1, n_swings=1, n_simultaneous=3)
+_random_short = partial(_random, directions=np.concatenate([FACES, CORNERS[::2]]), speed_ranges=((60, 90), (150, 210)), n_oblique=1,
+                        n_swings=1, n_simultaneous=3)
 
 
 def _near(rng, direction, spread):
@@ -194,30 +197,32 @@ def _near(rng, direction, spread):
 
 def _any_table(builder, rng):
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
-    joints = range(builder.n_joints)
-    angles = rng.permuted(np.tile(np.arange(24) * 15.0, (builder.n_joints, 1)), axis=1).T
+    count = builder.n_joints
+    angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
     tasks = [partial(at_angles, angles_deg=row) for row in angles]
-    for joint in joints:
-        tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, builder.n_joints), speeds_deg=speed, dwell=4.0) for speed in SPEEDS_DEG]
-        tasks += [partial(swing_joints, at_deg=rng.uniform(-180, 180, builder.n_joints), amplitude_deg=10.0 / frequency * (np.arange(builder.n_joints) == joint),
-                          frequency=frequency) for frequency in (0.5, 1.0, 2.0)]
-        for other in range(joint):
-            for at_deg in rng.uniform(-180, 180, (3, builder.n_joints)):
-                rates = 120.0 * (np.arange(builder.n_joints) == joint) + 80.0 * (np.arange(builder.n_joints) == other)
-                tasks.append(partial(two_axes, at_deg=at_deg, rates_deg=rates, dwell=5.0))
+    only = np.eye(count)
+    for joint in range(count):
+        tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, count), speeds_deg=speed, dwell=4.0)
+                  for speed in SPEEDS_DEG]
+        tasks += [partial(swing_joints, at_deg=rng.uniform(-180, 180, count), amplitude_deg=10.0 / cycles * only[joint], frequency=cycles)
+                  for cycles in (0.5, 1.0, 2.0)]
+        tasks += [partial(two_axes, at_deg=at_deg, rates_deg=120.0 * only[joint] + 80.0 * only[other], dwell=5.0)
+                  for other in range(joint) for at_deg in rng.uniform(-180, 180, (3, count))]
     run(builder, rng, tasks)
 
 
 _ON_ARM = {**paper_profiles.GIMBALS, 'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]}}
 
 _REGISTRY = {
-    'calibration': _Entry('full session on a three-axis table, about 11 min: 26 poses, spins, swings, two axes at once', _calibration, n_joints=3, adapts=True),
+    'calibration': _Entry('full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once', _calibration,
+                          n_joints=3, adapts=True),
     'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
     'quick': _Entry('the least that determines everything, about 2 min', _quick, n_joints=3, adapts=True),
     'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
     'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
     'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
-    'separating': _Entry('many angles, three speeds both ways, four frequencies: tells similar effects apart', _separating, n_joints=3, adapts=True),
+    'separating': _Entry('many angles, three speeds both ways, four frequencies: tells similar effects apart', _separating,
+                         n_joints=3, adapts=True),
     'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
     'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins leave 1 g', _separating, _ON_ARM, 3),
     'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),

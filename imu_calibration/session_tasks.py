@@ -18,7 +18,8 @@ def pose_deg(up_b, heading_deg=0.0):
     From ``up_b = (-sin m, sin i cos m, cos i cos m)``; the outer joint only sets the heading.
     """
     x, y, z = np.asarray(up_b, float) / np.linalg.norm(up_b)
-    return np.array([heading_deg, -np.degrees(np.arcsin(np.clip(x, -1, 1))), np.degrees(np.arctan2(y, z)) if np.hypot(y, z) > 1e-9 else 0.0])
+    inner = np.arctan2(y, z) if np.hypot(y, z) > 1e-9 else 0.0
+    return np.array([heading_deg, *np.degrees([-np.arcsin(np.clip(x, -1, 1)), inner])])
 
 
 def pose(builder, up_b, heading_deg, dwell):

@@ -4,7 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from physics import EFFECTS, make_session
+from physics import encoder_reading, make_session
+from physics_draw import EFFECTS
 
 from imu_calibration.effects import owner_of
 from imu_calibration.joint_motion import JointMotion
@@ -12,7 +13,7 @@ from imu_calibration.sensor_model import SensorModel, predict
 from imu_calibration.turntable import Table
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
-LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3, 'encoder_harmonic': 1e-3}
+LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3}
 """Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; else 1 ns stamps."""
 
 
@@ -28,9 +29,8 @@ def told_motion(session):
     motion = profile.at(time)
     if value is None:
         return motion
-    from physics import _encoder_reading
     step = 2e-3
-    readings = [_encoder_reading(profile.at(time + k * step).position, value)[0] for k in (-2, -1, 0, 1, 2)]
+    readings = [encoder_reading(profile.at(time + k * step).position, value)[0] for k in (-2, -1, 0, 1, 2)]
     rate = (8 * (readings[3] - readings[1]) - (readings[4] - readings[0])) / (12 * step)
     acceleration = (-readings[0] + 16 * readings[1] - 30 * readings[2] + 16 * readings[3] - readings[4]) / (12 * step**2)
     return JointMotion(time, readings[2], rate, acceleration, motion.jerk)

@@ -13,7 +13,8 @@ NAMES = sorted(profile_names())
 
 
 def reference(profile, time, **changes):
-    mapping = profile.table or {'joints': [{'name': n, 'axis': a} for n, a in zip(profile.joint_names, ([0, 0, 1], [0, 1, 0], [1, 0, 0]))], 'latitude': 45.0}
+    axes = dict(zip(profile.joint_names, ([0, 0, 1], [0, 1, 0], [1, 0, 0])))
+    mapping = profile.table or {'joints': [{'name': name, 'axis': axis} for name, axis in axes.items()], 'latitude': 45.0}
     return reference_motion(Table.from_mapping(mapping | changes), profile.at(time))
 
 
