@@ -94,7 +94,7 @@ def solve_linear(design, outputs, param_names, weights=None, rank_tolerance=RANK
     """
     design, outputs, names, root = _checked(design, outputs, param_names, weights)
     norms, left, singular, right = _scaled_svd(design * root[:, None])
-    _require_full_rank(design, singular, right, names, rank_tolerance)
+    _require_full_rank(design, norms, singular, right, names, rank_tolerance)
 
     def fit(target):
         weighted = (target.T * root).T
@@ -128,14 +128,13 @@ def null_directions(design, param_names, rank_tolerance=RANK_TOLERANCE):
     """
     Return the combinations of parameters that leave every output unchanged, as a list of {name: weight}.
 
-    Each weight is the change of the parameter times the norm of its column, so that parameters of different units compare;
-    the leading parameter of each combination has weight 1, and combinations are made as short as an echelon form can.
-    A column of zeros gives a direction of its own.
+    Weights are changes of the parameters in their own units, the leading one being 1; combinations are made as short as an echelon
+    form can. A column of zeros gives a direction of its own.
 
     """
-    _, _, singular, right = _scaled_svd(np.asarray(design, float))
+    norms, _, singular, right = _scaled_svd(np.asarray(design, float))
     weak = right[singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)]
-    return [] if len(weak) == 0 else _echelon(weak, tuple(param_names))
+    return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
 def predicted_sd(design, weights=None, sigma=1.0):
@@ -248,20 +247,21 @@ def _ratio(singular):
     return float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
 
 
-def _require_full_rank(design, singular, right, names, rank_tolerance):
+def _require_full_rank(design, norms, singular, right, names, rank_tolerance):
     weak = singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)
     if np.any(weak):
-        directions = _echelon(right[weak], names)
+        directions = _echelon(right[weak], norms, names)
         raise NotObservableError(
             f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from {len(design)} rows; not determined: '
             f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.')
 
 
-def _echelon(weak, names):
-    pivots = scipy.linalg.qr(weak, pivoting=True, mode='r')[1][:len(weak)]
-    pivots = np.sort(pivots)
+def _echelon(weak, norms, names):
+    pivots = np.sort(scipy.linalg.qr(weak, pivoting=True, mode='r')[1][:len(weak)])
     rows = np.linalg.solve(weak[:, pivots], weak)
-    return [{name: float(w) for name, w in zip(names, row) if abs(w) > 1e-6} for row in rows]
+    shown = np.abs(rows) > 1e-6
+    changes = rows / norms * norms[pivots, None]
+    return [{names[k]: float(change[k]) for k in np.flatnonzero(keep)} for change, keep in zip(changes, shown)]
 
 
 def _as_text(direction):

@@ -77,6 +77,8 @@ def test_singular_design_is_refused_by_parameter_name(column, expected):
     assert all(name in text for name in expected) and 'bias' not in text
     (direction,) = linear.null_directions(design, NAMES)
     assert set(direction) == expected
+    if column is None:
+        assert -direction['slope'] / direction['curve'] == pytest.approx(3)
     assert linear.numerical_rank(design) == 2
     assert np.isinf(linear.predicted_sd(design)).tolist() == [name in expected for name in NAMES]
 
