@@ -10,8 +10,9 @@ from imu_calibration.joint_fit import Rows, Trend, fit_with_velocity
 from imu_calibration.settings import JointSettings
 from imu_calibration.smoothing import encoder_step, smooth
 
-_MINIMUM_SAMPLES = 8  # fewer are fitted with a parabola
+_MINIMUM_SAMPLES = 8  # fewer stamps are fitted with a parabola
 _MARGIN = 3  # knots beyond the readings
+_LONGEST_HOLE = 300  # periods; a longer one cannot be bridged by anything sensible
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +96,14 @@ def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=Joint
     Raises
     ------
     InputError
-        When there are no readings, a position is not finite or time runs backwards.
+        When there are no readings, a position is not finite, time runs backwards or has a hole of many periods.
 
     """
     time, position = np.asarray(time, float), np.asarray(position, float)
     _check(time, position)
     position = _unwrapped(position)
-    knots = _place_knots(time)
+    stamps = time[np.concatenate([[True], np.diff(time) > 0])]
+    knots = _place_knots(stamps)
     still = np.all(position == position[0], axis=0)
     floor = _noise_floor(position, noise_sd)
     trend = Trend.through(time, position, still)
@@ -109,7 +111,7 @@ def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=Joint
     bandwidth, trusted = np.zeros(position.shape[1]), np.zeros(position.shape[1], bool)
     noise = floor.copy()
     moving = np.flatnonzero(~still)
-    if len(time) >= _MINIMUM_SAMPLES and len(moving):
+    if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = Rows(knots, time)
         fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], settings.robustness)
         for joint, fit in zip(moving, fits, strict=True):
@@ -134,13 +136,13 @@ def _unwrapped(position):
 
 
 def _place_knots(time):
-    """Return knots at the usual distance of the readings, with a margin on both sides."""
-    count = len(time)
-    span = time[-1] - time[0]
-    stride = min(8, count - 1)
-    step = np.median(time[stride:] - time[:-stride]) / stride if count > 1 else 0.0
-    step = max(step, span / (4 * count), 1e-6)
-    return Knots(float(time[0] - _MARGIN * step), float(step), int(np.ceil(span / step)) + 2 * _MARGIN)
+    """Return knots at the usual distance of the stamps (increasing), with a margin on both sides."""
+    stride = min(8, len(time) - 1)
+    step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
+    hole = np.max(np.diff(time), initial=0.0)
+    if hole > _LONGEST_HOLE * step:
+        raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; split them there')
+    return Knots(float(time[0] - _MARGIN * step), step, int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN)
 
 
 def _noise_floor(position, noise_sd):

@@ -58,6 +58,7 @@ class PenalisedSpline:
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
+        self.least_decade = self._least_decade()
         self.gains = lru_cache(None)(self._gains)
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
         self._symbols = self.symbols(self._theta)
@@ -74,6 +75,13 @@ class PenalisedSpline:
                                      overwrite_b=True, check_finite=False)
         residual = values - self.design @ coefficients
         return coefficients, np.einsum('i,ij,ij->j', self._interior, residual, residual)
+
+    def _least_decade(self):
+        """Return the smallest penalty (decade) for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6."""
+        empty = self.bands[0] < 1e-9 * self.density
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], empty, [False]]).astype(np.int8)))
+        hole = np.max(edges[1::2] - edges[::2], initial=0) + ORDER
+        return max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
 
     def _end_weights(self, penalty):
         """
@@ -167,7 +175,7 @@ def _squares_by_spectrum(spline, values):
 
 
 def _penalty(spline, decade):
-    return spline.density * 10.0 ** decade
+    return spline.density * 10.0 ** max(decade, spline.least_decade)
 
 
 def _cross_validation(spline, decade, squares, robustness):
