@@ -56,8 +56,8 @@ def joint_phases(time, position, settings, noise_rad=None):
     if still.all():
         return np.full(len(time), STILL, np.int8), level.T
     noise = np.maximum(np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None])
-    steady = _steady(rate, settings, _half_width(min(LONGEST_SPAN, settings.spin_minimum), period, half), 4 * noise * _slope_gain(half, period),
-                     ripple, half, 3 * noise)
+    steady_half = _half_width(min(LONGEST_SPAN, settings.spin_minimum), period, half)
+    steady = _steady(rate, settings, steady_half, 4 * noise * _slope_gain(half, period), ripple, half, 3 * noise)
     return np.where(still, STILL, np.where(steady, STEADY, MOVING)).astype(np.int8), level.T
 
 

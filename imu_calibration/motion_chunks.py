@@ -3,18 +3,17 @@
 import numpy as np
 
 from imu_calibration import joint_phases, quietness
-from imu_calibration.joint_motion import fit_joint_curve
-from imu_calibration.joint_phases import LOST, MOVING, STILL
+from imu_calibration.joint_phases import LOST, STILL
+from imu_calibration.joint_run import LEAST_READINGS, JointRun
 from imu_calibration.quietness import QuietFloor, quiet_samples
 from imu_calibration.sample_buffer import SampleBuffer
-from imu_calibration.window_cutting import PhasedSamples
+from imu_calibration.window import PhasedSamples
 
 JOINT_WAIT = 60.0
 """The IMU or the joints may be ahead of each other by this much before the missing ones are given up, s."""
 TEMPERATURE_WAIT = 5.0
 """Temperature may come later than the IMU by this much, s."""
 _LEAST_MARGIN = max(joint_phases.REACH, quietness.REACH) + 0.4
-_LEAST_JOINTS = 4
 NEVER = 1 << 62
 
 
@@ -22,9 +21,9 @@ class MotionChunks:
     """
     One epoch of the clock: takes samples as they come and hands out `PhasedSamples`, in order.
 
-    Chunk k holds the IMU samples from ``start + k * chunk`` on, for `chunk` seconds; `start` is the first IMU sample. What comes out depends on
-    samples within the chunk and a margin only, and a chunk is worked on when all streams have passed its margin (or are
-    given up), so the cut of the streams into blocks plays no role. Memory is bounded by the waiting times.
+    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the first IMU sample. What
+    comes out depends on samples within the chunk and a margin only, and a chunk is worked on when all streams have passed
+    its margin (or are given up), so the cut of the streams into blocks plays no role. The waiting times bound the memory.
     """
 
     def __init__(self, settings, noise_rad, floor):
@@ -135,8 +134,8 @@ class MotionChunks:
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
         runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
         phase, level = self._phases(time, runs, final)
-        resting = phase == STILL
-        quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor, resting)
+        quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor,
+                              phase == STILL)
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
@@ -144,7 +143,7 @@ class MotionChunks:
         temperature = self._temperatures(imu.stamp_ns[core], stop_ns + self._margin_ns)
         return self._without_lost(PhasedSamples(
             imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, temperature, phase[core],
-            quiet[core], after_gap, np.zeros(len(after_gap), bool)))
+            quiet[core], after_gap, np.zeros(len(after_gap), bool)), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):
         """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
@@ -156,8 +155,8 @@ class MotionChunks:
         step = np.diff(time)
         joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
         bounds = np.concatenate([[0], np.flatnonzero(step > joint_limit) + 1, [len(time)]])
-        runs = [_JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], self._settings, self._noise_rad)
-                for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= _LEAST_JOINTS]
+        runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], self._settings, self._noise_rad)
+                for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= LEAST_READINGS]
         return runs, limit
 
     def _phases(self, time, runs, final):
@@ -194,7 +193,16 @@ class MotionChunks:
             return np.full(len(stamp_ns), np.nan)
         return np.interp((stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9, readings.temperature_c)
 
-    def _without_lost(self, samples):
+    def _at_edge(self, stamp_ns, limit, final):
+        """Tell which samples are so close before the first joint state or after the last that nothing is missing."""
+        if self._first_joint_ns is None:
+            return np.zeros(len(stamp_ns), bool)
+        edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))
+        if final and self._joints.newest_ns is not None:
+            edge |= (stamp_ns > self._joints.newest_ns) & (stamp_ns <= self._joints.newest_ns + _ns(limit))
+        return edge
+
+    def _without_lost(self, samples, edge):
         lost = samples.phase == LOST
         before = np.concatenate([[self._after_loss], lost[:-1]])
         self._after_loss = bool(lost[-1])
@@ -202,50 +210,9 @@ class MotionChunks:
         samples.after_loss[before] = True
         if not lost.any():
             return samples
-        self._count('no joint state', np.count_nonzero(lost))
+        self._count('no joint state', np.count_nonzero(lost & ~edge))
+        self._count('edge of joints', np.count_nonzero(lost & edge))
         return None if lost.all() else samples.select(~lost)
-
-
-class _JointRun:
-    """Joint readings without gaps."""
-
-    def __init__(self, time, position, velocity, settings, noise_rad):
-        self.time, self.position, self.velocity = time, position, velocity
-        self.phase, self.level = joint_phases.joint_phases(time, position, settings, noise_rad)
-        self._moving = time[self.phase != STILL]
-
-    def covered(self, time, before, after):
-        """Tell which instants lie between the readings or, where the joints rest, within two periods of the first or last."""
-        reach = 2 * np.median(np.diff(self.time))
-        low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)
-        high = self.time[-1] + (reach if after and self.phase[-1] == STILL else 0.0)
-        return (time >= low) & (time <= high)
-
-    def at(self, time):
-        """Return the phase (that of both neighbours, else moving) and the level at instants."""
-        right = np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)
-        left = np.maximum(right - 1, 0)
-        phase = np.where(self.phase[left] == self.phase[right], self.phase[right], MOVING)
-        level = np.stack([np.interp(time, self.time, column) for column in self.level.T], axis=1)
-        return phase.astype(np.int8), level
-
-    def near_motion(self, time, distance):
-        """Tell which instants between the readings are within `distance` of one with moving joints."""
-        if not len(self._moving):
-            return np.zeros(len(time), bool)
-        right = np.searchsorted(self._moving, time)
-        ahead = self._moving[np.minimum(right, len(self._moving) - 1)]
-        behind = self._moving[np.maximum(right - 1, 0)]
-        near = np.minimum(np.abs(ahead - time), np.abs(time - behind)) <= distance
-        return near & (time >= self.time[0]) & (time <= self.time[-1])
-
-    def curve(self, time, overlap, noise_rad):
-        """Return the `JointMotion` of a smooth curve at instants."""
-        first, stop = np.searchsorted(self.time, [time[0] - overlap, time[-1] + overlap])
-        first, stop = max(0, min(first, len(self.time) - _LEAST_JOINTS)), min(len(self.time), max(stop, _LEAST_JOINTS))
-        piece = slice(first, stop)
-        velocity = None if np.isnan(self.velocity[piece]).all() else self.velocity[piece]
-        return fit_joint_curve(self.time[piece], self.position[piece], velocity, noise_rad).at(time)
 
 
 def _ns(seconds):

@@ -9,7 +9,8 @@ from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.settings import WindowSettings
 from imu_calibration.still_search import find_still
 from imu_calibration.stream_check import StreamCheck
-from imu_calibration.window_cutting import Window, WindowCutter
+from imu_calibration.window import Window
+from imu_calibration.window_cutting import WindowCutter
 
 __all__ = ['MotionGatherer', 'Window', 'find_still']
 
@@ -46,7 +47,6 @@ class MotionGatherer:
         self._turns = _Unwrapper()
         self._floor = QuietFloor()
         self._lost_counts = {}
-        self._block_counts = {}
         self._epoch = 0
         self._chunks = MotionChunks(settings, self._noise_rad, self._floor)
         self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
@@ -64,11 +64,11 @@ class MotionGatherer:
         Return reason -> number of samples.
 
         'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short': accepted, but in no window.
-        'no joint state', 'late IMU sample', 'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What the
-        blocks report as dropped is added under its own name.
+        'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
+        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What blocks report as dropped is not in here.
         """
         self._take_in()
-        counts = dict(self._block_counts)
+        counts = {}
         for name in _STREAMS:
             _add_counts(counts, {f'{name} {reason}': number for reason, number in self._checks[name].counts.items()})
         for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
@@ -95,7 +95,6 @@ class MotionGatherer:
             if samples is not None and len(samples):
                 self._raw[name].append(self._with_table_joints(samples) if name == 'joints' else samples)
                 self._n_new += len(samples)
-        _add_counts(self._block_counts, block.dropped or {})
         if self._n_new < _BATCH:
             return []
         self._n_new = 0
