@@ -77,7 +77,7 @@ class Recording:
         self.path = path
         self.topics = topics
         self.imu_topic, self.joint_topic, self.temperature_topic = imu_topic, joint_topic, temperature_topic
-        self._source = source
+        self.source = source
 
     @property
     def message_counts(self):
@@ -93,12 +93,12 @@ class Recording:
     @property
     def duration(self):
         """Seconds between the first and the last message by the recorder's clock."""
-        return self._source.duration_ns * 1e-9
+        return self.source.duration_ns * 1e-9
 
     @property
     def lost(self):
         """What could not be read, reason -> count; complete when `blocks` has run to its end."""
-        return dict(self._source.lost)
+        return dict(self.source.lost)
 
     def blocks(self, joint_names=None, block_samples=BLOCK_SAMPLES):
         """
@@ -124,7 +124,7 @@ class Recording:
         """
         decoders = self._decoders(joint_names)
         parts, n_samples = {}, 0
-        for stretch in self._source.stretches(list(decoders)):
+        for stretch in self.source.stretches(list(decoders)):
             for topic, packed in stretch.items():
                 samples = decoders[topic].decode(packed)
                 if samples is not None:
@@ -140,7 +140,7 @@ class Recording:
             yield last
 
     def _decoders(self, joint_names):
-        source, decoders = self._source, {}
+        source, decoders = self.source, {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
             standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
@@ -153,7 +153,7 @@ class Recording:
 
     def close(self):
         """Close the files."""
-        self._source.close()
+        self.source.close()
 
     def __enter__(self):
         return self

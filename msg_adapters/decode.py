@@ -45,7 +45,7 @@ class Decoder:
         groups, rest = group_by_layout(packed, self.find_layout)
         parts = [(index, self._decode_group(layout, group)) for layout, index, group in groups]
         parts += [(rest[k:k + 1], self._decode_alone(packed.message(number))) for k, number in enumerate(rest)]
-        return _in_order([(index, samples) for index, samples in parts if samples is not None])
+        return in_order([(index, samples) for index, samples in parts if samples is not None])
 
     def decode_objects(self, messages):
         """Return the samples of message objects, from rclpy or rosbags, or None when there are none."""
@@ -136,7 +136,7 @@ class JointDecoder(Decoder):
         return self.names
 
 
-def _in_order(parts):
+def in_order(parts):
     """Join (index, samples) pairs in the order of the indices; None when there are none."""
     if len(parts) < 2:
         return parts[0][1] if parts else None

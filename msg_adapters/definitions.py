@@ -49,6 +49,11 @@ def standard_definition(message_type):
     return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
 
 
+def is_standard_name(message_type):
+    """Return whether this package knows the type: Imu, JointState or Temperature."""
+    return message_type in _STANDARD
+
+
 def is_standard(message_type, encoding, text):
     """Return whether a definition has the fields of the standard one; without a text the standard is taken for granted."""
     if not text:

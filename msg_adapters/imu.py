@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imu_calibration.samples import ImuSamples
-from msg_adapters.layout import Layout
+from msg_adapters.layout import Layout, overlapping
 from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, align, byte_order, header_stamp_ns, to_ns
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -89,6 +89,37 @@ def decode_imu(layout, packed):
             values[absent] = np.nan
         readings[name] = values
     return ImuSamples(layout.stamp_ns(packed), frame_id=layout.names[0], **readings)
+
+
+def patch_imu_group(layout, packed, fields, frame_id=None):
+    """
+    Return copies of messages of one layout with some fields replaced (see `patch_imu` for one message).
+
+    Parameters
+    ----------
+    layout, packed : Layout, Packed
+        The messages.
+    fields : dict
+        Field name -> values, shape (n, count).
+    frame_id : str, optional
+        New frame.
+
+    Returns
+    -------
+    table : ndarray
+        uint8, shape (n, n_bytes): one message per row.
+
+    """
+    table = overlapping(packed.buffer, f'V{layout.size}')[packed.start].view(np.uint8).reshape(-1, layout.size)
+    for name, values in fields.items():
+        offset, count = layout.offsets[name]
+        table[:, offset:offset + 8 * count] = np.ascontiguousarray(values, dtype=layout.order + 'f8').view(np.uint8)
+    if frame_id is None or frame_id == layout.names[0]:
+        return table
+    body = layout.offsets['orientation'][0]
+    sample, new_body = _reframed(layout.sample, layout.order, body, frame_id.encode())
+    head = np.broadcast_to(np.frombuffer(sample[_FRAME:new_body], np.uint8), (len(table), new_body - _FRAME))
+    return np.concatenate([table[:, :_FRAME], head, table[:, body:]], axis=1)
 
 
 def imu_row(message):

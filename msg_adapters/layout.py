@@ -29,6 +29,11 @@ class Packed:
         start = int(self.start[index])
         return self.buffer[start:start + int(self.size[index])].tobytes()
 
+    def view(self, index):
+        """Return one message without copying it."""
+        start = int(self.start[index])
+        return memoryview(self.buffer)[start:start + int(self.size[index])]
+
     def select(self, index):
         """Return some of the messages."""
         return Packed(self.buffer, self.start[index], self.size[index])

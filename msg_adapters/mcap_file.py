@@ -3,23 +3,25 @@
 import os
 import struct
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from msg_adapters.compressed import decompress_chunk
-from msg_adapters.layout import Packed, is_any
+from msg_adapters.layout import Packed
 from msg_adapters.mcap_records import (CHANNEL, CHUNK, CHUNK_INDEX, DATA_END, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, PREFIX, SCHEMA, STATISTICS,
-                                       McapDamage, indexed_messages, is_record, parse_channel, parse_message_index, parse_schema,
+                                       McapDamage, indexed_messages, is_record, log_times, parse_channel, parse_message_index, parse_schema,
                                        parse_statistics, unpack_chunk, walk)
 from msg_adapters.read_ahead import read_ahead
+from msg_adapters.storage import StorageFile, Stretch
 
 STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
 
 
-class McapFile:
+class McapFile(StorageFile):
     """
     One .mcap file.
 
@@ -75,23 +77,23 @@ class McapFile:
         first, last, counts = self.statistics
         return (first, last) if any(counts.values()) and last else None
 
-    def stretches(self, topics):
-        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
-        for buffer, messages in read_ahead(self._joined_pieces()):
-            stretch = {}
-            for topic in topics:
-                numbers = [number for number, channel in self.channels.items() if channel.topic == topic]
-                mine = np.flatnonzero(is_any(messages.channel, numbers))
-                if len(mine):
-                    packed = Packed(buffer, messages.start[mine], messages.size[mine])
-                    stretch[topic] = packed if self.unpack is None else Packed.join(
-                        [self.unpack(packed.message(k)) for k in range(len(packed))])
-            if stretch:
-                yield stretch
-
     def close(self):
         """Close the file."""
         self.file.close()
+
+    @property
+    def topic_ids(self):
+        """Topic -> channel ids."""
+        ids = {}
+        for number, channel in self.channels.items():
+            ids.setdefault(channel.topic, []).append(number)
+        return ids
+
+    def _stretches(self):
+        for buffer, messages in read_ahead(self._joined_pieces()):
+            packed = Packed(buffer, messages.start, messages.size)
+            yield Stretch(messages.channel, lambda index, packed=packed: (index, packed.select(index)),
+                          partial(log_times, buffer, messages))
 
     def _joined_pieces(self):
         """Join pieces to stretches."""
@@ -227,10 +229,6 @@ class McapFile:
             elif opcode == CHANNEL:
                 number, channel = parse_channel(content)
                 self.channels[number] = channel
-
-    def _lose(self, what, count):
-        reason = f'{what} of {self.path.name}'
-        self.lost[reason] = self.lost.get(reason, 0) + count
 
     def _read(self, position, size):
         return os.pread(self.file.fileno(), size, position)

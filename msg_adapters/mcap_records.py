@@ -177,6 +177,11 @@ def walk(buffer):
     return Messages(channel, offset + MESSAGE_PREFIX, length - 22), others, position
 
 
+def log_times(buffer, messages, index):
+    """Return the receive times of some Messages of a buffer, int64."""
+    return overlapping(buffer, '<i8')[messages.start[index] - 16]
+
+
 def is_record(opcode):
     """Return whether the format knows the opcode, or leaves it to applications."""
     return 1 <= opcode <= LAST_OPCODE or opcode >= 0x80

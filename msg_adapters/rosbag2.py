@@ -6,7 +6,9 @@ from pathlib import Path, PurePath
 from tempfile import mkdtemp
 
 from msg_adapters.compressed import decompress_file, decompress_message
+from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
 from msg_adapters.mcap_file import McapFile
+from msg_adapters.qos import spelled_out
 from msg_adapters.sqlite_file import SqliteFile
 
 FILES = {'.db3': SqliteFile, '.mcap': McapFile}
@@ -63,17 +65,47 @@ class Rosbag2:
             lost.update(file.lost)
         return lost
 
+    @property
+    def storage(self):
+        """'sqlite3' or 'mcap'."""
+        return 'mcap' if isinstance(self.files[0], McapFile) else 'sqlite3'
+
+    def definition(self, topic):
+        """Return the TypeDefinition of a topic; the standard one where the bag has none."""
+        message_type = self.types[topic]
+        encoding, text = self.definitions.get(message_type, ('', ''))
+        if is_standard_name(message_type) and is_standard(message_type, encoding, text):
+            return standard_definition(message_type)
+        digest = self._entry(topic).get('type_description_hash', '')
+        return TypeDefinition(message_type, encoding if text else '', text, digest)
+
+    def qos(self, topic):
+        """Return the QoS profiles of a topic's publishers as far as the metadata say."""
+        return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
+
     def stretches(self, topics):
         """Yield dicts topic -> Packed in file order."""
+        return self._through(topics, lambda file: file.stretches(topics), lambda stretch: sum(map(len, stretch.values())))
+
+    def raw_stretches(self, topics):
+        """Yield RawMessages of the topics in file order."""
+        return self._through(topics, lambda file: file.raw_stretches(topics), lambda raw: len(raw.topic))
+
+    def _through(self, topics, read, count):
+        """Read the files one after the other; count what the metadata announce and damaged files do not hold."""
         n_read = 0
         for file in self.files:
             file.lost.clear()
-            for stretch in file.stretches(topics):
-                n_read += sum(map(len, stretch.values()))
+            for stretch in read(file):
+                n_read += count(stretch)
                 yield stretch
         announced = sum(self._announced().get(topic, 0) for topic in topics)
         if self.lost and announced > n_read:
             self._lost['messages that the metadata announce and the files do not hold'] = announced - n_read
+
+    def _entry(self, topic):
+        entries = [entry['topic_metadata'] for entry in self.metadata.get('topics_with_message_count', ())]
+        return next((entry for entry in entries if entry['name'] == topic), {})
 
     def close(self):
         """Close the files and remove what was decompressed."""

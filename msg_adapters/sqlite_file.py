@@ -4,21 +4,23 @@ import os
 import sqlite3
 from collections import defaultdict
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
-from msg_adapters.layout import Packed, is_any
+from msg_adapters.layout import Packed
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.sqlite_pages import PageReader
+from msg_adapters.storage import Stretch, StorageFile
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
 STRETCH_ROWS = 8192
 
 
-class SqliteFile:
+class SqliteFile(StorageFile):
     """
     One .db3 file.
 
@@ -54,8 +56,8 @@ class SqliteFile:
     def count(self):
         """Return topic -> messages by counting them."""
         by_id = defaultdict(int)
-        for ids, _ in self._all_rows():
-            for topic_id, count in zip(*np.unique(ids, return_counts=True), strict=True):
+        for stretch in self._stretches():
+            for topic_id, count in zip(*np.unique(stretch.topic_ids, return_counts=True), strict=True):
                 by_id[int(topic_id)] += int(count)
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
 
@@ -67,28 +69,11 @@ class SqliteFile:
             return None if first is None else (first, last)
         return None
 
-    def stretches(self, topics):
-        """Yield dicts topic -> Packed in the order of the rows; what the file loses is counted in `lost`."""
-        for ids, pack in self._all_rows():
-            stretch = {}
-            for topic in topics:
-                mine = np.flatnonzero(is_any(ids, self.topic_ids.get(topic, [])))
-                if len(mine):
-                    stretch[topic] = self._unpacked(pack(mine))
-            if stretch:
-                yield stretch
-
     def close(self):
         """Close the file."""
         self.connection.close()
 
-    def _unpacked(self, packed):
-        if self.unpack is None:
-            return packed
-        return Packed.join([self.unpack(packed.message(k)) for k in range(len(packed))])
-
-    def _all_rows(self):
-        """Yield (topic ids, function index -> Packed) stretch by stretch."""
+    def _stretches(self):
         root = self._root()
         if root is None:
             yield from self._rows_by_sql()
@@ -97,7 +82,7 @@ class SqliteFile:
         try:
             for buffer, starts in read_ahead(reader.stretches()):
                 rows = reader.rows(buffer, starts)
-                yield rows.topic_id, lambda index, rows=rows: self._pack(rows, index)
+                yield Stretch(rows.topic_id, partial(self._pack, rows), rows.received_ns)
         finally:
             reader.close()
             for name, count in (('pages', reader.damaged_pages), ('rows', reader.damaged_rows)):
@@ -117,13 +102,13 @@ class SqliteFile:
         start, size = rows.start[index], rows.size[index]
         outside = np.flatnonzero(~rows.inside[index])
         if not len(outside):
-            return Packed(rows.buffer, start, size)
+            return index, Packed(rows.buffer, start, size)
         found = [self._by_id(int(rows.row_id[index[k]])) for k in outside]
         tail = Packed.join([data or b'' for data in found])
         start[outside], size[outside] = len(rows.buffer) + tail.start, tail.size
         kept = np.ones(len(index), dtype=bool)
         kept[outside] = [data is not None for data in found]
-        return Packed(np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept])
+        return index[kept], Packed(np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept])
 
     def _by_id(self, row_id):
         try:
@@ -133,28 +118,24 @@ class SqliteFile:
             return None
 
     def _rows_by_sql(self):
-        cursor = iter(self.connection.execute('SELECT topic_id, data FROM messages ORDER BY id'))
+        cursor = iter(self.connection.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id'))
         going = True
         while going:
-            ids, messages = [], []
-            going = self._fetch(cursor, ids, messages)
-            if ids:
-                yield np.array(ids), lambda index, messages=messages: Packed.join([messages[k] for k in index])
+            rows = []
+            going = self._fetch(cursor, rows)
+            if rows:
+                ids, received, messages = zip(*rows, strict=True)
+                packed, received = Packed.join(list(map(bytes, messages))), np.array(received, dtype=np.int64)
+                yield Stretch(np.array(ids), lambda index, packed=packed: (index, packed.select(index)), received.__getitem__)
 
-    def _fetch(self, cursor, ids, messages):
-        """Append a stretch of rows to the two lists; return whether there may be more."""
+    def _fetch(self, cursor, rows):
+        """Append a stretch of rows; return whether there may be more."""
         try:
-            for topic_id, data in islice(cursor, STRETCH_ROWS):
-                ids.append(topic_id)
-                messages.append(bytes(data))
+            rows.extend(islice(cursor, STRETCH_ROWS))
         except sqlite3.Error as error:
             self._lose(f'rest after damage ({error})', 1)
             return False
-        return len(ids) == STRETCH_ROWS
-
-    def _lose(self, what, count):
-        reason = f'{what} of {self.path.name}'
-        self.lost[reason] = self.lost.get(reason, 0) + count
+        return len(rows) == STRETCH_ROWS
 
 
 def _connect(path, logged):

@@ -38,6 +38,14 @@ class Rows(NamedTuple):
     """Bytes of the data, int64, shape (n,)."""
     inside: np.ndarray
     """False where the data go on in overflow pages, bool, shape (n,)."""
+    received_at: np.ndarray
+    """First byte of the receive time in `buffer`, int64, shape (n,)."""
+    received_type: np.ndarray
+    """Serial type of the receive time, int64, shape (n,)."""
+
+    def received_ns(self, index):
+        """Return the receive times of some rows, int64."""
+        return _integer(self.buffer, self.received_at[index], self.received_type[index])
 
 
 class PageReader:
@@ -159,12 +167,13 @@ def _parse_cells(buffer, cell, page_end, largest):
         types.append(serial)
     sizes = [_INTEGER_SIZE[np.clip(serial, 0, 11)] for serial in types[:3]]
     topic_id = _integer(buffer, value + sizes[0], types[1])
-    start = value + sizes[0] + sizes[1] + sizes[2]
+    received_at = value + sizes[0] + sizes[1]
+    start = received_at + sizes[2]
     size = (types[3] - 12) >> 1
     inside = payload_size <= largest
     sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (header_size < 60) & (field <= page_end)
     sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
-    return Rows(buffer, row_id, topic_id, start, size, inside), sensible
+    return Rows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]), sensible
 
 
 def _varint(buffer, position):
@@ -186,11 +195,14 @@ def _varint(buffer, position):
 
 
 def _integer(buffer, position, serial):
-    """Decode big-endian integers of up to four bytes; topic ids are small."""
+    """Decode big-endian integers by their serial types."""
     value = np.where(serial == 9, 1, 0)
-    for size in (1, 2, 3, 4):
-        mine = np.flatnonzero(serial == size)
+    for kind in range(1, 7):
+        mine = np.flatnonzero(serial == kind)
         if len(mine):
+            size = int(_INTEGER_SIZE[kind])
             at = np.clip(position[mine, np.newaxis] + np.arange(size), 0, len(buffer) - 1)
-            value[mine] = buffer[at].astype(np.int64) @ (256 ** np.arange(size)[::-1])
+            padded = np.zeros((len(mine), 8), dtype=np.uint8)
+            padded[:, :size] = buffer[at]
+            value[mine] = padded.view('>i8')[:, 0] >> 8 * (8 - size)   # the shift brings the sign along
     return value

@@ -1,105 +1,20 @@
-"""New recordings: rosbag2 folders, made beside their place and renamed when they are complete."""
-
-import os
-import shutil
-from collections import Counter
-from contextlib import contextmanager
-from pathlib import Path
+"""Sessions from arrays into new recordings."""
 
 import numpy as np
 
-from imu_calibration.errors import InputError
 from msg_adapters.bag import DEFAULT_TOPICS
+from msg_adapters.bag_writer import BagWriter
+from msg_adapters.copying import copy_with_corrected
 from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import UNKNOWN, encode_imu, encode_joints, encode_temperature, rows
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
-from msg_adapters.mcap_writer import McapWriter
-from msg_adapters.sqlite_writer import SqliteWriter
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
-STORAGES = {'sqlite3': SqliteWriter, 'mcap': McapWriter}
-ROS_DISTRO = 'jazzy'
-METADATA_VERSION = 9
+__all__ = ['BagWriter', 'copy_with_corrected', 'write_session']
+
 BATCH = 65536
 """Messages handed to the storage at once; bounds the memory of a long recording."""
-
-
-class BagWriter:
-    """
-    Write one rosbag2 folder.
-
-    Parameters
-    ----------
-    path : path-like
-        The folder to make.
-    storage : str
-        'sqlite3' or 'mcap'.
-    options : dict
-        Passed to the storage (`compression` of the chunks of an mcap).
-
-    """
-
-    def __init__(self, path, storage='sqlite3', **options):
-        if storage not in STORAGES:
-            raise InputError(f'the storage of a bag must be {" or ".join(STORAGES)}, got {storage!r}; choose one of these')
-        self.path = Path(path)
-        self.topics, self.counts = {}, Counter()
-        self.first_ns, self.last_ns = None, None
-        writer = STORAGES[storage]
-        self.file_name = f'{self.path.name}_0{writer.suffix}'
-        self.partial = make_partial_folder(self.path)
-        self.storage = writer(self.partial / self.file_name, ROS_DISTRO, **options)
-
-    def add_topic(self, name, definition, qos=()):
-        """Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings); return its id."""
-        topic_id = len(self.topics) + 1
-        self.topics[topic_id] = (name, definition, list(qos))
-        self.storage.add_topic(topic_id, name, definition, dump_yaml(list(qos)).strip() if qos else '')
-        return topic_id
-
-    def write(self, topic_ids, received_ns, messages):
-        """Append messages in the order of the file: arrays of topic ids and receive times, and a list of byte strings."""
-        if not len(messages):
-            return
-        self.storage.write(topic_ids, received_ns, messages)
-        for topic_id, count in zip(*np.unique(topic_ids, return_counts=True), strict=True):
-            self.counts[int(topic_id)] += int(count)
-        first, last = int(received_ns.min()), int(received_ns.max())
-        self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
-        self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
-
-    def close(self):
-        """Finish the files and put the folder in its place."""
-        information = self._metadata()
-        self.storage.close(METADATA_VERSION, dump_yaml(information).strip())
-        (self.partial / 'metadata.yaml').write_text(dump_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
-        if self.path.exists():
-            self.abort()
-            raise InputError(f'{self.path} must not exist yet; remove it or choose another name')
-        os.rename(self.partial, self.path)
-
-    def abort(self):
-        """Throw away what has been written."""
-        self.storage.abort()
-        shutil.rmtree(self.partial, ignore_errors=True)
-
-    def _metadata(self):
-        times = {'starting_time': {'nanoseconds_since_epoch': self.first_ns or 0},
-                 'duration': {'nanoseconds': (self.last_ns or 0) - (self.first_ns or 0)},
-                 'message_count': self.counts.total()}
-        topics = [{'topic_metadata': {'name': name, 'type': definition.type, 'serialization_format': 'cdr', 'offered_qos_profiles': qos,
-                                      'type_description_hash': definition.digest},
-                   'message_count': self.counts[topic_id]} for topic_id, (name, definition, qos) in self.topics.items()]
-        return {'version': METADATA_VERSION, 'storage_identifier': self.storage.identifier, **times, 'topics_with_message_count': topics,
-                'compression_format': '', 'compression_mode': '', 'relative_file_paths': [self.file_name],
-                'files': [{'path': self.file_name, **times}], 'custom_data': None, 'ros_distro': ROS_DISTRO}
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, *_):
-        self.close() if kind is None else self.abort()
 
 
 def write_session(path, imu, joints=None, temperature=None, *, storage='sqlite3', imu_topic=DEFAULT_TOPICS[IMU_TYPE],
@@ -137,18 +52,11 @@ def write_session(path, imu, joints=None, temperature=None, *, storage='sqlite3'
         streams.append((joint_topic, JOINT_STATE_TYPE, joints, lambda part: encode_joints(part, with_velocity=keep_velocity)))
     if temperature is not None:
         streams.append((temperature_topic, TEMPERATURE_TYPE, temperature, encode_temperature))
-    with writing(path, storage, **options) as bag:
+    with BagWriter(path, storage, **options) as bag:
         ids = [bag.add_topic(name, standard_definition(message_type)) for name, message_type, _, _ in streams]
         received = [np.maximum.accumulate(samples.stamp_ns) for _, _, samples, _ in streams]
         for parts in _merged(received):
             _write_batch(bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts)
-
-
-@contextmanager
-def writing(path, storage='sqlite3', **options):
-    """Give a BagWriter that closes on success and leaves nothing behind on failure."""
-    with BagWriter(path, storage, **options) as bag:
-        yield bag
 
 
 def _merged(received):
@@ -171,24 +79,3 @@ def _write_batch(bag, ids, received, streams, parts):
             messages += rows(encode(samples.select(part)))
     order = np.argsort(times, kind='stable')
     bag.write(topic_ids[order], times[order], [messages[k] for k in order.tolist()])
-
-
-def make_partial_folder(path):
-    """Make the folder beside `path` in which it is built (raises InputError when `path` exists or cannot be written)."""
-    path = Path(path)
-    if path.exists():
-        raise InputError(f'{path} must not exist yet; remove it or choose another name')
-    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
-    except OSError as error:
-        raise InputError(f'{path.parent} must be a folder that can be written: {error.strerror}; choose another output') from error
-    return partial
-
-
-def dump_yaml(value):
-    """Return YAML text in the order of the mapping."""
-    import yaml
-    return yaml.safe_dump(value, sort_keys=False, width=1000)

@@ -1,0 +1,76 @@
+"""What the readers of storage files have in common: from stretches of rows to messages by topic."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from msg_adapters.layout import Packed, is_any
+
+
+class Stretch(NamedTuple):
+    """Consecutive messages of a file, of all topics."""
+
+    topic_ids: np.ndarray
+    """The file's own numbers of topics, shape (n,)."""
+    pack: callable
+    """Index array -> (index array, Packed): rows that turn out unreadable are left out."""
+    received_ns: callable
+    """Index array -> receive times, int64."""
+
+
+class RawMessages(NamedTuple):
+    """Consecutive messages of some topics, in file order."""
+
+    topic: np.ndarray
+    """Index into the topics that were asked for, shape (n,)."""
+    received_ns: np.ndarray
+    """Receive times, int64, shape (n,)."""
+    packed: Packed
+    """The messages."""
+
+
+class StorageFile:
+    """Base of the readers: they provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, and count in `lost`."""
+
+    unpack = None
+    """Bytes -> bytes for each message, when the bag is compressed by message."""
+
+    def stretches(self, topics):
+        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
+        for stretch in self._stretches():
+            found = {}
+            for topic in topics:
+                mine = np.flatnonzero(is_any(stretch.topic_ids, self.topic_ids.get(topic, [])))
+                if len(mine):
+                    found[topic] = self._take(stretch, mine)[1]
+            if found:
+                yield found
+
+    def raw_stretches(self, topics):
+        """Yield RawMessages of the topics in file order."""
+        for stretch in self._stretches():
+            code = np.full(len(stretch.topic_ids), -1)
+            for number, topic in enumerate(topics):
+                code[is_any(stretch.topic_ids, self.topic_ids.get(topic, []))] = number
+            mine = np.flatnonzero(code >= 0)
+            if len(mine):
+                mine, packed = self._take(stretch, mine)
+                yield RawMessages(code[mine], stretch.received_ns(mine), packed)
+
+    def _take(self, stretch, mine):
+        mine, packed = stretch.pack(mine)
+        if self.unpack is None:
+            return mine, packed
+        messages = [self._unpacked(packed.message(k)) for k in range(len(packed))]
+        kept = np.array([message is not None for message in messages], dtype=bool)
+        return mine[kept], Packed.join([message for message in messages if message is not None])
+
+    def _unpacked(self, data):
+        try:
+            return self.unpack(data)
+        except Exception as error:   # whatever the decompressor raises on damaged data
+            return self._lose(f'messages that cannot be decompressed ({error})', 1)
+
+    def _lose(self, what, count):
+        reason = f'{what} of {self.path.name}'
+        self.lost[reason] = self.lost.get(reason, 0) + count
