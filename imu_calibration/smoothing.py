@@ -59,7 +59,7 @@ class PenalisedSpline:
         self.density = self.n_rows / self.n_coefficients
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
         self.least_decade = self._least_decade()
-        self.gains = lru_cache(None)(self._gains)
+        self._gains = {}
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
         self._symbols = self.symbols(self._theta)
 
@@ -94,12 +94,14 @@ class PenalisedSpline:
         distance = np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1]) - 2
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
-    def _gains(self, penalty):
+    def gains(self, penalty):
         """Return the mean gain of the fit over all frequencies (degrees of freedom per row), and of its square."""
-        normal, damping = self._symbols
-        gain = normal / (normal + penalty * damping)
-        least = 3 / self.n_rows
-        return least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
+        if penalty not in self._gains:
+            normal, damping = self._symbols
+            gain = normal / (normal + penalty * damping)
+            least = 3 / self.n_rows
+            self._gains[penalty] = least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
+        return self._gains[penalty]
 
     def bandwidth(self, penalty):
         """Return the frequency, rad per knot, below which more than half the amplitude passes."""
