@@ -120,7 +120,8 @@ def _run_chain(columns, motion, steps, part):
         if not np.array_equal(matrix, np.eye(3)):
             columns = np.tensordot(matrix, columns, 1)
         if column is not None:
-            columns = _turn(columns, third, *(sense * values[part, column] for values in (motion.position, motion.rate, motion.acceleration)))
+            values = (motion.position, motion.rate, motion.acceleration)
+            columns = _turn(columns, third, *(sense * value[part, column] for value in values))
     return np.broadcast_to(columns, (3, 6, part.stop - part.start))
 
 

@@ -141,7 +141,8 @@ def _place_knots(time):
     step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
     hole = np.max(np.diff(time), initial=0.0)
     if hole > _LONGEST_HOLE * step:
-        raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; split them there')
+        raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
+                         'split them there')
     return Knots(float(time[0] - _MARGIN * step), step, int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN)
 
 

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.signal.windows import tukey
 
 from imu_calibration.bspline import ORDER, penalty_bands
 
@@ -54,7 +53,7 @@ class PenalisedSpline:
         self.design, self.bands, self.penalty = design, bands, penalty_bands(np.ones(design.shape[1] - 3))
         self.n_rows, self.n_coefficients = design.shape
         # Splines are worst at the ends, which callers keep out: the ends have no say in the noise or the penalty.
-        interior = np.tile(tukey(self.n_rows // n_kinds, _TAPER) ** 2, n_kinds)
+        interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
@@ -158,7 +157,7 @@ def _squares_by_spectrum(spline, values):
     """
     pilot = _penalty(spline, _PILOT)
     coefficients, floor = spline.fit(values, pilot)
-    taper = tukey(len(coefficients) - 3, _TAPER)[:, None]
+    taper = _taper(len(coefficients) - 3)[:, None]
     power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(taper ** 2)
     theta = np.arange(len(power)) * 2 * np.pi / len(taper)
     normal, damping = spline.symbols(theta)
@@ -174,6 +173,12 @@ def _squares_by_spectrum(spline, values):
 
     beyond = np.maximum(floor - squares(_PILOT), 0.0)
     return lambda decade: squares(decade) + beyond
+
+
+def _taper(size):
+    """Return a window with raised-cosine edges (Tukey's; scipy.signal takes seconds to import)."""
+    inside = np.minimum(np.arange(size), np.arange(size)[::-1]) / max(0.5 * _TAPER * (size - 1), 1.0)
+    return 0.5 - 0.5 * np.cos(np.pi * np.minimum(inside, 1.0))
 
 
 def _penalty(spline, decade):

@@ -72,7 +72,8 @@ class Table:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:
-            raise InputError('table: gravity or latitude must be given, got neither; add gravity in m/s^2, or latitude in degrees (and height)')
+            raise InputError('table: gravity or latitude must be given, got neither; '
+                             'add gravity in m/s^2, or latitude in degrees (and height)')
 
     @classmethod
     def from_mapping(cls, mapping):

@@ -8,7 +8,7 @@ from imu_calibration.earth import EARTH_RATE, earth_rate_n, normal_gravity
 
 @pytest.mark.parametrize(('latitude', 'gravity'), [(0.0, 9.7803253359), (45.0, 9.8061977693), (90.0, 9.8321849379)])
 def test_normal_gravity_on_the_ellipsoid(latitude, gravity):
-    """Equator and pole are defining or derived constants of WGS 84 (TR8350.2, table 3.4); 45 deg follows from them by Clairaut's exact form."""
+    """Equator and pole are defining or derived constants of WGS 84 (TR8350.2, table 3.4); 45 deg follows by Somigliana's form."""
     assert normal_gravity(latitude) == pytest.approx(gravity, abs=2e-9)
     assert normal_gravity(-latitude) == normal_gravity(latitude)
 

@@ -19,7 +19,8 @@ def sine(time, amplitude, frequency, phase=0.3):
     """Position and its first three derivatives, shape (4, n)."""
     argument = 2 * np.pi * frequency * time + phase
     pulsation = 2 * np.pi * frequency
-    return amplitude * np.array([np.sin(argument), pulsation * np.cos(argument), -pulsation ** 2 * np.sin(argument), -pulsation ** 3 * np.cos(argument)])
+    sin, cos = np.sin(argument), np.cos(argument)
+    return amplitude * np.array([sin, pulsation * cos, -pulsation ** 2 * sin, -pulsation ** 3 * cos])
 
 
 def relative_errors(curve, truth, start=2.0, stop=18.0, rate=400.0):
@@ -313,7 +314,8 @@ def read_shaft(folder, component, seconds):
             value = getattr(message.angular_velocity, component) if connection.topic == '/imu/data_raw' else message.position[0]
             rows[connection.topic].append((stamp, value))
     origin = rows['/imu/data_raw'][0][0]
-    return [(np.array([stamp - origin for stamp, _ in one]) / 1e9, np.array([value for _, value in one])) for one in rows.values()]
+    return [(np.array([stamp - origin for stamp, _ in one]) / 1e9, np.array([value for _, value in one]))
+            for one in rows.values()]
 
 
 @pytest.mark.parametrize(('name', 'component', 'sense', 'scale'), [('shaft_pitch_slow', 'y', 1, 0.985), ('shaft_yaw_medium', 'z', -1, 1.005)])

@@ -27,8 +27,8 @@ directions = coordinate_axes | vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
 def tables(draw):
     joints = [Joint(f'joint{k}', draw(directions), draw(vectors)) for k in range(draw(st.integers(1, 4)))]
     degrees = tuple(180 * x for x in draw(vectors))
-    return Table(joints, up=draw(directions), gravity=9.81, latitude=draw(st.none() | st.floats(-90, 90)), azimuth_deg=draw(st.none() | number),
-                 mount_rpy_deg=degrees, mount_xyz=draw(st.none() | vectors))
+    return Table(joints, up=draw(directions), gravity=9.81, latitude=draw(st.none() | st.floats(-90, 90)),
+                 azimuth_deg=draw(st.none() | number), mount_rpy_deg=degrees, mount_xyz=draw(st.none() | vectors))
 
 
 def joint_motion(table, seed, time):
