@@ -318,7 +318,10 @@ def read_shaft(folder, component, seconds):
             for one in rows.values()]
 
 
-@pytest.mark.parametrize(('name', 'component', 'sense', 'scale'), [('shaft_pitch_slow', 'y', 1, 0.985), ('shaft_yaw_medium', 'z', -1, 1.005)])
+@pytest.mark.parametrize(('name', 'component', 'sense', 'scale'), [
+    ('shaft_pitch_slow', 'y', 1, 0.985),
+    ('shaft_yaw_medium', 'z', -1, 1.005),
+])
 def test_encoder_with_coarse_steps_agrees_with_the_gyro(recordings, name, component, sense, scale):
     """
     Shaft with torque ripple, 0.088 deg steps and stamps in whole milliseconds; some of them repeat.
