@@ -61,15 +61,15 @@ def quiet_samples(force_s, rate_s, period, ratio, longest, floor, resting=None):
     sums = [_CellSums(values, edges) for values in (force_s, rate_s)]
     least = np.array([least_variance(values) for values in (force_s, rate_s)])
     at_rest = None if resting is None else np.logical_and.reduceat(resting, edges[:-1])
-    quiet, shorter = np.ones(len(edges) - 1, bool), np.inf
+    quiet, shorter = np.ones(len(edges) - 1, bool), np.full(2, np.inf)
     for span in SPANS:
         width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
         variance = np.stack([item.variance(width) for item in sums], axis=1)
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
-        if limit is None:
+        if limit is None and np.isinf(shorter).all():
             return np.zeros(n, bool)
         # at rest the variance hardly grows with the span; where it does, the quietest part was moving as well
-        shorter = limit = np.maximum(np.minimum(limit, _GROWTH * shorter), least)
+        shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), least)
         quiet &= _covered(np.all(variance <= ratio ** 2 * limit, axis=1), width)
     return np.repeat(_shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
 

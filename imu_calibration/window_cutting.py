@@ -92,7 +92,7 @@ class WindowCutter:
 
     def _shed(self, samples, start, stop, kind, reason):
         """Cut whole windows off a run while it is twice as long as a window, open or not: so arrival plays no role."""
-        windows, longest = [], self._settings.window_maximum
+        windows, longest = [], self._longest(kind)
         while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
             cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
             windows += self._finished(samples.select(slice(start, cut)), kind, reason)
@@ -125,19 +125,25 @@ class WindowCutter:
     def _close(self, samples, kind, reason):
         """Return the windows of a whole run of one kind, cut into equal pieces of at most the longest length."""
         length = samples.time[-1] - samples.time[0]
-        pieces = max(1, int(np.ceil(length / self._settings.window_maximum)))
+        pieces = max(1, int(np.ceil(length / self._longest(kind[0]))))
         bounds = np.linspace(0, len(samples), pieces + 1).astype(int)
         windows = []
         for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
             windows += self._finished(samples.select(slice(start, stop)), kind[0], reason[0])
         return windows
 
-    def _finished(self, samples, kind, reason):
+    def _least(self, kind):
         settings = self._settings
-        least = {UNUSED: 0.0, STATIC: settings.static_minimum, SPIN: settings.spin_minimum, DYNAMIC: settings.dynamic_minimum}[kind]
+        return {UNUSED: 0.0, STATIC: settings.static_minimum, SPIN: settings.spin_minimum, DYNAMIC: settings.dynamic_minimum}[kind]
+
+    def _longest(self, kind):
+        # halves of a window that is a little too long must still be long enough
+        return max(self._settings.window_maximum, 2 * self._least(kind))
+
+    def _finished(self, samples, kind, reason):
         n = len(samples)
         length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
-        if length < least or (kind != UNUSED and n < _LEAST_SAMPLES):
+        if length < self._least(kind) or (kind != UNUSED and n < _LEAST_SAMPLES):
             kind, reason = UNUSED, _TOO_SHORT
         key = _REASONS[reason] if kind == UNUSED else _KINDS[kind]
         self.counts[key] = self.counts.get(key, 0) + n

@@ -254,6 +254,23 @@ def test_long_windows_are_cut_in_equal_pieces():
     assert [len(window) for window in windows] == [1000, 750, 750]
 
 
+def test_cutting_leaves_no_piece_too_short():
+    imu, joints = record(rest(10.5))
+    windows, counts = gather(imu, joints, window_maximum=1.5)
+    assert counts == {'static': len(imu)} and all(len(window) >= 200 for window in windows) and len(windows) >= 5
+
+
+@pytest.mark.parametrize('chunk, overlap', [(2.0, 0.2), (7.3, 1.0), (600.0, 60.0)])
+def test_grid_of_the_chunks_hardly_matters(chunk, overlap):
+    profile = tour()
+    imu, joints = record(profile)
+    usual, _ = gather(imu, joints)
+    windows, _ = gather(imu, joints, chunk=chunk, overlap=overlap)
+    for window, other in zip(windows, usual, strict=True):
+        assert window.kind == other.kind and abs(window.time[0] - other.time[0]) < 0.1 and abs(window.time[-1] - other.time[-1]) < 0.1
+    check_motion(windows, profile, 1e-4, 5e-3, 0.3)
+
+
 def test_dropped_imu_samples_end_a_window():
     imu, joints = record(rest(20))
     keep = (seconds(imu) < 9) | (seconds(imu) > 11)
