@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,11 @@ ROOT = Path(__file__).resolve().parents[1]
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
 EXECUTABLES = ('imu_calibration', *NODES)
 NOT_SOURCE = shutil.ignore_patterns('.git', '.venv*', '.hypothesis', '.pytest_cache', '__pycache__', '*.egg-info', 'build', 'install', 'log', 'demo', 'out')
+
+TABLE = 'table_file:={config}/table_three_axis.yaml'
+PARAMETERS = {'calibration_node': [TABLE], 'simulator_node': [TABLE], 'compensator_node': []}
+
+LOCAL = {'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 pytestmark = pytest.mark.slow
 
@@ -37,6 +43,21 @@ def plain_environment():
     if 'ROS_DISTRO' in os.environ and 'PYTHONPATH' in os.environ:
         environment['PYTHONPATH'] = os.environ['PYTHONPATH']
     return environment
+
+
+@pytest.fixture(scope='module')
+def graph():
+    """A node that looks at the graph of this host, in a domain of its own."""
+    import rclpy
+    with pytest.MonkeyPatch.context() as patch:
+        for key, value in LOCAL.items():
+            patch.setenv(key, value)
+        context = rclpy.Context()
+        rclpy.init(context=context)
+        node = rclpy.create_node('watcher', context=context)
+        yield node
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def sourced(workspace, *command, **options):
@@ -84,3 +105,31 @@ def test_the_command_line_starts(workspace, folder):
     assert done.returncode == 0, done.stderr
     for verb in ('inspect', 'calibrate', 'compensate', 'simulate', 'compare'):
         assert verb in done.stdout
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize('name', PARAMETERS)
+def test_a_node_joins_the_graph_and_ends_on_sigint(workspace, graph, name):
+    namespace = f'build_{uuid.uuid4().hex}'
+    config = prefix(workspace) / 'share' / 'imu_calibration' / 'config'
+    parameters = [word for text in PARAMETERS[name] for word in ('-p', text.format(config=config))]
+    command = [prefix(workspace) / 'lib' / 'imu_calibration' / name, '--ros-args', '-r', f'__ns:=/{namespace}', *parameters]
+    with subprocess.Popen(['bash', '-c', f'. {workspace}/install/setup.bash && exec "$@"', 'bash', *map(str, command)], cwd=workspace,
+                          env=plain_environment() | LOCAL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            until = time.monotonic() + 60.0
+            while f'/{namespace}/{name}/get_type_description' not in dict(graph.get_service_names_and_types()):
+                assert process.poll() is None, process.stderr.read()
+                assert time.monotonic() < until, f'{name} did not join the graph'
+                time.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert process.returncode == 0, errors
+
+
+def test_a_player_without_a_bag_refuses_in_one_line(workspace):
+    done = sourced(workspace, prefix(workspace) / 'lib' / 'imu_calibration' / 'bag_player_node')
+    assert done.returncode == 1
+    assert 'bag' in done.stderr and 'Traceback' not in done.stderr
