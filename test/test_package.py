@@ -110,6 +110,8 @@ def test_every_python_package_and_data_file_is_installed(installed):
     listed = {name for _, names in installed['data'] for name in names}
     present = {str(path.relative_to(ROOT)) for pattern in ('config/*', 'launch/*.launch.py') for path in ROOT.glob(pattern)}
     assert present | {'package.xml', 'resource/imu_calibration'} == listed
+    others = {path for path in (ROOT / 'imu_calibration').rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
+    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/templates'}
 
 
 @pytest.mark.parametrize('name', ['pypi.txt', 'jazzy-ubuntu2404.txt', 'oldest.txt'])
