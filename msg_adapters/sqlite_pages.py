@@ -49,7 +49,12 @@ class Rows(NamedTuple):
 
 
 class PageReader:
-    """Reads the leaves below one root page in the order of the row ids."""
+    """
+    Reads the leaves below one root page in the order of the row ids.
+
+    When inner pages are damaged or the file is cut off, all leaves of the file are read in their order instead: the inner page
+    above the first rows of a table often lies far behind them.
+    """
 
     def __init__(self, path, root):
         self.file = open(path, 'rb', buffering=0)
@@ -59,8 +64,12 @@ class PageReader:
         self.usable = self.page_size - header[20]
         self.n_pages = os.fstat(self.file.fileno()).st_size // self.page_size
         self.root = root
-        self.damaged_pages = 0
-        self.damaged_rows = 0
+        self.damaged_pages, self.damaged_rows, self.last_id = 0, 0, None
+        for _ in self._leaf_groups(np.array([root]), 0):
+            pass
+        self.scanning = self.damaged_pages > 0
+        if self.scanning:
+            self.damaged_pages = max(int.from_bytes(header[28:32], 'big') - self.n_pages, self.damaged_pages)
 
     def close(self):
         """Close the file."""
@@ -68,6 +77,10 @@ class PageReader:
 
     def stretches(self):
         """Yield (buffer, starts of the pages in it) over the leaves."""
+        if self.scanning:
+            for first in range(1, self.n_pages + 1, STRETCH_PAGES):
+                yield self._read(np.arange(first, min(first + STRETCH_PAGES, self.n_pages + 1)))
+            return
         waiting, n_waiting = [], 0
         for leaves in self._leaf_groups(np.array([self.root]), 0):
             waiting.append(leaves)
@@ -81,7 +94,8 @@ class PageReader:
     def rows(self, buffer, starts):
         """Parse the leaves of a stretch; pages and rows that make no sense are counted and left out."""
         whole = buffer[starts] == LEAF
-        self.damaged_pages += int((~whole).sum())
+        if not self.scanning:
+            self.damaged_pages += int((~whole).sum())
         starts = starts[whole]
         word = np.ndarray((max(len(buffer) - 1, 0),), '>u2', buffer, strides=(1,))
         n_cells = word[starts + 3].astype(np.int64)
@@ -91,8 +105,19 @@ class PageReader:
         page_end = page + self.usable
         cell = np.minimum(page + word[page + 8 + 2 * number], page_end)
         rows, sensible = _parse_cells(buffer, cell, page_end, self.usable - 35)
-        self.damaged_rows += int((~sensible).sum())
+        if self.scanning:
+            sensible &= self._ascending(rows.row_id, sensible)   # other tables, and old copies of pages
+        else:
+            self.damaged_rows += int((~sensible).sum())
         return rows if sensible.all() else Rows(buffer, *(column[sensible] for column in rows[1:]))
+
+    def _ascending(self, row_id, sensible):
+        """Return where the row ids go on behind the largest one before."""
+        lowest = np.iinfo(np.int64).min
+        ids = np.where(sensible, row_id, lowest)
+        before = np.maximum.accumulate(np.concatenate([[lowest if self.last_id is None else self.last_id], ids]))
+        self.last_id = int(before[-1])
+        return ids > before[:-1]
 
     def _leaf_groups(self, pages, depth):
         """Yield arrays of leaf page numbers below `pages`, all of one level."""
@@ -171,7 +196,7 @@ def _parse_cells(buffer, cell, page_end, largest):
     start = received_at + sizes[2]
     size = (types[3] - 12) >> 1
     inside = payload_size <= largest
-    sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (header_size < 60) & (field <= page_end)
+    sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (field == value) & (value <= page_end)
     sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
     return Rows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]), sensible
 
