@@ -125,6 +125,11 @@ class OffsetLikelihood:
 
     def __call__(self, offset, wander=0.0, time=100.0):
         """Return the value for an offset sd, a wander sd and its correlation time."""
+        logs, gram = self.whitened(offset, wander, time)
+        return logs + _profile(gram)
+
+    def whitened(self, offset, wander=0.0, time=100.0):
+        """Return log|V| and the Gram matrix of ``[design | residual]`` weighted with V^-1, `information` included."""
         variance = self.white + offset**2
         logs, gram = np.log(variance).sum(), self.information.copy()
         scaled = self.rows / np.sqrt(variance)[:, :, None]
@@ -137,7 +142,7 @@ class OffsetLikelihood:
             bands = self._inverse_kernel(decay, rest, wander)
             for axis in range(3):
                 logs += self._take_wander(gram, bands, self.rows[:, axis], variance[:, axis])
-        return logs + _profile(gram)
+        return logs, gram
 
     def _inverse_kernel(self, decay, rest, wander):
         """Return K^-1 / s^2 of the wander as lower bands, shape (2, n)."""
@@ -166,6 +171,8 @@ def _profile(gram):
     return 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() + gram[-1, -1] - solved @ solved
 
 
+TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
+"""Correlation times of MEMS biases: around 100 s, log-normal; a short session cannot tell them (field catalogue, section 6)."""
 WANDER_GAIN = 9.2
 """Fall of minus twice the log likelihood that a wander must win over independent offsets: chi-square, two degrees of freedom, 1 %."""
 OFFSET_GAIN = 2.7
@@ -185,7 +192,11 @@ def estimate_offsets(rows, white, times, sessions, information):
 
     """
     typical = float(np.sqrt(np.median(white)))
-    cost = OffsetLikelihood(rows, white, times, sessions, information)
+    likelihood = OffsetLikelihood(rows, white, times, sessions, information)
+
+    def cost(offset, wander=0.0, time=TYPICAL_TIME):
+        return likelihood(offset, wander, time) + (np.log(time / TYPICAL_TIME) / TIME_SPREAD)**2
+
     ratios = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
     costs = [cost(ratio * typical) for ratio in ratios]
     offset = _refine(cost, ratios[int(np.argmin(costs))] * typical, costs[0])

@@ -9,13 +9,13 @@ from imu_calibration.effects.base import SENSORS
 
 TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
-N_TIME_CONSTANTS = 10
+N_TIME_CONSTANTS = 12
 """Warm-ups are asked for at this many time constants."""
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """One effect that is asked about; a warm-up is asked for between each pair of neighbouring time constants."""
+    """One effect that is asked about; a warm-up is asked for at each time constant of a bank."""
 
     effect: object
     """The Effect."""
@@ -24,7 +24,7 @@ class Question:
     price: int
     """Number of parameters that it costs."""
     label: str
-    """Effect name, for a warm-up with the pair of time constants."""
+    """Effect name, for a warm-up with the number of the time constant."""
 
     @property
     def name(self):
@@ -92,7 +92,7 @@ def _why_not(effect, have, table, kinds, span):
 
 def time_constants(duration):
     """Return the time constants at which warm-ups are asked for, s."""
-    return np.geomspace(max(duration / 40, 5.0), 3.0 * duration, N_TIME_CONSTANTS)
+    return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, N_TIME_CONSTANTS)
 
 
 def extended_model(model, effects):

@@ -82,28 +82,32 @@ class Evidence:
         fall = self.loss(smaller) - self.loss(larger)
         return float(chi2.sf(max(fall, 0.0), len(larger) - len(smaller)))
 
-    def window_losses(self, used, values_of_fold=None):
-        """Return the loss of each window by sensor under fits that did not see its fold, dict sensor -> (k,); NaN where locked."""
+    def window_losses(self, used):
+        """
+        Return the loss of each window under fits that did not see its fold: two dicts sensor -> (k,), NaN where locked.
+
+        The first is the loss of the windows' means, the second that within the windows.
+        """
         index = np.asarray(used)
         reduced = np.zeros((len(self.parts), self.space.size + 1))
         reduced[:, -1] = 1.0
         for number in range(len(self.parts)):
             reduced[number, index] = -self.fit(used, number)[0]
         rows = self.fold >= 0
-        chosen = reduced[np.maximum(self.fold, 0)]
-        return {sensor: np.where(rows, self._losses(sensor, chosen), np.nan) for sensor in SENSORS}
+        found = {sensor: self._losses(sensor, reduced[np.maximum(self.fold, 0)]) for sensor in SENSORS}
+        return tuple({sensor: np.where(rows, found[sensor][part], np.nan) for sensor in SENSORS} for part in range(2))
 
     def _losses(self, sensor, reduced):
-        kind, total = self.space.lifted.kind, np.zeros(len(self.fold))
+        kind = self.space.lifted.kind
+        means, within = np.zeros(len(kind)), np.zeros(len(kind))
         for axis in range(3):
-            at = np.r_[self.space.index[sensor][axis], self.space.size]
-            weights = reduced[:, at]
-            total += np.einsum('ki,ki->k', self._white[sensor][axis], weights)**2
-            inside = np.einsum('kij,ki,kj->k', self.space.within[sensor][axis], weights, weights)
+            weights = reduced[:, np.r_[self.space.index[sensor][axis], self.space.size]]
+            means += np.einsum('ki,ki->k', self._white[sensor][axis], weights)**2
+            inside = np.einsum('kij,ki,kj->k', self.space.within[sensor][axis], weights, weights, optimize=True)
             for name in KINDS:
                 rows = kind == name
-                total[rows] += inside[rows] / self.noise[sensor].row_variance(name)[axis]
-        return total
+                within[rows] += inside[rows] / self.noise[sensor].row_variance(name)[axis]
+        return means, within
 
     @cached_property
     def _white(self):

@@ -1,6 +1,6 @@
 """The recording reduced to means and products of columns per window: all that candidates, folds and resamples need."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,8 @@ class Lifted:
     """Middle of each window, s, shape (k,)."""
     count: np.ndarray
     """Samples of each window, shape (k,)."""
+    duration: np.ndarray
+    """Length of each window, s, shape (k,)."""
     session: np.ndarray
     """Recording of each window, shape (k,)."""
     mean: dict
@@ -82,9 +84,21 @@ def lift(windows, table, model, values, constants, progress=None):
             progress(done / len(windows))
     fields = {name: np.array([d[name] for d in describe]) for name in describe[0]}
     return Lifted(model, values, np.asarray(constants), np.array([w.kind for w in windows]), fields['time'],
-                  np.array([len(w.time) for w in windows], float), np.zeros(len(windows), int),
+                  np.array([len(w.time) for w in windows], float), np.array([w.time[-1] - w.time[0] for w in windows]), np.zeros(len(windows), int),
                   {s: np.array(means[s]) for s in SENSORS}, {s: np.array(grams[s]) for s in SENSORS},
                   {s: (np.array([n[0] for n in noise[s]]), np.array([n[1] for n in noise[s]])) for s in SENSORS}, fields)
+
+
+def rebased(lifted, values):
+    """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
+    mean, gram = {}, {}
+    for sensor in SENSORS:
+        change = coefficients(lifted.model, sensor, values) - coefficients(lifted.model, sensor, lifted.values)
+        join = np.eye(lifted.mean[sensor].shape[1])
+        join[:len(change), -3:] -= change
+        mean[sensor] = lifted.mean[sensor] @ join
+        gram[sensor] = join.T @ lifted.gram[sensor] @ join
+    return replace(lifted, values=values, mean=mean, gram=gram)
 
 
 def _pieces(windows):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.diagnosis.wander import estimate_wander
+from imu_calibration.diagnosis.wander import NATURAL_WANDER, WanderSearch
 from imu_calibration.effects.base import SENSORS
 
 KINDS = ('spin', 'dynamic')
@@ -21,6 +21,8 @@ class SensorNoise:
     """Variance at low frequency over that of white noise, shape (3,)."""
     within: dict = field(default_factory=dict)
     """Kind -> factor on the variance of centred rows, shape (3,)."""
+    bend: dict = field(default_factory=dict)
+    """Kind -> part of that factor that serial correlation adds, at least 1."""
     offset_sd: float = 0.0
     """Standard deviation of an independent offset of each window."""
     wander_sd: float = 0.0
@@ -123,41 +125,76 @@ def solve_normal(normal, prior_sd, prior_shift, used=None):
     return values
 
 
-def saturated_noise(space):
+def saturated_noise(space, smooth):
     """
     Return sensor -> SensorNoise, estimated beside a model with every effect that is asked about.
 
     Windows' offsets and the wander come from restricted maximum likelihood on the means of the windows; the variance within moving
     windows from the residual, and its serial correlation from how far each window alone would like to bend the model.
+
+    Parameters
+    ----------
+    space : Space
+    smooth : dict
+        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, stays
+        in the model beside which the wander is estimated.
+
     """
     noise = {sensor: _first(space, sensor) for sensor in SENSORS}
     for _ in range(2):
         normal = normal_matrix(space, noise)
         values = solve_normal(normal, space.prior_sd, space.prior_mean)
-        noise = {sensor: replace(noise[sensor], within=_within_factors(space, sensor, noise[sensor], values)) for sensor in SENSORS}
-    return {sensor: with_wander(space, sensor, noise) for sensor in SENSORS}
+        noise = {sensor: _with_factors(space, sensor, noise[sensor], values) for sensor in SENSORS}
+    return {sensor: with_wander(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
 
 
-def with_wander(space, sensor, noise, used=None):
-    """Return the noise of a sensor with window offsets and wander estimated beside the parameters `used` (default all)."""
+def with_wander(space, sensor, noise, smooth):
+    """Return the noise of a sensor with window offsets and wander, estimated beside all effects but the superfluous smooth ones."""
     own = np.unique(np.concatenate(space.index[sensor]))
-    if used is not None:
-        own = np.intersect1d(own, used)
-    column = {parameter: place for place, parameter in enumerate(own)}
+    place = {parameter: k for k, parameter in enumerate(own)}
     lifted = space.lifted
     rows = np.zeros((len(lifted.kind), 3, len(own) + 1))
     for axis in range(3):
-        keep = [k for k, parameter in enumerate(space.index[sensor][axis]) if parameter in column]
-        places = [column[space.index[sensor][axis][k]] for k in keep]
-        rows[:, axis, places + [len(own)]] = space.mean[sensor][axis][:, keep + [-1]]
+        at = [place[parameter] for parameter in space.index[sensor][axis]]
+        rows[:, axis, at + [len(own)]] = space.mean[sensor][axis]
+    search = WanderSearch(rows, noise[sensor].mean_variance(lifted.kind, lifted.count), lifted.time, lifted.session,
+                          _known_otherwise(space, sensor, noise, own), natural_wander(noise[sensor], lifted))
+    options = [[place[k] for k in parameters] for parameters in smooth]
+    structural = [k for k in range(len(own)) if k not in {k for option in options for k in option}]
+    used = structural + _needed_smooth(search, structural, options)
+    shape = search.polished(search.best(used)[0], used)
+    return replace(noise[sensor], offset_sd=shape[0] * search.typical, wander_sd=shape[1] * search.typical, wander_time=shape[2])
+
+
+def natural_wander(noise, lifted):
+    """Return the standard deviation by which a bias wanders at least, by the white noise of the sensor."""
+    rate = np.median(lifted.count / np.maximum(lifted.duration, 1e-3))
+    return NATURAL_WANDER * float(np.sqrt(np.median(noise.white) / rate))
+
+
+SMOOTH_PRICE = 7.0
+"""Fall of minus twice the log likelihood per parameter that an effect smooth in time must win over wander."""
+
+
+def _needed_smooth(search, structural, options):
+    """Return the parameters of the smooth effects (none, one or two of them) that beat wander in likelihood."""
+    trials = [[]] + [[k] for k in range(len(options))]
+    costs = {(): search.best(structural, restricted=False)[1]}
+    for (k,) in trials[1:]:
+        costs[(k,)] = search.best(structural + options[k], restricted=False)[1] + SMOOTH_PRICE * len(options[k])
+    best = min(costs, key=costs.get)
+    return [k for number in best for k in options[number]]
+
+
+def _known_otherwise(space, sensor, noise, own):
+    """Return the normal matrix of what priors and the inside of windows tell about the parameters `own`."""
     at = np.r_[own, space.size]
     information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
-    information[:-1, :-1] += np.diag(1 / space.prior_sd[own]**2)
-    information[:-1, -1] += space.prior_mean[own] / space.prior_sd[own]**2
+    prior = 1 / space.prior_sd[own]**2
+    information[:-1, :-1] += np.diag(prior)
+    information[:-1, -1] += space.prior_mean[own] * prior
     information[-1, :-1] = information[:-1, -1]
-    variance = noise[sensor].mean_variance(lifted.kind, lifted.count)
-    found = estimate_wander(rows, variance, lifted.time, lifted.session, information)
-    return replace(noise[sensor], offset_sd=found[0], wander_sd=found[1], wander_time=found[2])
+    return information
 
 
 def _first(space, sensor):
@@ -176,9 +213,9 @@ def _first(space, sensor):
     return SensorNoise(*found, within={name: np.ones(3) for name in KINDS})
 
 
-def _within_factors(space, sensor, noise, values):
-    """Return kind -> factor on the white variance: the larger of the residual's variance and that of its projection on the columns."""
-    factors = {}
+def _with_factors(space, sensor, noise, values):
+    """Return the noise with factors within windows: the residual's variance, and more where it lies along the columns."""
+    factors, bends = {}, {}
     for name in KINDS:
         rows = space.lifted.kind == name
         if not rows.any():
@@ -190,9 +227,9 @@ def _within_factors(space, sensor, noise, values):
             squares = np.einsum('kij,i,j->k', products, reduced, reduced)
             dof = (space.lifted.count[rows] - 1).sum()
             factor[axis] = squares.sum() / dof / noise.white[axis]
-        bend = _bend(space, sensor, rows, values) / (factor * noise.white)
-        factors[name] = np.maximum(factor, 0.9) * np.clip(np.mean(bend), 1.0, None)
-    return factors
+        bends[name] = float(np.clip(np.mean(_bend(space, sensor, rows, values) / (factor * noise.white)), 1.0, None))
+        factors[name] = np.maximum(factor, 0.9) * bends[name]
+    return replace(noise, within=factors, bend=bends)
 
 
 def _bend(space, sensor, rows, values):

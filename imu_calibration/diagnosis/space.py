@@ -34,12 +34,25 @@ class Space:
         return len(self.names)
 
 
-def parameter_space(lifted):
-    """Return the Space of a lifted recording: the Jacobian of the coefficients joins columns to parameters."""
+def parameter_space(lifted, baseline):
+    """
+    Return the Space of a lifted recording: the Jacobian of the coefficients joins columns to parameters.
+
+    Parameters of the baseline count from the values of the linearisation; those of all other effects from nothing, so that an
+    effect that is left out is absent even where the columns were taken with it.
+
+    Parameters
+    ----------
+    baseline : SensorModel
+        The model that is diagnosed.
+
+    """
     model, n_bank = lifted.model, len(lifted.constants)
     names = list(model.param_names)
     prior, sd = model.prior()
-    shift = np.where(np.isfinite(prior), prior - lifted.values, 0.0)
+    in_baseline = np.concatenate([np.full(e.size, (e.sensor, e.name) in baseline.slices) for e in model.effects])
+    shift = np.where(in_baseline, prior - lifted.values, prior)
+    removed = np.where(in_baseline, 0.0, lifted.values)
     for short in ('accel', 'gyro'):
         names += [f'{short}_warm_up.{k}.{axis}' for k in range(n_bank) for axis in 'xyz']
     q_model, q = len(model.param_names), len(names)
@@ -57,6 +70,7 @@ def parameter_space(lifted):
             take = np.r_[np.arange(p + n_bank), p + n_bank + axis]
             join = np.zeros((len(take), len(used) + 1))
             join[:-1, :-1], join[-1, -1] = full[:, used], 1.0
+            join[:-1, -1] = full[:, :q_model] @ removed
             index[sensor].append(used)
             mean[sensor].append(lifted.mean[sensor][:, take] @ join)
             within[sensor].append(join.T @ (lifted.gram[sensor][:, take[:, None], take[None, :]] @ join))
@@ -78,7 +92,7 @@ def _jacobian(model, sensor, values):
 
 
 def questions(space, effects):
-    """Return a Question for each effect; a warm-up gives one per pair of neighbouring time constants."""
+    """Return a Question for each effect; a warm-up gives one per time constant of the bank."""
     model, constants = space.lifted.model, space.lifted.constants
     n_bank, q_model = len(constants), len(model.param_names)
     asked = []
@@ -88,6 +102,11 @@ def questions(space, effects):
             asked.append(Question(effect, tuple(range(part.start, part.stop)), effect.size, effect.name))
         elif special(effect) and effect.name.endswith('_bias_drift'):
             start = q_model + 3 * n_bank * SENSORS.index(effect.sensor)
-            for k in range(n_bank - 1):
-                asked.append(Question(effect, tuple(range(start + 3 * k, start + 3 * k + 6)), 4, f'{effect.name}@{k}'))
+            for k in range(n_bank):
+                asked.append(Question(effect, tuple(range(start + 3 * k, start + 3 * k + 3)), 4, f'{effect.name}@{k}'))
     return asked
+
+
+def smooth_parameters(asked):
+    """Return sensor -> list of the parameters of effects that are smooth in time: thermal bias and warm-ups."""
+    return {sensor: [q.parameters for q in asked if q.sensor == sensor and q.name.endswith(('_thermal_bias', '_bias_drift'))] for sensor in SENSORS}

@@ -1,0 +1,124 @@
+"""Saturation: a limit that outputs pile up at, and the samples that it spoils."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.sensor_model import coefficients, columns
+
+MARGIN = 4.0
+"""Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
+LEAST_CLIPPED = 4
+SHORTEST = 20
+"""A window with fewer samples left is dropped."""
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """A limit that the outputs of one sensor pile up at."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    level: float
+    """Largest output, m/s^2 or rad/s."""
+    level_sd: float
+    """Standard deviation of the level: the resolution with which outputs approach it."""
+    n_clipped: int
+    """Samples at the limit."""
+    n_expected: float
+    """Samples that the model expects beyond it, where there are none."""
+
+    @property
+    def p_value(self):
+        """Chance that no sample passes a level that so many are expected beyond (Poisson)."""
+        return float(np.exp(-self.n_expected))
+
+
+def predictions(windows, table, model, values):
+    """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
+    found = []
+    for window in windows:
+        temperature = window.temperature_c
+        if window.kind == 'static' and temperature is not None:
+            temperature = np.array([temperature.mean()])
+        found.append(tuple(columns(model, s, table, window.motion, temperature) @ coefficients(model, s, values) for s in SENSORS))
+    return found
+
+
+def measured(window, sensor):
+    """Return the measured output of a sensor in a window, shape (n, 3)."""
+    return window.force_s if sensor == 'accelerometer' else window.rate_s
+
+
+def may_be_clipped(windows, sensor):
+    """Return whether several samples share the largest output exactly, and few come close below it."""
+    size = np.concatenate([np.abs(measured(w, sensor)).max(axis=1) for w in windows])
+    level = size.max(initial=0.0)
+    at = size >= level * (1 - 1e-12)
+    below = size[~at]
+    if at.sum() < LEAST_CLIPPED or not len(below):
+        return False
+    gap = level - below.max()
+    near = (below > level - max(2 * gap, 1e-3 * level)).sum() if gap > 0 else 0
+    return bool(at.sum() >= LEAST_CLIPPED and (at.sum() > 3 * near or at.sum() > 0.2 * near and at.sum() > 20) and level > 0)
+
+
+def find_saturation(windows, predicted, noise_sd, sensor):
+    """
+    Return the `Saturation` of a sensor, or None.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+    predicted : list of (force, rate)
+        What a model without limit predicts (`predictions`).
+    noise_sd : array, shape (3,)
+        Standard deviation of single samples.
+
+    """
+    if not may_be_clipped(windows, sensor):
+        return None
+    output = np.concatenate([measured(w, sensor) for w in windows])
+    expected = np.concatenate([np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape) for w, p in zip(windows, predicted)])
+    level = np.abs(output).max()
+    clipped = np.abs(output) >= level * (1 - 1e-12)
+    beyond = norm.sf((level - np.abs(expected)) / noise_sd)
+    n_expected = float(beyond.sum())
+    agree = float(beyond[clipped].sum())
+    if n_expected < 3 or agree < 0.5 * clipped.sum() * 0.5:
+        return None
+    return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected)
+
+
+def without_clipped(windows, predicted, levels, noise_sd):
+    """
+    Return the windows without samples that a limit spoils: those at it, and those predicted within a few standard deviations of it.
+
+    Parameters
+    ----------
+    levels : dict
+        Sensor -> level.
+    noise_sd : dict
+        Sensor -> (3,).
+
+    """
+    kept = []
+    for window, pair in zip(windows, predicted):
+        good = np.ones(len(window.time), bool)
+        for sensor, level in levels.items():
+            near = np.abs(pair[SENSORS.index(sensor)]) > level - MARGIN * noise_sd[sensor]
+            at = np.abs(measured(window, sensor)) >= level * (1 - 1e-12)
+            good &= ~(near | at).any(axis=1)
+        if good.all():
+            kept.append(window)
+        elif window.kind != 'static' and good.sum() >= SHORTEST:
+            kept.append(_selected(window, good))
+    return kept
+
+
+def _selected(window, index):
+    temperature = None if window.temperature_c is None else window.temperature_c[index]
+    return replace(window, stamp_ns=window.stamp_ns[index], time=window.time[index], force_s=window.force_s[index], rate_s=window.rate_s[index],
+                   motion=window.motion.select(index), temperature_c=temperature)
