@@ -1,0 +1,53 @@
+"""Diagnostics: what a node knows about itself, once per second on /diagnostics and at once when it changes."""
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+PERIOD = 1.0
+"""Seconds between two messages; diagnostic aggregators call a status stale after five."""
+
+
+def make_status(level, name, message, values=None, hardware_id=''):
+    """
+    Return one DiagnosticStatus.
+
+    Parameters
+    ----------
+    level : bytes
+        `OK`, `WARN`, `ERROR` or `STALE`.
+    name : str
+        What the status is about; the publisher puts the node's name in front.
+    message : str
+        One line.
+    values : dict, optional
+        Further details: key -> anything that prints.
+    hardware_id : str
+        The sensor, usually its frame_id.
+
+    """
+    pairs = [KeyValue(key=str(key), value=value if isinstance(value, str) else str(value)) for key, value in (values or {}).items()]
+    return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
+
+
+class DiagnosticsPublisher:
+    """
+    Publishes what `collect` returns (a list of DiagnosticStatus) every `PERIOD`, and on `publish_now`.
+
+    The timer runs on the steady clock, so that diagnostics go on while simulated time stands still.
+    """
+
+    def __init__(self, node, collect):
+        from rclpy.clock import Clock
+        from rclpy.clock_type import ClockType
+        self._node, self._collect = node, collect
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._timer = node.create_timer(PERIOD, self.publish_now, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish_now(self):
+        """Publish the present state."""
+        array = DiagnosticArray(status=self._collect())
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        prefix = self._node.get_fully_qualified_name().lstrip('/')
+        for status in array.status:
+            status.name = f'{prefix}: {status.name}'
+        self._publisher.publish(array)
