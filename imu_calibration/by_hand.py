@@ -11,13 +11,16 @@ from imu_calibration.by_hand_system import (
     ACCELEROMETER, COMPONENTS, N_PARAMS, NOMINAL, PARAM_NAMES, SENSITIVITY, Poses, State, norm_rows, unpack)
 from imu_calibration.effects import find_effect
 from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.noise import STANDARD_GRAVITY
 from imu_calibration.settings import setting
 from imu_calibration.still_search import find_still
 
-STANDARD_GRAVITY = 9.80665
-"""m/s^2; what is taken when the site is not known."""
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
+FIXED = ('accelerometer.matrix.xy', 'accelerometer.matrix.xz', 'accelerometer.matrix.yz')
+"""Zero by the choice of axes."""
+PUBLISHED = (*PARAM_NAMES[:3], *(f'accelerometer.matrix.{a}{b}' for a in 'xyz' for b in 'xyz'), *PARAM_NAMES[9:])
+"""Order of the parameters in the result."""
 POSES_LEAST = 4
 """Fewer attitudes leave even the accelerometer's biases to the prior."""
 G_SENSITIVITY_P = 1e-3
@@ -201,10 +204,12 @@ def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, toler
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
     advice = missing_motion(found.factor, found.state.values, statuses, PARAM_NAMES, modelled, priors, goals, gravity, pose_sd, turn_sd)
     statistics = {**statistics, **evidence, **_statistics(found, poses, turns, gravity)}
-    index = np.flatnonzero(modelled)
-    return HandCalibration(tuple(PARAM_NAMES[k] for k in index), found.state.values[index], found.covariance[np.ix_(index, index)],
-                           tuple(statuses[k] for k in index), goals[index], priors[index], gravity, dict(GAUGE), advice, statistics, poses,
-                           found.state)
+    names = [name for name in PUBLISHED if name in FIXED or modelled[PARAM_NAMES.index(name)]]
+    index = np.array([PARAM_NAMES.index(name) if name not in FIXED else -1 for name in names])
+    covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
+    return HandCalibration(tuple(names), np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
+                           tuple((*statuses, 'determined')[k] for k in index), np.append(goals, goals[3])[index],
+                           np.append(priors, 0.0)[index], gravity, dict(GAUGE), advice, statistics, poses, found.state)
 
 
 def _from_catalogue(tolerances):
