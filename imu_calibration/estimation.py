@@ -7,7 +7,7 @@ import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
-from imu_calibration.sensor_model import coefficients
+from imu_calibration.sensor_model import coefficient_jacobian, coefficients
 from imu_calibration.window_noise import WindowNoise, estimate_offsets, sessions_of, white_noise, whiten
 from imu_calibration.window_statistics import triangular
 
@@ -125,7 +125,7 @@ def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
     values = problem.start()
     noises = noise or problem.first_noise(values)
     for _ in range(2):
-        values = problem.minimise(values, noises, _free(model, None))
+        values = problem.minimise(values, noises, _free(model, None), enough=0.01)
         if noise is not None:
             break
         noises = problem.update_noise(values, noises)
@@ -206,21 +206,6 @@ class _Problem:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
         return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
 
-    def jacobian(self, sensor, values):
-        """Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params)."""
-        step, parts = 1e-30, []
-        own = np.concatenate([np.full(e.size, e.sensor in (sensor, 'reference')) for e in self.model.effects])
-        zero = None
-        for index in range(len(values)):
-            if not own[index]:
-                parts.append(zero)
-                continue
-            moved = values.astype(complex)
-            moved[index] += 1j * step
-            parts.append(coefficients(self.model, sensor, moved).imag / step)
-        shape = next(part.shape for part in parts if part is not None)
-        return np.stack([np.zeros(shape) if part is None else part for part in parts], axis=2)
-
     def mean_variance(self, noise):
         """Return the variance of the window means by the noise within, shape (n_windows, 3)."""
         return noise.white_variance * noise.inflation / self.counts[:, None]
@@ -243,23 +228,23 @@ class _Problem:
         """Return residual rows and their Jacobian over both sensors and all axes, without the prior."""
         residuals, jacobians = [], []
         for sensor in SENSORS:
-            c, dc = coefficients(self.model, sensor, values), self.jacobian(sensor, values)
+            c, dc = coefficients(self.model, sensor, values), coefficient_jacobian(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
                 residuals.append(factor[:, :-1] @ c[:, axis] - factor[:, -1])
                 jacobians.append(factor[:, :-1] @ dc[:, axis])
         return np.concatenate(residuals), np.concatenate(jacobians)
 
-    def minimise(self, values, noises, free):
-        """Gauss-Newton with step halving on the triangular factors; the prior is a set of rows."""
+    def minimise(self, values, noises, free, enough=1e-7):
+        """Gauss-Newton with step halving on the triangular factors, until steps are below `enough` standard deviations."""
         factors = {s: self.systems(s, noises[s]) for s in SENSORS}
         cost = np.inf
         for _ in range(40):
             residual, jacobian = self._with_prior(values, factors)
             step = _scaled_lstsq(jacobian[:, free], -residual)
             moved, cost, residual_new = self._halve(values, step, free, factors, residual @ residual)
-            sd_steps = np.abs(step) * np.linalg.norm(jacobian[:, free], axis=0)
+            sd_steps = np.abs(step) * np.sqrt((jacobian[:-len(self.prior.root), free]**2).sum(axis=0) + 1 / self.prior.sd[free]**2)
             values = moved
-            if np.max(sd_steps, initial=0.0) < 1e-7 * max(1.0, np.sqrt(cost)):
+            if np.max(sd_steps, initial=0.0) < enough * max(1.0, 1e-7 * np.sqrt(cost)):
                 break
         return values
 
@@ -328,7 +313,7 @@ class _Problem:
 
     def _linearised(self, sensor, values, noise, noises):
         """Return mean rows ``[design | residual]`` in the parameters, and the Gram matrix of what else is known of them."""
-        dc = self.jacobian(sensor, values)
+        dc = coefficient_jacobian(self.model, sensor, values)
         own = np.flatnonzero(np.any(dc != 0, axis=(0, 1)))
         dc, root = dc[:, :, own], self.prior.root[:, own]
         means = self.means[sensor]

@@ -7,7 +7,7 @@ import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.reference import Reference
-from imu_calibration.sensor_model import coefficients
+from imu_calibration.sensor_model import coefficient_jacobian
 from imu_calibration.effects.regressors import GROUPS
 
 DEG = np.pi / 180
@@ -140,7 +140,7 @@ def added_information(model, values, noise, motion, gravity):
 
 def _piece_information(model, sensor, values, noise, piece, point):
     design = np.concatenate([_group(name, width, piece, point) for name, width in model.groups(sensor)], axis=1)
-    dc = _coefficient_jacobian(model, sensor, values)
+    dc = coefficient_jacobian(model, sensor, values)
     static = len(piece) == 1
     count = 500.0 if static else 2.0 * len(piece)
     mean = design.mean(axis=0)
@@ -157,15 +157,6 @@ def _piece_information(model, sensor, values, noise, piece, point):
 def _group(name, width, piece, point):
     thermal = name.endswith('temperature') and piece.temperature_c is None
     return np.zeros((len(piece), width)) if thermal or name not in GROUPS else GROUPS[name](piece, point)
-
-
-def _coefficient_jacobian(model, sensor, values):
-    parts = []
-    for index in range(len(values)):
-        moved = values.astype(complex)
-        moved[index] += 1e-30j
-        parts.append(coefficients(model, sensor, moved).imag / 1e-30)
-    return np.stack(parts, axis=2)
 
 
 def tolerance_scaled_singular_values(information, tolerances):

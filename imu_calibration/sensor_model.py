@@ -9,7 +9,7 @@ from imu_calibration import effects as catalogue_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.regressors import GROUPS, WIDTH
 from imu_calibration.errors import InputError
-from imu_calibration.reference import Reference
+from imu_calibration.reference import Reference, lever_matrix
 from imu_calibration.turntable import reference_motion
 
 NAMED_MODELS = {
@@ -20,6 +20,20 @@ NAMED_MODELS = {
     'extended_rate': ('bias', 'matrix', 'gyro_rate_product'),
 }
 """Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Columns of one sensor: which effects make them and where their coefficients stand."""
+
+    effects: tuple
+    """Effects that concern the sensor."""
+    rows: dict
+    """Group name -> slice of the columns."""
+    width: int
+    """Number of columns."""
+    point: dict
+    """Where the columns were linearised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +111,28 @@ class SensorModel:
                 names.setdefault(group, WIDTH[group])
             if effect.warp is not None:
                 names['warp:' + effect.name] = 3 * effect.size
+                if sensor == 'accelerometer' and effect.derivative is None and self.has_arms:
+                    names['warp_lever:' + effect.name] = 9 * effect.size
         return list(names.items())
+
+    @property
+    def has_arms(self):
+        """Whether the accelerometers have lever arms, whose terms a warp changes too."""
+        return bool({'accel_size_effect', 'lever_arm'} & set(self.accelerometer))
+
+    def layout(self, sensor):
+        """Return where the coefficients of each group stand (worked out once per sensor)."""
+        if sensor not in self._layouts:
+            rows, start = {}, 0
+            for name, width in self.groups(sensor):
+                rows[name] = slice(start, start + width)
+                start += width
+            self._layouts[sensor] = Layout(tuple(self.concerning(sensor)), rows, start, self.full_point())
+        return self._layouts[sensor]
+
+    @cached_property
+    def _layouts(self):
+        return {}
 
     def warp_point(self, effect):
         """Return the values at which `effect`'s columns are taken."""
@@ -201,46 +236,97 @@ def columns(model, sensor, table, motion, temperature_c=None, ref=None):
     ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
     if ref.temperature_c is None and any(name.endswith('temperature') for name, _ in model.groups(sensor)):
         raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
-    point = model.full_point()
-    warps = {'warp:' + e.name: e for e in model.concerning(sensor) if e.warp is not None}
-    parts = [warp_columns(model, warps[name], sensor, table, motion, ref) if name in warps else GROUPS[name](ref, point)
-             for name, _ in model.groups(sensor)]
+    point, parts = model.full_point(), []
+    warps = {e.name: e for e in model.concerning(sensor) if e.warp is not None}
+    for name, _ in model.groups(sensor):
+        kind, _, owner = name.partition(':')
+        if kind == 'warp':
+            parts += warp_columns(model, warps[owner], sensor, table, motion, ref)
+        elif kind != 'warp_lever':
+            parts.append(GROUPS[name](ref, point))
     return np.concatenate(parts, axis=1)
 
 
 def warp_columns(model, effect, sensor, table, motion, ref):
-    """Return d(true input)/d(parameter) for each parameter of a warp, shape (n, 3 size)."""
+    """
+    Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
+    """
     if effect.derivative is not None:
-        return effect.derivative(ref)
-    at, parts = model.warp_point(effect), []
+        return [effect.derivative(ref)]
+    inputs, levers = [], []
+    for above, below, width in _central_steps(effect, model.warp_point(effect)):
+        high, low = (warped_reference(model, sensor, table, motion, values={effect.name: at}) for at in (above, below))
+        inputs.append((getattr(high, INPUT_OF[sensor]) - getattr(low, INPUT_OF[sensor])) / width)
+        if sensor == 'accelerometer' and model.has_arms:
+            turns = [lever_matrix(end.rate_s, end.alpha_s).reshape(-1, 9) for end in (high, low)]
+            levers.append((turns[0] - turns[1]) / width)
+    return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
+
+
+def _central_steps(effect, at):
+    """Yield (values above, values below, distance) for the derivative by each parameter; time constants stay positive."""
     for index in range(effect.size):
         step = np.zeros(effect.size)
         step[index] = effect.step
+        below = at - step
         if effect.components[index] == 'time_constant':
             step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
             below = at - step if at[index] > 0 else at
-        else:
-            below = at - step
-        above = at + step
-        high, low = (getattr(warped_reference(model, sensor, table, motion, values={effect.name: v}), INPUT_OF[sensor]) for v in (above, below))
-        parts.append((high - low) / (above - below)[index])
-    return np.concatenate(parts, axis=1)
+        yield at + step, below, (at + step - below)[index]
 
 
 def coefficients(model, sensor, values):
     """Return the coefficients of the columns for a parameter vector (real or complex), shape (n_columns, 3)."""
-    of_sensor, point = model.values_of(sensor, values), model.full_point()
-    groups = model.groups(sensor)
-    total = {name: 0.0 for name, _ in groups}
-    matrix = of_sensor['matrix'].reshape(3, 3)
-    for effect in model.concerning(sensor):
-        if effect.warp is not None:
-            change = of_sensor[effect.name] - model.warp_point(effect)
-            total['warp:' + effect.name] = (change[:, None, None] * matrix.T[None]).reshape(-1, 3)
-        elif effect.coefficients is not None:
-            for group, block in effect.coefficients(of_sensor, point).items():
-                total[group] = total[group] + block
-    return np.concatenate([np.broadcast_to(total[name], (width, 3)) for name, width in groups])
+    of_sensor, layout = model.values_of(sensor, values), model.layout(sensor)
+    total = np.zeros((layout.width, 3), values.dtype)
+    for effect in layout.effects:
+        _add_coefficients(total, model, effect, of_sensor, layout)
+    return total
+
+
+def _add_coefficients(total, model, effect, of_sensor, layout):
+    """Add one effect's coefficients in place."""
+    if effect.warp is not None:
+        change = of_sensor[effect.name] - model.warp_point(effect)
+        matrix = of_sensor['matrix'].reshape(3, 3)
+        total[layout.rows['warp:' + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(-1, 3)
+        if 'warp_lever:' + effect.name in layout.rows:
+            products = (matrix[:, :, None] * _all_arms(of_sensor)[:, None, :]).reshape(3, 9).T
+            total[layout.rows['warp_lever:' + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
+    elif effect.coefficients is not None:
+        for group, block in effect.coefficients(of_sensor, layout.point).items():
+            total[layout.rows[group]] += block
+
+
+def _all_arms(of_sensor):
+    """Return the arms from the reference point, shape (3, 3)."""
+    arms = of_sensor['accel_size_effect'].reshape(3, 3) if 'accel_size_effect' in of_sensor else np.zeros((3, 3))
+    return arms + of_sensor['lever_arm'] if 'lever_arm' in of_sensor else arms
+
+
+SHARED = ('matrix', 'accel_size_effect', 'lever_arm')
+"""Effects whose values enter the coefficients of others."""
+
+
+def coefficient_jacobian(model, sensor, values):
+    """
+    Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params).
+
+    Besides its own values an effect's coefficients depend on the sensor's matrix and, for warps, on its arms.
+    """
+    layout, step = model.layout(sensor), 1e-30
+    jacobian = np.zeros((layout.width, 3, len(values)))
+    for effect in layout.effects:
+        concerned = layout.effects if effect.name in SHARED else (effect,)
+        part = model.slices[effect.sensor, effect.name]
+        for index in range(part.start, part.stop):
+            moved = values.astype(complex)
+            moved[index] += 1j * step
+            of_sensor, total = model.values_of(sensor, moved), np.zeros((layout.width, 3), complex)
+            for other in concerned:
+                _add_coefficients(total, model, other, of_sensor, layout)
+            jacobian[:, :, index] = total.imag / step
+    return jacobian
 
 
 def predict(model, values, table, motion, temperature_c=None):
