@@ -179,7 +179,7 @@ def _open_source(path):
     try:
         return GeneralFile(path) if path.suffix == '.bag' else Rosbag2(path)
     except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
-        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file), got: {error}; '
+        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file), got: {" ".join(str(error).split())}; '
                          'check the path, or record again') from error
 
 
