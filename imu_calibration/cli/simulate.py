@@ -1,5 +1,6 @@
 """``imu_calibration simulate``: a bag from a simulated session, and the truth beside it."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -33,8 +34,11 @@ def add_arguments(parser):
     parser.add_argument('--duration', type=float, help='wanted length, s')
     parser.add_argument('--imu-rate', type=float, default=100.0, help='Hz, default 100')
     parser.add_argument('--joint-rate', type=float, default=100.0, help='Hz, default 100')
+    parser.add_argument('--encoder-resolution-deg', type=float, default=0.0, help='step of the joint positions, deg, default none')
+    parser.add_argument('--stamp-jitter-us', type=float, default=0.0, help='standard deviation of the IMU stamps, microseconds, default none')
     parser.add_argument('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
     parser.add_argument('--storage', choices=('sqlite3', 'mcap'), default='sqlite3')
+    parser.add_argument('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
 def run(options):
@@ -45,10 +49,12 @@ def run(options):
     if profile.table is not None:
         table = Table.from_mapping(profile.table)
     model, values = _truth(options, table)
-    settings = SimulationOptions(options.imu_rate, options.joint_rate, GRADES[options.grade].noise,
+    noise = replace(GRADES[options.grade].noise, encoder_resolution=math.radians(options.encoder_resolution_deg), stamp_jitter=options.stamp_jitter_us * 1e-6)
+    settings = SimulationOptions(options.imu_rate, options.joint_rate, noise,
                                  temperature_start_c=25.0 if options.temperature or 'thermal' in ' '.join(options.effect) else None)
     imu, joints, temperature = simulate(model, values, table, profile, settings, options.seed)
-    write_session(options.output, imu, joints, temperature, storage=options.storage)
+    packed = {} if options.compression == 'none' else {'compression': options.compression}
+    write_session(options.output, imu, joints, temperature, storage=options.storage, **packed)
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), ('determined',) * len(values), settings.frame_id,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': options.seed, 'profile': options.profile}})
     files.write_text(f'{options.output}/truth.yaml', documents.calibration_to_text(truth))
