@@ -5,7 +5,7 @@ import struct
 import numpy as np
 
 from msg_adapters.imu import FIELDS, N_DOUBLES
-from msg_adapters.stamps import align, from_ns
+from msg_adapters.stamps import from_ns
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN = (0.0,) * 9
@@ -71,7 +71,7 @@ def _string(text):
 
 def _padded(data, size):
     """Pad bytes that stand behind the 8 bytes of a stamp, so that their end is aligned."""
-    return data.ljust(align(len(data), size), b'\0')
+    return data + bytes(-len(data) % size)
 
 
 def _table(stamp_ns, head, pieces):

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.samples import ImuSamples
 from msg_adapters.layout import Layout, overlapping
-from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, align, byte_order, header_stamp_ns, to_ns
+from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 
@@ -16,8 +16,6 @@ FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s':
           'force_s': slice(25, 28), 'force_cov': slice(28, 37)}
 """Places in the 37 doubles behind the header: x, y, z, w and row-major 3 x 3 covariances."""
 
-_FRAME = ENCAPSULATION_SIZE + 8
-_HEADERS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _DOUBLES = {order: struct.Struct(f'{order}{N_DOUBLES}d') for order in '<>'}
 
 
@@ -42,8 +40,8 @@ def parse_imu(data):
         When the bytes are not a plain CDR Imu message.
 
     """
-    order, frame, body, sec, nanosec = _open_message(data)
-    return ImuMessage(to_ns(sec, nanosec), frame.decode(errors='replace'), _DOUBLES[order].unpack_from(data, body))
+    header, body = _open_message(data)
+    return ImuMessage(header.stamp_ns, header.frame.decode(errors='replace'), _DOUBLES[header.order].unpack_from(data, body))
 
 
 def patch_imu(data, frame_id=None, **fields):
@@ -60,8 +58,9 @@ def patch_imu(data, frame_id=None, **fields):
         Values by the names of `FIELDS`; covariances as 3 x 3 or as nine numbers.
 
     """
-    order, frame, body, _, _ = _open_message(data)
-    if frame_id is not None and frame_id.encode() != frame:
+    header, body = _open_message(data)
+    order = header.order
+    if frame_id is not None and frame_id.encode() != header.frame:
         data, body = _reframed(data, order, body, frame_id.encode())
     patched = bytearray(data)
     for name, value in fields.items():
@@ -73,10 +72,10 @@ def patch_imu(data, frame_id=None, **fields):
 
 def find_imu_layout(data):
     """Return the Layout of a serialized Imu message (raises MessageError)."""
-    order, frame, body, _, _ = _open_message(data)
+    header, body = _open_message(data)
     offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
-    fixed = ((0, 2), (_FRAME, _FRAME + 4 + struct.unpack_from(order + 'I', data, _FRAME)[0]))
-    return Layout(order, len(data), bytes(data), fixed, offsets, (frame.decode(errors='replace'),))
+    fixed = ((0, 2), (FRAME_OFFSET, header.end))
+    return Layout(header.order, len(data), bytes(data), fixed, offsets, (header.frame.decode(errors='replace'),))
 
 
 def decode_imu(layout, packed):
@@ -118,8 +117,8 @@ def patch_imu_group(layout, packed, fields, frame_id=None):
         return table
     body = layout.offsets['orientation'][0]
     sample, new_body = _reframed(layout.sample, layout.order, body, frame_id.encode())
-    head = np.broadcast_to(np.frombuffer(sample[_FRAME:new_body], np.uint8), (len(table), new_body - _FRAME))
-    return np.concatenate([table[:, :_FRAME], head, table[:, body:]], axis=1)
+    head = np.broadcast_to(np.frombuffer(sample[FRAME_OFFSET:new_body], np.uint8), (len(table), new_body - FRAME_OFFSET))
+    return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
 
 
 def imu_row(message):
@@ -139,24 +138,16 @@ def _reading(vector, covariance):
 
 
 def _open_message(data):
-    """Check the bytes and return (byte order, frame_id bytes, offset of the doubles, sec, nanosec)."""
-    order = byte_order(data)
-    if len(data) < _FRAME + 4:
-        raise MessageError(f'an Imu message has at least {_FRAME + 4} bytes, got {len(data)}')
-    sec, nanosec, length = _HEADERS[order].unpack_from(data, ENCAPSULATION_SIZE)
-    body = _body_offset(length)
+    """Check the bytes and return (Header, offset of the doubles)."""
+    header = open_header(data)
+    body = aligned(header.end, 8)
     if len(data) < body + 8 * N_DOUBLES:
-        raise MessageError(f'an Imu message with a frame_id of {length} bytes has {body + 8 * N_DOUBLES} bytes, got {len(data)}')
-    return order, bytes(data[_FRAME + 4:_FRAME + 4 + max(length - 1, 0)]), body, sec, nanosec
-
-
-def _body_offset(length):
-    """Offset of the doubles when the frame_id takes `length` bytes with its closing zero."""
-    return ENCAPSULATION_SIZE + align(_FRAME + length, 8)
+        raise MessageError(f'an Imu message with its doubles at byte {body} has {body + 8 * N_DOUBLES} bytes, got {len(data)}')
+    return header, body
 
 
 def _reframed(data, order, body, frame):
     """Return the message with another frame_id and the new offset of its doubles."""
-    new_body = _body_offset(len(frame) + 1)
-    head = bytes(data[:_FRAME]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'
+    new_body = aligned(FRAME_OFFSET + 4 + len(frame) + 1, 8)
+    head = bytes(data[:FRAME_OFFSET]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'
     return head.ljust(new_body, b'\0') + bytes(data[body:]), new_body

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.samples import JointSamples
 from msg_adapters.layout import Layout
-from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, UnusableMessage, align, byte_order, header_stamp_ns
+from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, header_stamp_ns, open_header
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
@@ -24,11 +24,14 @@ def find_joint_layout(data):
         When the bytes are not a plain CDR JointState.
 
     """
-    order = byte_order(data)
+    header = open_header(data)
+    walk = _Walk(bytes(data), header)
     try:
-        return _walk(bytes(data), order)
-    except (struct.error, IndexError):
+        names = tuple(walk.string() for _ in range(walk.count()))
+        offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
+    except struct.error:
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
+    return Layout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
 
 
 def decode_joints(layout, packed, joint_names):
@@ -75,38 +78,37 @@ def joint_columns(names, n_positions, joint_names):
     return [names.index(name) for name in joint_names]
 
 
-def _walk(data, order):
-    """Step through header, names and the three sequences; raises struct.error or IndexError at the end of the data."""
-    count_at = struct.Struct(order + 'I')
-    start = position = ENCAPSULATION_SIZE + 8
-    fixed = [(0, 2)]
+class _Walk:
+    """Steps through a message; raises struct.error at the end of the data."""
 
-    def skip_string(position):
-        length, = count_at.unpack_from(data, position)
-        fixed.append((position, position + 4 + length))
-        if position + 4 + length > len(data):
-            raise IndexError
-        return data[position + 4:position + 4 + max(length - 1, 0)].decode(errors='replace'), position + 4 + length
+    def __init__(self, data, header):
+        self.data, self.position = data, header.end
+        self.number = struct.Struct(header.order + 'I')
+        self.fixed = [(0, 2), (FRAME_OFFSET, header.end)]
 
-    def aligned(position, size):
-        return ENCAPSULATION_SIZE + align(position - ENCAPSULATION_SIZE, size)
+    def count(self):
+        """Read a count or the length of a string, which every message of the layout must share."""
+        start = aligned(self.position, 4)
+        self.position = start + 4
+        self.fixed.append((start, self.position))
+        return self.number.unpack_from(self.data, start)[0]
 
-    _, position = skip_string(start)
-    position = aligned(position, 4)
-    n_names, = count_at.unpack_from(data, position)
-    fixed.append((position, position + 4))
-    position, names = position + 4, []
-    for _ in range(n_names):
-        name, position = skip_string(aligned(position, 4))
-        names.append(name)
-    offsets = {}
-    for field in ('position', 'velocity', 'effort'):
-        position = aligned(position, 4)
-        count, = count_at.unpack_from(data, position)
-        fixed.append((position, position + 4))
-        position = aligned(position + 4, 8) if count else position + 4
-        offsets[field] = (position, count)
-        position += 8 * count
-        if position > len(data):
-            raise IndexError
-    return Layout(order, len(data), data, tuple(fixed), offsets, tuple(names))
+    def string(self):
+        """Read a string, which every message of the layout must share."""
+        length = self.count()
+        start = self._skip(length)
+        self.fixed.append((start, self.position))
+        return self.data[start:start + max(length - 1, 0)].decode(errors='replace')
+
+    def doubles(self):
+        """Step over a sequence of doubles; return (offset, count)."""
+        count = self.count()
+        if count:
+            self.position = aligned(self.position, 8)
+        return self._skip(8 * count), count
+
+    def _skip(self, size):
+        start, self.position = self.position, self.position + size
+        if self.position > len(self.data):
+            raise struct.error
+        return start

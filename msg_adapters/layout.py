@@ -137,10 +137,12 @@ def is_any(values, wanted):
 
 
 def _checks(fixed, sample):
-    """Cover the byte ranges by 8-byte words inside the message: (offset, mask, expected value)."""
+    """Cover the fixed bytes by few 8-byte words inside the message: (offset, mask, expected value)."""
+    left = np.zeros(len(sample), dtype=bool)
     for first, last in fixed:
-        for offset in range(first, last, 8):
-            begin = min(offset, len(sample) - 8)
-            mask = bytes(0xff if first <= begin + k < last else 0 for k in range(8))
-            mask = int.from_bytes(mask, 'little')
-            yield begin, np.uint64(mask), np.uint64(int.from_bytes(sample[begin:begin + 8], 'little') & mask)
+        left[first:last] = True
+    while left.any():
+        offset = min(int(np.argmax(left)), len(sample) - 8)
+        mask = sum(0xff << 8 * k for k in range(8) if left[offset + k])
+        left[offset:offset + 8] = False
+        yield offset, np.uint64(mask), np.uint64(int.from_bytes(sample[offset:offset + 8], 'little') & mask)

@@ -3,6 +3,7 @@
 import os
 import struct
 from collections import Counter
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -89,16 +90,18 @@ class McapFile(StorageFile):
             ids.setdefault(channel.topic, []).append(number)
         return ids
 
-    def _stretches(self):
-        for buffer, messages in read_ahead(self._joined_pieces()):
-            packed = Packed(buffer, messages.start, messages.size)
-            yield Stretch(messages.channel, lambda index, packed=packed: (index, packed.select(index)),
-                          partial(log_times, buffer, messages))
+    def _stretches(self, topics):
+        wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
+        with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
+            for buffer, messages in pieces:
+                packed = Packed(buffer, messages.start, messages.size)
+                yield Stretch(messages.channel, lambda index, packed=packed: (index, packed.select(index)),
+                              partial(log_times, buffer, messages))
 
-    def _joined_pieces(self):
+    def _joined_pieces(self, wanted):
         """Join pieces to stretches."""
         waiting, n_waiting = [], 0
-        for piece in self._pieces():
+        for piece in self._pieces(wanted):
             waiting.append(piece)
             n_waiting += len(piece[0])
             if n_waiting >= STRETCH_BYTES:
@@ -107,20 +110,21 @@ class McapFile(StorageFile):
         if waiting:
             yield _join(waiting)
 
-    def _pieces(self):
-        """Yield (buffer, Messages) for each chunk and each run of messages outside of chunks."""
+    def _pieces(self, wanted):
+        """Yield (buffer, Messages) for each chunk with wanted channels and each run of messages outside of chunks."""
         for opcode, position, length, walked in self._records():
             if opcode == CHUNK:
-                yield from self._chunk(position, length)
+                indexes = self._indexes_behind(position + length)
+                if not indexes or any(number in wanted for number, _ in indexes):
+                    yield from self._chunk(position, length, indexes)
             elif opcode == MESSAGE:
                 self._register(walked[2])
                 yield walked[:2]
             elif opcode in (SCHEMA, CHANNEL):
                 self._register([(opcode, self._read(position, length))])
 
-    def _chunk(self, position, length):
+    def _chunk(self, position, length, indexes):
         content = memoryview(self._read(position, length))
-        indexes = [parse_message_index(self._read(at, size)) for at, size in self._indexes_behind(position + length)]
         try:
             records, whole = unpack_chunk(content, decompress_chunk)
         except McapDamage as damage:
@@ -169,13 +173,17 @@ class McapFile(StorageFile):
         return following
 
     def _indexes_behind(self, position):
-        """Yield (position, length) of the MessageIndex records that start at `position`."""
+        """Return (channel id, offsets) from the MessageIndex records that start at `position`."""
+        indexes = []
         while True:
             prefix = self._read(position, PREFIX.size)
             opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
-            if opcode != MESSAGE_INDEX or position + PREFIX.size + length > self.size or length < 6:
-                return
-            yield position + PREFIX.size, length
+            if opcode != MESSAGE_INDEX or position + PREFIX.size + length > self.size:
+                return indexes
+            try:
+                indexes.append(parse_message_index(self._read(position + PREFIX.size, length)))
+            except (struct.error, ValueError):
+                return []   # the chunk is then walked through
             position += PREFIX.size + length
 
     def _read_summary(self):
@@ -205,13 +213,11 @@ class McapFile(StorageFile):
         """Find channels and counts without a summary, by the message indexes where there are any."""
         counts = Counter()
         for opcode, position, length, walked in self._records():
-            indexes = []
-            if opcode == CHUNK:
-                indexes = [parse_message_index(self._read(at, size)) for at, size in self._indexes_behind(position + length)]
+            indexes = self._indexes_behind(position + length) if opcode == CHUNK else []
             if indexes and all(number in self.channels for number, _ in indexes):
                 counts.update({number: len(offsets) for number, offsets in indexes})
             elif opcode == CHUNK:
-                for _, messages in self._chunk(position, length):
+                for _, messages in self._chunk(position, length, indexes):
                     counts.update(messages.channel.tolist())
             elif opcode == MESSAGE:
                 self._register(walked[2])

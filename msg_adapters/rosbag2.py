@@ -127,6 +127,7 @@ class Rosbag2:
             opened = FILES[_storage_suffix(path)]
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(opened(plain, unpack))
+            self._lost.update(self.files[-1].lost)
         except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not cost the others
             self._lost[f'file {path.name} that cannot be read ({error})'] = 1
             return f'{path.name}: {error}'

@@ -3,7 +3,7 @@
 import os
 import sqlite3
 from collections import defaultdict
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -35,14 +35,22 @@ class SqliteFile(StorageFile):
 
     def __init__(self, path, unpack=None):
         self.path, self.unpack = Path(path), unpack
-        self.logged = Path(f'{path}-wal').exists()
+        self.lost = {}
+        log = Path(f'{path}-wal')
+        self.logged = log.exists() and log.stat().st_size > 0
         self.connection = _connect(self.path, self.logged)
         try:
+            self._read_topics()
+        except sqlite3.OperationalError as error:
+            self.connection.close()
+            if not self.logged:
+                raise
+            self.lost[f'write-ahead log {log.name} that cannot be read ({error})'] = 1
+            self.logged, self.connection = False, _connect(self.path, False)
             self._read_topics()
         except BaseException:
             self.connection.close()
             raise
-        self.lost = {}
 
     def _read_topics(self):
         self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
@@ -56,7 +64,7 @@ class SqliteFile(StorageFile):
     def count(self):
         """Return topic -> messages by counting them."""
         by_id = defaultdict(int)
-        for stretch in self._stretches():
+        for stretch in self._stretches(list(self.topic_ids)):
             for topic_id, count in zip(*np.unique(stretch.topic_ids, return_counts=True), strict=True):
                 by_id[int(topic_id)] += int(count)
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
@@ -73,16 +81,17 @@ class SqliteFile(StorageFile):
         """Close the file."""
         self.connection.close()
 
-    def _stretches(self):
+    def _stretches(self, topics):
         root = self._root()
         if root is None:
             yield from self._rows_by_sql()
             return
         reader = PageReader(self.path, root)
         try:
-            for buffer, starts in read_ahead(reader.stretches()):
-                rows = reader.rows(buffer, starts)
-                yield Stretch(rows.topic_id, partial(self._pack, rows), rows.received_ns)
+            with closing(read_ahead(reader.stretches())) as pieces:
+                for buffer, starts in pieces:
+                    rows = reader.rows(buffer, starts)
+                    yield Stretch(rows.topic_id, partial(self._pack, rows), rows.received_ns)
         finally:
             reader.close()
             for name, count in (('pages', reader.damaged_pages), ('rows', reader.damaged_rows)):

@@ -1,10 +1,17 @@
 """Header stamps and the four bytes in front of every CDR message."""
 
+import struct
+from typing import NamedTuple
+
 NS_PER_S = 1_000_000_000
 
 ENCAPSULATION_SIZE = 4
 """CDR aligns relative to the byte after the encapsulation header."""
 
+FRAME_OFFSET = ENCAPSULATION_SIZE + 8
+"""Where the length of the frame_id stands, behind the stamp."""
+
+_STARTS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
 
 
@@ -32,9 +39,34 @@ def byte_order(data):
         raise MessageError(f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}') from None
 
 
-def align(position, size):
-    """Return the first position from `position` on that is a multiple of `size`; both count from the encapsulation header's end."""
-    return -(-position // size) * size
+class Header(NamedTuple):
+    """What stands in front of every stamped message."""
+
+    order: str
+    """Byte order of the message, '<' or '>'."""
+    stamp_ns: int
+    """Header stamp."""
+    frame: bytes
+    """frame_id without its closing zero."""
+    end: int
+    """First byte behind the frame_id, not yet aligned."""
+
+
+def open_header(data):
+    """Return the Header of a serialized message (raises MessageError)."""
+    order = byte_order(data)
+    if len(data) < FRAME_OFFSET + 4:
+        raise MessageError(f'a stamped message has at least {FRAME_OFFSET + 4} bytes, got {len(data)}')
+    sec, nanosec, length = _STARTS[order].unpack_from(data, ENCAPSULATION_SIZE)
+    end = FRAME_OFFSET + 4 + length
+    if end > len(data):
+        raise MessageError(f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}')
+    return Header(order, to_ns(sec, nanosec), bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
+
+
+def aligned(position, size):
+    """Return the first position from `position` on that CDR aligns to `size`; positions count from the start of the message."""
+    return position + (ENCAPSULATION_SIZE - position) % size
 
 
 def to_ns(sec, nanosec):

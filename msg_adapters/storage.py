@@ -37,7 +37,7 @@ class StorageFile:
 
     def stretches(self, topics):
         """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
-        for stretch in self._stretches():
+        for stretch in self._stretches(topics):
             found = {}
             for topic in topics:
                 mine = np.flatnonzero(is_any(stretch.topic_ids, self.topic_ids.get(topic, [])))
@@ -48,7 +48,7 @@ class StorageFile:
 
     def raw_stretches(self, topics):
         """Yield RawMessages of the topics in file order."""
-        for stretch in self._stretches():
+        for stretch in self._stretches(topics):
             code = np.full(len(stretch.topic_ids), -1)
             for number, topic in enumerate(topics):
                 code[is_any(stretch.topic_ids, self.topic_ids.get(topic, []))] = number

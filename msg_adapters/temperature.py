@@ -1,29 +1,22 @@
 """sensor_msgs/Temperature: by attribute and by bytes."""
 
-import struct
-
 import numpy as np
 
 from imu_calibration.samples import TemperatureSamples
 from msg_adapters.layout import Layout
-from msg_adapters.stamps import ENCAPSULATION_SIZE, MessageError, align, byte_order, header_stamp_ns
+from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
-
-_FRAME = ENCAPSULATION_SIZE + 8
 
 
 def find_temperature_layout(data):
     """Return the Layout of a serialized Temperature message (raises MessageError)."""
-    order = byte_order(data)
-    if len(data) < _FRAME + 4:
-        raise MessageError(f'a Temperature message has at least {_FRAME + 4} bytes, got {len(data)}')
-    length, = struct.unpack_from(order + 'I', data, _FRAME)
-    body = ENCAPSULATION_SIZE + align(_FRAME + length, 8)
+    header = open_header(data)
+    body = aligned(header.end, 8)
     if len(data) < body + 16:
-        raise MessageError(f'a Temperature message with a frame_id of {length} bytes has {body + 16} bytes, got {len(data)}')
-    frame = bytes(data[_FRAME + 4:_FRAME + 4 + max(length - 1, 0)]).decode(errors='replace')
-    return Layout(order, len(data), bytes(data), ((0, 2), (_FRAME, _FRAME + 4 + length)), {'temperature_c': (body, 1)}, (frame,))
+        raise MessageError(f'a Temperature message with its doubles at byte {body} has {body + 16} bytes, got {len(data)}')
+    fixed = ((0, 2), (FRAME_OFFSET, header.end))
+    return Layout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)}, (header.frame.decode(errors='replace'),))
 
 
 def decode_temperature(layout, packed):
