@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import norm
 
+from imu_calibration.diagnosis.lifted import joined_motion
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.sensor_model import coefficients, columns
+from imu_calibration.sensor_model import coefficient_jacobian, coefficients, columns
 
 MARGIN = 4.0
 """Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
@@ -29,6 +30,10 @@ class Saturation:
     """Samples at the limit."""
     n_expected: float
     """Samples that the model expects beyond it, where there are none."""
+    rms_before: float
+    """Rms of measured minus predicted where the model expects outputs beyond the limit, without the limit in the model."""
+    rms_after: float
+    """The same with it."""
 
     @property
     def p_value(self):
@@ -50,6 +55,41 @@ def predictions(windows, table, model, values):
 def measured(window, sensor):
     """Return the measured output of a sensor in a window, shape (n, 3)."""
     return window.force_s if sensor == 'accelerometer' else window.rate_s
+
+
+def noise_at_rest(windows, sensor):
+    """Return the standard deviation of single samples in static windows (of second differences without any), shape (3,)."""
+    rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
+    if rest:
+        return np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0)
+    return np.median([np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6) for w in windows if len(w.time) > 8], axis=0)
+
+
+def simple_fit(windows, table, model):
+    """Return the parameters of a model by least squares on thinned samples, all weighted alike."""
+    values = np.where(np.isfinite(model.start()), model.start(), 0.0)
+    prior, sd = model.prior()
+    picked = [_thinned(window) for window in windows]
+    index, total, right = np.arange(len(values)), np.diag(1 / sd**2), (prior - values) / sd**2
+    for sensor in SENSORS:
+        motion, temperature = joined_motion(picked)
+        design = columns(model, sensor, table, motion, temperature)
+        output = np.concatenate([measured(w, sensor) if w.kind != 'static' else measured(w, sensor).mean(axis=0, keepdims=True) for w in picked])
+        base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
+        weight = 1 / noise_at_rest(windows, sensor)**2
+        for axis in range(3):
+            rows, residual = design @ slope[:, axis], output[:, axis] - design @ base[:, axis]
+            total = total + weight[axis] * rows.T @ rows
+            right = right + weight[axis] * rows.T @ residual
+    scale = 1 / np.sqrt(np.diag(total))
+    step = scale * np.linalg.solve(total * np.outer(scale, scale) + 1e-13 * np.eye(len(index)), scale * right)
+    return values + step
+
+
+def _thinned(window, most=50):
+    if window.kind == 'static' or len(window.time) <= most:
+        return window
+    return _selected(window, np.arange(0, len(window.time), len(window.time) // most))
 
 
 def may_be_clipped(windows, sensor):
@@ -89,7 +129,10 @@ def find_saturation(windows, predicted, noise_sd, sensor):
     agree = float(beyond[clipped].sum())
     if n_expected < 3 or agree < 0.5 * clipped.sum() * 0.5:
         return None
-    return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected)
+    far = np.abs(expected) > level
+    before, after = output - expected, output - np.clip(expected, -level, level)
+    rms = [float(np.sqrt(np.mean(e[far]**2))) if far.any() else 0.0 for e in (before, after)]
+    return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms)
 
 
 def without_clipped(windows, predicted, levels, noise_sd):

@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.regressors import GROUPS
 from imu_calibration.joint_motion import JointMotion
+from imu_calibration.reference import lever_matrix
 from imu_calibration.sensor_model import INPUT_OF, coefficients, warped_reference
 from imu_calibration.window_statistics import batch_statistics
 
@@ -45,6 +46,21 @@ class Lifted:
     """Window means of what a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
 
 
+def own_groups(model, sensor):
+    """Return the column groups of the diagnosis: a warp's change of the lever-arm terms is folded into its change of the input."""
+    return [(name, width) for name, width in model.groups(sensor) if not name.startswith('warp_lever:')]
+
+
+def own_rows(model, sensor):
+    """Return the mask of the model's columns that are columns of the diagnosis."""
+    return np.concatenate([np.full(width, not name.startswith('warp_lever:')) for name, width in model.groups(sensor)])
+
+
+def own_coefficients(model, sensor, values):
+    """Return the coefficients of the columns of the diagnosis, shape (n_columns, 3)."""
+    return coefficients(model, sensor, values)[own_rows(model, sensor)]
+
+
 def lift(windows, table, model, values, constants, progress=None):
     """
     Reduce windows to `Lifted` for a model and its values.
@@ -62,10 +78,10 @@ def lift(windows, table, model, values, constants, progress=None):
     means, grams = {s: [] for s in SENSORS}, {s: [] for s in SENSORS}
     noise = {s: [] for s in SENSORS}
     describe = []
-    coefficient = {s: coefficients(model, s, values) for s in SENSORS}
+    coefficient = {s: own_coefficients(model, s, values) for s in SENSORS}
     done = 0
     for part in _pieces(windows):
-        blocks = _columns(part, table, model, constants)
+        blocks = _columns(part, table, model, constants, mean_arm(model, values))
         edges = np.cumsum([0] + [len(w.motion) for w in part])
         for index, window in enumerate(part):
             rows = slice(edges[index], edges[index + 1])
@@ -93,7 +109,7 @@ def rebased(lifted, values):
     """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
     mean, gram = {}, {}
     for sensor in SENSORS:
-        change = coefficients(lifted.model, sensor, values) - coefficients(lifted.model, sensor, lifted.values)
+        change = own_coefficients(lifted.model, sensor, values) - own_coefficients(lifted.model, sensor, lifted.values)
         join = np.eye(lifted.mean[sensor].shape[1])
         join[:len(change), -3:] -= change
         mean[sensor] = lifted.mean[sensor] @ join
@@ -142,16 +158,25 @@ def joined_motion(windows):
     return motion, np.concatenate([[w.temperature_c.mean()] if w.kind == 'static' else w.temperature_c for w in windows])
 
 
-def _columns(windows, table, model, constants):
+def mean_arm(model, values):
+    """Return the mean lever arm of the accelerometers, or None when there are none."""
+    arms = np.zeros(3)
+    for name in ('lever_arm', 'accel_size_effect'):
+        if ('accelerometer', name) in model.slices:
+            arms = arms + values[model.slices['accelerometer', name]].reshape(-1, 3).mean(axis=0)
+    return arms if np.any(arms) else None
+
+
+def _columns(windows, table, model, constants, arm):
     """Return sensor -> ``[columns of the model | bank of warm-ups]`` of windows in one piece."""
     motion, temperature = joined_motion(windows)
     bank = -np.expm1(-motion.time[:, None] / np.asarray(constants)[None, :])
-    references = _References(model, table, motion, temperature)
+    references = _References(model, table, motion, temperature, arm)
     blocks = {}
     for sensor in SENSORS:
         ref, point = references.at(sensor), model.full_point()
         warps = {'warp:' + e.name: e for e in model.concerning(sensor) if e.warp is not None}
-        parts = [references.derivative(sensor, warps[name]) if name in warps else GROUPS[name](ref, point) for name, _ in model.groups(sensor)]
+        parts = [references.derivative(sensor, warps[name]) if name in warps else GROUPS[name](ref, point) for name, _ in own_groups(model, sensor)]
         blocks[sensor] = np.concatenate(parts + [bank], axis=1)
     return blocks
 
@@ -159,7 +184,8 @@ def _columns(windows, table, model, constants):
 class _References:
     """Motions with the warps of a model, each computed once for both sensors where both feel the same."""
 
-    def __init__(self, model, table, motion, temperature_c):
+    def __init__(self, model, table, motion, temperature_c, arm):
+        self.arm = arm
         self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
         self._known = {}
 
@@ -176,18 +202,24 @@ class _References:
         own = [e for e in self.model.concerning(sensor) if e.warp is not None and e.sensor == sensor and np.any(self.model.warp_point(e))]
         return tuple(e.name for e in own)
 
+    def _input(self, sensor, ref):
+        true = getattr(ref, INPUT_OF[sensor])
+        return true if self.arm is None or sensor == 'gyroscope' else true + lever_matrix(ref.rate_s, ref.alpha_s) @ self.arm
+
     def derivative(self, sensor, effect):
         """Return d(true input)/d(parameter) by forward differences, shape (n, 3 size); a lag of zero is a delay to first order."""
-        name, at = INPUT_OF[sensor], self.model.warp_point(effect)
+        at = self.model.warp_point(effect)
+        if effect.derivative is not None:
+            return effect.derivative(self.at(sensor))
         if effect.sensor == sensor and not np.any(at):
             clock = next((e for e in self.model.effects if e.name == 'time_offset'), None)
             if clock is not None:
                 return self.derivative(sensor, clock)
-        parts, base = [], getattr(self.at(sensor), name)
+        parts, base = [], self._input(sensor, self.at(sensor))
         for index in range(effect.size):
             moved = at.copy()
             moved[index] += effect.step
-            parts.append((getattr(self.at(sensor, effect.name, moved), name) - base) / effect.step)
+            parts.append((self._input(sensor, self.at(sensor, effect.name, moved)) - base) / effect.step)
         if effect.sensor in SENSORS:
             self._known = {key: ref for key, ref in self._known.items() if key[1] is None}
         return np.concatenate(parts, axis=1)

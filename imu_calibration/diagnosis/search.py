@@ -74,8 +74,7 @@ class Search:
         values, inverse = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
         value, sd = values[places], np.sqrt(np.diag(inverse)[places])
-        at = self.evidence.space.lifted.model.warp_point(question.effect)[0] if question.effect.name.endswith('_bandwidth') else 0.0
-        if question.effect.name.endswith('_bandwidth') and value[0] + at < 0:
+        if question.effect.name.endswith('_bandwidth') and value[0] < 0:
             return False
         largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
         return bool(np.all(np.abs(value) - 3 * sd < 20 * largest))

@@ -140,7 +140,7 @@ def saturated_noise(space, smooth):
         in the model beside which the wander is estimated.
 
     """
-    noise = {sensor: _first(space, sensor) for sensor in SENSORS}
+    noise = first_noise(space)
     for _ in range(2):
         normal = normal_matrix(space, noise)
         values = solve_normal(normal, space.prior_sd, space.prior_mean)
@@ -195,6 +195,11 @@ def _known_otherwise(space, sensor, noise, own):
     information[:-1, -1] += space.prior_mean[own] * prior
     information[-1, :-1] = information[:-1, -1]
     return information
+
+
+def first_noise(space):
+    """Return sensor -> SensorNoise before anything is fitted: the noise at rest."""
+    return {sensor: _first(space, sensor) for sensor in SENSORS}
 
 
 def _first(space, sensor):

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.diagnosis.candidates import Question, special
+from imu_calibration.diagnosis.lifted import own_rows
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.sensor_model import coefficients
+from imu_calibration.sensor_model import coefficient_jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,10 @@ def parameter_space(lifted, baseline):
     model, n_bank = lifted.model, len(lifted.constants)
     names = list(model.param_names)
     prior, sd = model.prior()
-    in_baseline = np.concatenate([np.full(e.size, (e.sensor, e.name) in baseline.slices) for e in model.effects])
+    for effect in model.effects:
+        if effect.name.endswith('_bias_drift'):
+            prior[model.slices[effect.sensor, effect.name]][-1] = lifted.values[model.slices[effect.sensor, effect.name]][-1]
+    in_baseline = counted_from_values(model, baseline)
     shift = np.where(in_baseline, prior - lifted.values, prior)
     removed = np.where(in_baseline, 0.0, lifted.values)
     for short in ('accel', 'gyro'):
@@ -59,7 +63,7 @@ def parameter_space(lifted, baseline):
     bank_sd = np.concatenate([np.full(3 * n_bank, 0.5), np.full(3 * n_bank, 0.05)])
     index, mean, within = {}, {}, {}
     for number, sensor in enumerate(SENSORS):
-        jacobian = _jacobian(model, sensor, lifted.values)
+        jacobian = own_jacobian(model, sensor, lifted.values)
         p = len(jacobian)
         index[sensor], mean[sensor], within[sensor] = [], [], []
         for axis in range(3):
@@ -77,18 +81,18 @@ def parameter_space(lifted, baseline):
     return Space(lifted, tuple(names), np.concatenate([sd, bank_sd]), np.concatenate([shift, np.zeros(6 * n_bank)]), index, mean, within)
 
 
-def _jacobian(model, sensor, values):
-    own = np.concatenate([np.full(e.size, e.sensor in (sensor, 'reference')) for e in model.effects])
-    columns = []
-    for k in range(len(values)):
-        if own[k]:
-            moved = values.astype(complex)
-            moved[k] += 1e-30j
-            columns.append(coefficients(model, sensor, moved).imag / 1e-30)
-        else:
-            columns.append(None)
-    zero = np.zeros_like(next(c for c in columns if c is not None))
-    return np.stack([zero if c is None else c for c in columns], axis=2)
+def counted_from_values(model, baseline):
+    """Return a mask of the parameters that count from the linearisation: the baseline's, and time constants of warm-ups."""
+    masks = [np.full(e.size, (e.sensor, e.name) in baseline.slices) for e in model.effects]
+    for effect, mask in zip(model.effects, masks):
+        if effect.name.endswith('_bias_drift'):
+            mask[-1] = True
+    return np.concatenate(masks)
+
+
+def own_jacobian(model, sensor, values):
+    """Return d(coefficients)/d(values) of the columns of the diagnosis, shape (n_columns, 3, n_params)."""
+    return coefficient_jacobian(model, sensor, values)[own_rows(model, sensor)]
 
 
 def questions(space, effects):

@@ -1,0 +1,164 @@
+"""From windows to findings: the one function that asks every effect, and the sentence that says what was found."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.diagnosis import censoring
+from imu_calibration.diagnosis.candidates import testable_effects
+from imu_calibration.diagnosis.extended import extended_solution
+from imu_calibration.diagnosis.gain import Gain, heldout_gain, residual_traces
+from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
+from imu_calibration.diagnosis.sentences import sentence
+from imu_calibration.diagnosis.separation import separating_motion
+from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
+from imu_calibration.diagnosis.stories import Explained, sensors_of
+from imu_calibration.diagnosis.unexplained import unexplained
+from imu_calibration.effects import find_effect
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import NotObservableError
+
+LINEARISATIONS = 3
+"""Times that the columns are taken anew, at most."""
+LEAST_WINDOWS = 8
+
+
+def diagnose(windows, table, model, settings=None, progress=None):
+    """
+    Say what a model gets wrong, and why.
+
+    The recording is reduced once to sufficient statistics of every effect's columns per window; the search then asks each effect
+    that is not in the model on held-out windows.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        One recording in order; windows of kind 'unused' are not fitted to, but let dead reckoning run through.
+    table : Table
+        The reference.
+    model : SensorModel
+        The model to diagnose.
+    settings : optional
+        Reserved.
+    progress : callable, optional
+        Called with the share that is done, in [0, 1].
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    NotObservableError
+        When there are too few windows to hold any out.
+
+    """
+    used = [window for window in windows if window.kind != 'unused']
+    if len(used) < LEAST_WINDOWS:
+        raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, {len(used)} were found; '
+                                 'rest in more poses, or spin and swing the table')
+    report = progress or (lambda share: None)
+    used, limits = _without_clipping(used, table, model)
+    effects, not_testable = testable_effects(replace_joints(model, table), table, used)
+    asked = without_saturation(effects)
+    attempt = Attempt(used, table, model, asked, progress=lambda share: report(0.5 * share))
+    chosen = attempt.search.run()
+    for _ in range(LINEARISATIONS - 1):
+        if not attempt.needs_another(chosen):
+            break
+        attempt = Attempt(used, table, model, asked, attempt.point(chosen), lambda share: report(0.5 + 0.2 * share))
+        chosen = attempt.search.run()
+    report(0.75)
+    explained = Explained(attempt.evidence, attempt.search)
+    named = explained.pruned(chosen)
+    result = _assembled(windows, used, table, model, attempt, explained, named, limits, not_testable)
+    report(1.0)
+    return result
+
+
+def replace_joints(model, table):
+    """Return the model with the joints of the table."""
+    return model if tuple(model.joint_names) == tuple(table.joint_names) else replace(model, joint_names=tuple(table.joint_names))
+
+
+def _without_clipping(windows, table, model):
+    """Return (windows without samples that a limit spoils, the limits found)."""
+    suspects = [sensor for sensor in SENSORS if censoring.may_be_clipped(windows, sensor)]
+    if not suspects:
+        return windows, []
+    limits = {sensor: float(max(np.abs(censoring.measured(w, sensor)).max() for w in windows)) for sensor in suspects}
+    noise_sd = {sensor: censoring.noise_at_rest(windows, sensor) for sensor in SENSORS}
+    kept, found = windows, []
+    for _ in range(2):
+        fit = censoring.simple_fit(kept, table, model)
+        predicted = censoring.predictions(windows, table, model, fit)
+        kept = censoring.without_clipped(windows, predicted, limits, noise_sd)
+    fit = censoring.simple_fit(kept, table, model)
+    predicted = censoring.predictions(windows, table, model, fit)
+    found = [limit for limit in (censoring.find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
+    if not found:
+        return windows, []
+    return censoring.without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found
+
+
+def _assembled(windows, used, table, model, attempt, explained, named, limits, not_testable):
+    baseline = extended_solution(attempt.lifted, attempt.noise, model, [])
+    solution = extended_solution(attempt.lifted, attempt.noise, model, named, limits) if named or limits else baseline
+    findings = [_clipping(limit, solution) for limit in limits]
+    for place, question in enumerate(named):
+        findings.append(_finding(attempt, explained, named, place, solution, table))
+    sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
+    return Diagnosis(tuple(findings), unexplained(attempt, explained, named), _candidates(attempt, named), tuple(not_testable), baseline, solution,
+                     heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution), len(used), int(attempt.locked.sum()))
+
+
+def _finding(attempt, explained, named, place, solution, table):
+    question = named[place]
+    rest = [q for q in named if q is not question]
+    score = attempt.search.score(rest, question)
+    mates = attempt.search.class_mates(named, question)
+    parameters = parameters_of(solution, question.sensor, question.name)
+    gain = heldout_gain(attempt, named[:place], named[:place + 1], sensors_of(question.effect))
+    motion = separating_motion(solution, question, mates[0][0], table.gravity_value) if mates else ''
+    return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
+                   explained.share(named, question), gain, tuple(mate.name for mate, _ in mates), motion)
+
+
+def _clipping(limit, solution):
+    short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[limit.sensor]
+    effect = find_effect(limit.sensor, f'{short}_saturation')
+    parameters = parameters_of(solution, limit.sensor, effect.name)
+    gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
+    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value, limit.n_expected, 1.0, gain,
+                   (), '')
+
+
+def _candidates(attempt, named):
+    """Return every effect that was asked about, the strongest first."""
+    found, mates = {q.name for q in named}, {}
+    for question in named:
+        for mate, _ in attempt.search.class_mates(named, question):
+            mates.setdefault(mate.name, question.name)
+    rows = {}
+    for question in attempt.questions:
+        alone = attempt.search.score([], question)
+        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
+            continue
+        beside = None if question.name in found else attempt.search.score(named, question)
+        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain, beside and beside.p_value,
+                                        _verdict(question.name, alone, beside, found, mates))
+    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
+
+
+def _verdict(name, alone, beside, found, mates):
+    if name in found:
+        return 'found'
+    if name in mates:
+        return f'as good as {mates[name]}'
+    if not alone.allowed and alone.gain > 0:
+        return 'refused: its size would be impossible'
+    if beside is not None and beside.significant:
+        return 'refused: it leaves most of the unexplained where it was'
+    if alone.significant:
+        return 'not needed beside the findings' if found else 'refused: it leaves most of the unexplained where it was'
+    return 'no evidence'

@@ -1,0 +1,91 @@
+"""What a diagnosis hands back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One effect that the model lacked."""
+
+    effect: str
+    """Published name."""
+    sensor: str
+    """'accelerometer', 'gyroscope' or 'reference'."""
+    explanation: str
+    """One sentence for a test engineer, with the size."""
+    parameters: dict
+    """Parameter name -> (value, sd, unit), SI, from all windows."""
+    p_value: float
+    """Chance of such a fall of the misfit by noise, times the number of effects asked about."""
+    heldout_gain: float
+    """Gain of log likelihood on held-out windows, nats."""
+    share: float
+    """Share of what was unexplained that it removes from held-out windows."""
+    gain: object
+    """`gain.Gain` on windows that took no part in choosing, of this finding on top of those before it."""
+    indistinguishable_from: tuple
+    """Effects that this recording cannot tell apart from it, at most two."""
+    separating_motion: str
+    """Which motion would tell them apart; empty when there is nothing to tell apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect that was asked about."""
+
+    effect: str
+    """Published name."""
+    sensor: str
+    """'accelerometer', 'gyroscope' or 'reference'."""
+    gain_alone: float
+    """Gain of held-out log likelihood on top of the baseline, nats."""
+    p_value_alone: float
+    """Its p-value there, times the number of effects asked about."""
+    gain_beside: float | None
+    """The same on top of the findings; None for a finding."""
+    p_value_beside: float | None
+    """Its p-value there."""
+    verdict: str
+    """'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or why it was refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Everything that a report, a document and a node need."""
+
+    findings: tuple
+    """Findings as found, the strongest first."""
+    unexplained: dict
+    """Sensor -> `unexplained.Rest` beside the findings."""
+    candidates: tuple
+    """Every effect that was asked about, strongest first (Candidate)."""
+    not_testable: tuple
+    """{'effect', 'why', 'needs'} of the effects that could not be asked about."""
+    baseline: object
+    """Solution of the model that was diagnosed."""
+    solution: object
+    """Solution of the extended model on all windows; the baseline's when nothing was found."""
+    gain: object
+    """`gain.Gain` of all findings together on windows that took no part in choosing."""
+    traces: object
+    """`gain.Traces`: residuals before and after, for plots."""
+    windows: int
+    """Windows used."""
+    locked: int
+    """Windows that took no part in choosing."""
+
+    @property
+    def model(self):
+        """The extended SensorModel, linearised at the solution."""
+        return self.solution.model.at(self.solution.values)
+
+
+def parameters_of(solution, sensor, effect):
+    """Return parameter name -> (value, sd, unit) of one effect."""
+    declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
+    part = solution.model.slices[sensor, effect]
+    sd = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
+    return {name: (float(value), float(spread), declared.unit_of(k))
+            for k, (name, value, spread) in enumerate(zip(declared.param_names(), solution.values[part], sd))}

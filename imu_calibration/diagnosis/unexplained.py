@@ -1,0 +1,118 @@
+"""What remains when every effect has been asked about: how much, what it goes with, and where in the session it sits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from imu_calibration.effects.base import SENSORS
+
+SIGNIFICANT = 5.0
+"""Standard deviations above noise from which a rest is significant."""
+ALPHA = 1e-4
+"""Significance that a correlation must have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Structure of one sensor's residual that no effect explains."""
+
+    significant: bool
+    """Whether it stands out of noise and of the wander that every bias has."""
+    rms: float
+    """Rms of the windows' means beyond noise, m/s^2 or rad/s."""
+    sigma: float
+    """Standard deviations by which it exceeds noise."""
+    correlates_with: str | None
+    """What it goes with most, or None."""
+    share: float
+    """Share of the windows' scatter that goes with it."""
+    where: str | None
+    """Where in the session most of it sits."""
+    residual: np.ndarray
+    """Residual of the windows' means, shape (k, 3)."""
+    noise_sd: np.ndarray
+    """What noise alone would leave there, shape (k, 3)."""
+
+
+def unexplained(attempt, explained, chosen):
+    """Return sensor -> Rest for a choice of effects."""
+    excess = explained.excess(chosen)
+    values = np.zeros(attempt.space.size + 1)
+    used = list(attempt.search.used(chosen))
+    values[used], values[-1] = -attempt.evidence.fit(tuple(used))[0], 1.0
+    return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+
+
+def _rest(attempt, explained, sensor, excess, values):
+    space, lifted = attempt.space, attempt.lifted
+    residual = np.stack([space.mean[sensor][axis] @ values[np.r_[space.index[sensor][axis], space.size]] for axis in range(3)], axis=1)
+    floor = explained.floor.noise[sensor]
+    noise_sd = np.sqrt(floor.mean_variance(lifted.kind, lifted.count) + floor.wander_sd**2)
+    sigma = max(excess[0] / np.sqrt(2 * explained.n_means), excess[1] / np.sqrt(2 * explained.n_within) if excess[1] > 0.02 * explained.n_within else 0.0)
+    rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
+    significant = bool(sigma > SIGNIFICANT)
+    if not significant:
+        return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
+    name, share = _correlate(lifted, residual / noise_sd)
+    return Rest(True, rms, float(sigma), name, share, _where(lifted, residual, noise_sd), residual, noise_sd)
+
+
+def _correlate(lifted, residual):
+    """Return (name, adjusted share of the variance) of what the residual goes with most, or (None, 0)."""
+    best = (None, 0.0)
+    for name, columns, rows in _explanations(lifted):
+        if rows.sum() < 3 * columns.shape[1] + 6:
+            continue
+        design = np.column_stack([np.ones(rows.sum()), columns[rows]])
+        left = residual[rows]
+        fitted = design @ np.linalg.lstsq(design, left, rcond=1e-9)[0]
+        total, rest = ((left - left.mean(axis=0))**2).sum(), ((left - fitted)**2).sum()
+        k, n = columns.shape[1], rows.sum()
+        share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
+        p_value = f_distribution.sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), 3 * k, 3 * (n - k - 1))
+        if p_value < ALPHA and share > max(best[1], 0.15):
+            best = (name, float(share))
+    return best
+
+
+def _explanations(lifted):
+    """Yield (name, columns (k, m), windows where they are known)."""
+    describe, every = lifted.describe, np.ones(len(lifted.kind), bool)
+    time = (describe['time'] - describe['time'].mean()) / max(np.ptp(describe['time']), 1e-9)
+    yield 'time', np.stack([time, time**2, time**3], axis=1), every
+    step = _step(time)
+    yield 'time', step, every
+    temperature = describe['temperature']
+    if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
+        warm = (temperature - temperature.mean()) / np.ptp(temperature)
+        yield 'temperature', np.stack([warm, warm**2], axis=1), every
+    yield 'rate', np.stack([describe['rate'], describe['rate']**2], axis=1), every
+    yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
+    for name in describe:
+        if name.startswith('angle'):
+            number = name[len('angle'):]
+            angle, known = describe[name], describe['span' + number] < 0.7
+            yield f'angle of joint {int(number) + 1}', np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1), known
+    yield 'motion (moving windows against windows at rest)', (lifted.kind != 'static')[:, None].astype(float), every
+
+
+def _step(time):
+    return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)
+
+
+def _where(lifted, residual, noise_sd):
+    """Return a sentence about the shortest stretch that holds four fifths of the rest, or None when it is everywhere."""
+    order = np.argsort(lifted.time)
+    weight = np.maximum(((residual / noise_sd)**2 - 1).sum(axis=1)[order], 0.0)
+    sums = np.concatenate([[0.0], np.cumsum(weight)])
+    if sums[-1] <= 0:
+        return None
+    stop = np.searchsorted(sums, sums[:-1] + 0.8 * sums[-1])
+    time = lifted.time[order]
+    known = np.flatnonzero(stop <= len(time))
+    lengths = time[np.minimum(stop[known] - 1, len(time) - 1)] - time[known]
+    first = known[int(np.argmin(lengths))]
+    if lengths.min() > 0.6 * np.ptp(time):
+        return None
+    return f'four fifths of it lie between {time[first]:.0f} s and {time[stop[first] - 1]:.0f} s'
