@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.effects import SENSORS
 from imu_calibration.errors import InputError
@@ -35,6 +36,22 @@ class Transfer:
     """Turns sensor vectors into target vectors, shape (3, 3)."""
     arm_t: np.ndarray
     """From the target's origin to the sensor, in the target frame, m, shape (3,)."""
+
+    @classmethod
+    def from_pose(cls, frame_id, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0)):
+        """
+        Return the transfer to a frame in which the sensor sits at `xyz` (m), turned by `rpy`.
+
+        Parameters
+        ----------
+        xyz, rpy : sequence of 3 floats
+            Pose of the sensor in the target frame, as in a static transform or a URDF joint from target to sensor: roll, pitch,
+            yaw in rad about the fixed axes x, y, z.
+
+        """
+        if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
+            raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; correct it')
+        return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
 
 
 def invertible(model):
