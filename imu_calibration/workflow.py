@@ -14,6 +14,7 @@ from imu_calibration.estimation import make_prior, solve
 from imu_calibration.gathering import Gathered, gather, merge, restrict
 from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
 from imu_calibration.settings import WindowSettings
+from imu_calibration.verdict import judge, requested
 
 SENSORS = ('accelerometer', 'gyroscope')
 G = 9.80665
@@ -57,6 +58,8 @@ class CalibrationResult:
     """The model whose columns were gathered; it may have more effects."""
     tolerances: np.ndarray
     """Tolerance of each parameter."""
+    options: CalibrationOptions = CalibrationOptions()
+    """What was asked for."""
 
 
 def choose_model(options, table, temperature_c=None):
@@ -182,7 +185,7 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
             raise InputError(f"calibration by hand estimates bias+matrix, '{model}' was asked for; give --table for more")
     calibration, hand, gathered, tolerances = calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance)
     calibration = replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity})
-    return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances)
+    return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances, options)
 
 
 def finish(gathered, model, table, options=CalibrationOptions(), provenance=None):
@@ -195,7 +198,7 @@ def finish(gathered, model, table, options=CalibrationOptions(), provenance=None
         solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
     tolerances = tolerances_of(narrow, options.tolerances)
     calibration = document(solution, tolerances, table, gathered, provenance)
-    return CalibrationResult(calibration, solution, gathered, table, narrow, model, tolerances)
+    return CalibrationResult(calibration, solution, gathered, table, narrow, model, tolerances, options)
 
 
 def _size_effect_unseen(solution):
@@ -322,51 +325,15 @@ def _check_rates(moving, gathered, model):
 
 
 def summary(result):
-    """Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people."""
-    calibration = result.calibration
-    lines, verdict = [], 'good'
-    requested = [k for k, name in enumerate(calibration.param_names) if requested_parameter(result, name)]
-    weak = [k for k in requested if calibration.status[k] != DETERMINED]
-    if weak:
-        verdict = 'weak'
-        for status in ('weak', 'held'):
-            names = [calibration.param_names[k] for k in weak if calibration.status[k] == status]
-            if names:
-                lines.append(f'{status}: {", ".join(names)}')
-        needs = list(dict.fromkeys(d['needs'] for d in calibration.undetermined))
-        lines += [f'next: {need}' for need in needs[:3]]
-    if calibration.statistics.get('dropped'):
-        lines.append('dropped: ' + ', '.join(f'{count} {reason}' for reason, count in calibration.statistics['dropped'].items()))
-    bad = misfits(calibration)
-    if bad:
-        verdict, lines = 'bad', bad + lines
-    return verdict, lines
-
-
-def requested_parameter(result, name):
-    """Return whether a parameter is the robot's business; table, clock and the common arm are nuisances."""
-    return not name.startswith('reference.') and '.lever_arm.' not in name
-
-
-MISFIT = 10.0
-"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
-
-
-def misfits(calibration):
-    """Return a line for each sensor whose residuals in motion are far above its noise at rest."""
-    lines = []
-    for sensor in SENSORS:
-        for kind, ratio in (calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}).items():
-            if kind != 'means' and ratio > MISFIT:
-                lines.append(f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times the noise at rest; '
-                             "run 'imu_calibration diagnose' to find the cause")
-    return lines
+    """Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people (see `verdict`)."""
+    found = judge(result.calibration, result.tolerances)
+    return found.word, found.lines
 
 
 def exit_code(result):
     """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
     calibration = result.calibration
-    lacking = any(status != DETERMINED for name, status in zip(calibration.param_names, calibration.status) if requested_parameter(result, name))
+    lacking = any(status != DETERMINED for name, status in zip(calibration.param_names, calibration.status) if requested(name))
     return 3 if lacking or calibration.statistics.get('dropped') else 0
 
 

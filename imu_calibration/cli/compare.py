@@ -2,7 +2,8 @@
 
 from imu_calibration import comparison
 from imu_calibration.cli import files
-from imu_calibration.cli.show import SHOWN, console, with_sd
+from imu_calibration.cli.show import console
+from imu_calibration.units import for_people, with_sd
 
 NAME = 'compare'
 HELP = 'Say whether two calibrations agree, in units of their combined standard deviation.'
@@ -23,7 +24,7 @@ def run(options):
     for heading in ('parameter', 'A', 'B', 'B - A', 'combined sd', 'unit', 'in sd'):
         table.add_column(heading, justify='left' if heading in ('parameter', 'unit') else 'right')
     for row in result.rows:
-        factor, unit = SHOWN.get(row.unit, (1.0, row.unit))
+        factor, unit = for_people(row.unit)
         difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
         table.add_row(row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
                       'held' if row.ratio is None else f'{row.ratio:.1f}')

@@ -2,8 +2,9 @@
 
 from imu_calibration.by_hand_document import read_imu
 from imu_calibration.cli import recordings
-from imu_calibration.cli.show import console, with_sd
+from imu_calibration.cli.show import console
 from imu_calibration.errors import InputError
+from imu_calibration.units import with_sd
 
 
 NAME = 'arm'

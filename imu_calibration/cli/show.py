@@ -1,11 +1,7 @@
 """What the verbs print: short tables on standard output."""
 
-import numpy as np
-
 from imu_calibration import workflow
-
-SHOWN = {'m/s^2': (1e3 / 9.80665, 'mg'), 'rad/s': (180 / np.pi, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (180 / np.pi * 60, 'arcmin'), 's': (1e3, 'ms')}
-"""Units for people: SI unit -> factor, unit."""
+from imu_calibration.units import for_people, with_sd
 
 
 def console():
@@ -17,7 +13,7 @@ def console():
 
 
 def show_calibration(result, folder, report=True):
-    """Print the verdict, the parameters and where the files are."""
+    """Print the parameters, the verdict and where the files are."""
     from rich.table import Table
     out, calibration = console(), result.calibration
     verdict, lines = workflow.summary(result)
@@ -27,7 +23,7 @@ def show_calibration(result, folder, report=True):
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.sensor, effect.name]
         for k, index in enumerate(range(part.start, part.stop)):
-            factor, unit = SHOWN.get(effect.unit_of(k), (1.0, effect.unit_of(k)))
+            factor, unit = for_people(effect.unit_of(k))
             value, sd = calibration.values[index] * factor, calibration.sd[index] * factor
             table.add_row(calibration.param_names[index], *with_sd(value, sd), unit, calibration.status[index])
     out.print(table)
@@ -36,11 +32,3 @@ def show_calibration(result, folder, report=True):
         out.print('  ' + line, soft_wrap=True)
     files = 'calibration.yaml' + (' and report.html' if report else '')
     out.print(f'written: {files} in {folder}', soft_wrap=True)
-
-
-def with_sd(value, sd):
-    """Return value and standard deviation as text with no more digits than the standard deviation supports."""
-    if not np.isfinite(sd) or sd <= 0:
-        return f'{value:.6g}', f'{sd:.2g}'
-    digits = max(0, min(12, 1 - int(np.floor(np.log10(sd)))))
-    return f'{value:.{digits}f}', f'{sd:.{digits}f}'

@@ -1,0 +1,40 @@
+"""Units for people, and as many digits as a standard deviation supports: for what is printed, never for arithmetic."""
+
+import numpy as np
+
+G = 9.80665
+"""Standard gravity, m/s^2: the g of people's units."""
+DEG = np.pi / 180
+SHOWN = {
+    'm/s^2': (1e3 / G, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'), 's': (1e3, 'ms'),
+    '(m/s^2)^-1': (1e3 * G, 'mg/g²'), '(m/s^2)^-2': (1e3 * G**2, 'mg/g³'), '(rad/s)^-1': (1e2 * DEG, '% per deg/s'),
+    '(rad/s)/(m/s^2)': (G / DEG, '(deg/s)/g'), 'm/s^2/K': (1e3 / G, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
+}
+"""SI unit -> (factor, unit that people use)."""
+
+
+def for_people(unit):
+    """Return (factor, unit) that turns an SI value into what people read; (1, unit) where SI is what they read."""
+    return SHOWN.get(unit, (1.0, unit))
+
+
+def decimals(sd, digits=2):
+    """Return the number of decimals that shows `digits` digits of a standard deviation."""
+    return int(max(0, min(12, digits - 1 - np.floor(np.log10(sd) + 1e-9))))
+
+
+def with_sd(value, sd):
+    """Return value and standard deviation as text with no more digits than the standard deviation supports."""
+    if not np.isfinite(sd) or sd <= 0:
+        return f'{value:.6g}', f'{sd:.2g}'
+    places = decimals(sd)
+    return f'{value:.{places}f}', f'{sd:.{places}f}'
+
+
+def significant(value, digits=3):
+    """Return a number as plain text with `digits` significant digits; powers of ten only where zeros would not help."""
+    if value == 0 or not np.isfinite(value):
+        return f'{value:g}'
+    if not 1e-4 <= abs(value) < 1e6:
+        return f'{value:.{digits - 1}e}'
+    return f'{value:.{max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))}f}'
