@@ -16,14 +16,12 @@ from msg_adapters.layout import group_by_layout
 from msg_adapters.stamps import MessageError
 
 
-def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct, covariances=None, gains=None,
-                        frame_id=None, mat_ts=None, storage=None):
+def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct, propagate=None, frame_id=None, mat_ts=None, storage=None):
     """
     Write a bag with all topics of another one and the corrected Imu messages behind the measured ones.
 
     Stamps, and whatever is not corrected, come from the measured message. Its covariances follow the message definition: an
-    absent quantity (first element -1) is left alone, an unknown covariance (zeros) becomes that of `covariances`, a known
-    one is carried through `gains`: ``G C G'``.
+    absent quantity (first element -1) is left alone, the others go through `propagate`.
 
     Parameters
     ----------
@@ -33,10 +31,9 @@ def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct
         Topic to correct, and name of the new one.
     correct : callable
         ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in the order of the file.
-    covariances : callable or tuple, optional
-        Covariances of corrected (force, rate), each (3, 3); a callable is asked after every block.
-    gains : tuple of ndarray, optional
-        Derivatives of corrected (force, rate) with respect to measured ones, each (3, 3).
+    propagate : callable, optional
+        Asked after each block for each distinct pair of covariances: measured (force, rate), each (3, 3) or None when unknown ->
+        corrected (force, rate).
     frame_id : str, optional
         New frame of the corrected messages; `mat_ts` (target from sensor) then turns the orientation.
     storage : str, optional
@@ -57,7 +54,7 @@ def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct
         bag = recording.source
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]
-        patch = _Patch(correct, covariances, gains, frame_id, mat_ts)
+        patch = _Patch(correct, propagate, frame_id, mat_ts)
         with BagWriter(destination, storage or bag.storage) as writer:
             ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
@@ -93,8 +90,8 @@ def _write(writer, topic_ids, raw, measured, corrected_id, patch):
 class _Patch:
     """Makes corrected messages from measured ones."""
 
-    def __init__(self, correct, covariances, gains, frame_id, mat_ts):
-        self.correct, self.covariances, self.gains = correct, covariances, gains or (None, None)
+    def __init__(self, correct, propagate, frame_id, mat_ts):
+        self.correct, self.propagate = correct, propagate
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
 
@@ -110,25 +107,30 @@ class _Patch:
             return np.zeros(0, dtype=int), []
         done = np.sort(np.concatenate([index for _, index, _ in groups]))
         corrected = self.correct(in_order([(index, decode_imu(layout, group)) for layout, index, group in groups]))
-        known = self.covariances() if callable(self.covariances) else self.covariances or (None, None)
         messages = [None] * len(done)
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
-            fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), known)
+            fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]))
             for k, message in zip(place.tolist(), rows(patch_imu_group(layout, group, fields, self.frame_id)), strict=True):
                 messages[k] = message
         return done, messages
 
-    def _fields(self, layout, packed, vectors, known):
+    def _fields(self, layout, packed, vectors):
         """Return the new fields of one group: field name -> values."""
+        measured = [layout.column(packed, f'{quantity}_cov') for quantity in ('force', 'rate')]
+        absent = [covariance[:, :1] == -1.0 for covariance in measured]
         fields = {}
-        for quantity, values, noise, gain in zip(('force', 'rate'), vectors, known, self.gains, strict=True):
-            measured, covariance = layout.column(packed, f'{quantity}_s'), layout.column(packed, f'{quantity}_cov')
-            absent, unknown = covariance[:, 0] == -1.0, ~covariance.any(axis=1)
-            fields[f'{quantity}_s'] = np.where(absent[:, np.newaxis], measured, values)
-            fields[f'{quantity}_cov'] = _new_covariance(covariance, absent, unknown, noise, gain)
+        for quantity, values, missing in zip(('force', 'rate'), vectors, absent, strict=True):
+            fields[f'{quantity}_s'] = np.where(missing, layout.column(packed, f'{quantity}_s'), values)
+        if self.propagate is not None:
+            covariances = _propagated(self.propagate, np.concatenate(measured, axis=1))
+            for quantity, before, after, missing in zip(('force', 'rate'), measured, np.split(covariances, 2, axis=1), absent, strict=True):
+                fields[f'{quantity}_cov'] = np.where(missing, before, after)
         if self.mat_st is not None:
-            fields['orientation'] = self._turned(layout.column(packed, 'orientation'), layout.column(packed, 'orientation_cov', 1)[:, 0])
+            orientation_cov = layout.column(packed, 'orientation_cov')
+            fields['orientation'] = self._turned(layout.column(packed, 'orientation'), orientation_cov[:, 0])
+            turned = (self.mat_st.T @ orientation_cov.reshape(-1, 3, 3) @ self.mat_st).reshape(-1, 9)
+            fields['orientation_cov'] = np.where(orientation_cov[:, :1] == -1.0, orientation_cov, turned)
         return fields
 
     def _turned(self, quaternion, first_cov):
@@ -140,11 +142,9 @@ class _Patch:
         return turned
 
 
-def _new_covariance(covariance, absent, unknown, noise, gain):
-    covariance = covariance.copy()
-    if noise is not None:
-        covariance[unknown] = np.ravel(noise)
-    known = ~absent & ~unknown
-    if gain is not None and known.any():
-        covariance[known] = (gain @ covariance[known].reshape(-1, 3, 3) @ gain.T).reshape(-1, 9)
-    return covariance
+def _propagated(propagate, pairs):
+    """Return the corrected covariances of measured ones, both (n, 18): nine numbers of force, nine of rate."""
+    distinct, which = (pairs[:1], np.zeros(len(pairs), int)) if (pairs == pairs[0]).all() else np.unique(pairs, axis=0, return_inverse=True)
+    known = [[None if not c.any() else c.reshape(3, 3) for c in np.split(np.where(pair == -1.0, 0.0, pair), 2)] for pair in distinct]
+    table = np.array([np.concatenate([c.ravel() for c in propagate(*pair)]) for pair in known])
+    return table[which.ravel()]

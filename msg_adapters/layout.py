@@ -143,6 +143,6 @@ def _checks(fixed, sample):
         left[first:last] = True
     while left.any():
         offset = min(int(np.argmax(left)), len(sample) - 8)
-        mask = sum(0xff << 8 * k for k in range(8) if left[offset + k])
+        mask = int.from_bytes(np.where(left[offset:offset + 8], 0xff, 0).astype(np.uint8).tobytes(), 'little')
         left[offset:offset + 8] = False
         yield offset, np.uint64(mask), np.uint64(int.from_bytes(sample[offset:offset + 8], 'little') & mask)
