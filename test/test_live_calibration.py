@@ -1,0 +1,228 @@
+"""The live answer is the offline answer; what is saved comes back; memory stays bounded. No ROS here."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration import accumulator_state, workflow
+from imu_calibration.errors import DocumentError, InputError, NotObservableError
+from imu_calibration.live_calibration import LiveCalibration, LiveSettings, SolvePacer
+from imu_calibration.profiles import make_profile
+from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table
+
+TABLE = Table.from_mapping({
+    'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+    'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0, 'mount': {'rpy_deg': [0, 0, 0], 'xyz': None}})
+SD = 1e-6
+"""Live and offline agree to this share of the standard deviation."""
+
+
+def session(tilt=(0.0, 0.0), seed=1):
+    """IMU and joint samples of the quick profile, and the true values."""
+    model = SensorModel(('bias', 'matrix', 'accel_size_effect'), ('bias', 'matrix'), ('table_tilt',), TABLE.joint_names)
+    values = random_values(model, 'industrial', seed)
+    values[model.slices['reference', 'table_tilt']] = tilt
+    imu, joints, _ = simulate(model.at(values), values, TABLE, make_profile('quick', seed, TABLE), SimulationOptions(50.0, 50.0), seed)
+    return imu, joints
+
+
+@pytest.fixture(scope='module')
+def quick():
+    """One session."""
+    return session()
+
+
+@pytest.fixture(scope='module')
+def expected(quick):
+    """What the offline tool says of it."""
+    return offline(quick)
+
+
+def blocks(imu, joints, seed=0, mean_seconds=0.2):
+    """Cut a session into uneven blocks as they would come from topics."""
+    rng = np.random.default_rng(seed)
+    first, last = imu.stamp_ns[0] - 1, max(imu.stamp_ns[-1], joints.stamp_ns[-1]) + 1
+    edges = np.sort(rng.integers(first, last, int((last - first) * 1e-9 / mean_seconds)))
+    edges = np.concatenate([[first], edges, [last]])
+    cuts = [np.searchsorted(s.stamp_ns, edges) for s in (imu, joints)]
+    for k in range(len(edges) - 1):
+        parts = [s.select(slice(c[k], c[k + 1])) for s, c in zip((imu, joints), cuts)]
+        yield SampleBlock(*parts)
+
+
+def offline(*sessions, options=workflow.CalibrationOptions()):
+    """Return what the offline tool says."""
+    return workflow.calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options)
+
+
+def run(live, imu, joints, seed=0):
+    """Push a session and return the completed windows."""
+    return [window for block in blocks(imu, joints, seed) for window in live.push(block)]
+
+
+def assert_same(a, b, share=SD):
+    """Assert that two calibrations agree to a share of their standard deviations, status by status."""
+    assert a.param_names == b.param_names and a.status == b.status
+    assert np.max(np.abs(a.values - b.values) / b.sd) < share
+    np.testing.assert_allclose(a.sd, b.sd, rtol=1e-6)
+
+
+def test_the_live_answer_is_the_offline_answer(quick, expected):
+    live = LiveCalibration(TABLE)
+    run(live, *quick)
+    result = live.solve(pending=True)
+    assert_same(result.calibration, expected.calibration)
+    for section in ('windows', 'samples_used', 'dropped', 'stream'):
+        assert result.calibration.statistics[section] == expected.calibration.statistics[section]
+    assert result.calibration.conditions == expected.calibration.conditions
+
+
+def test_solving_on_the_way_changes_nothing(quick, expected):
+    live, count = LiveCalibration(TABLE), 0
+    for number, block in enumerate(blocks(*quick, seed=3)):
+        live.push(block)
+        if number % 150 == 149:
+            live.solve(pending=number % 300 == 299)
+            count += 1
+    assert count >= 3
+    assert_same(live.solve(pending=True).calibration, expected.calibration)
+
+
+@pytest.fixture(scope='module')
+def tilted():
+    """A session on a table that stands far from level."""
+    return session((0.004, -0.003), seed=2)
+
+
+def test_a_tilted_table_is_linearised_anew_like_offline(tilted):
+    live = LiveCalibration(TABLE)
+    run(live, *tilted)
+    expected = offline(tilted)
+    tilt = expected.calibration.value('reference', 'table_tilt')
+    assert np.all(np.abs(tilt - [0.004, -0.003]) < 4 * expected.calibration.sd[expected.model.slices['reference', 'table_tilt']])
+    assert_same(live.solve(pending=True).calibration, expected.calibration)
+    assert not live.needs_linearising()
+
+
+def test_a_store_too_small_is_said_and_still_gives_the_first_pass(tilted):
+    live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=100))
+    run(live, *tilted)
+    result = live.solve(pending=True)
+    assert live.needs_linearising() and not live.store_is_complete
+    tilt = result.calibration.value('reference', 'table_tilt')
+    assert np.all(np.abs(tilt - [0.004, -0.003]) < 6 * result.calibration.sd[result.model.slices['reference', 'table_tilt']] + 1e-5)
+
+
+def cut(samples, start, stop):
+    """The part of samples between two shares of their length."""
+    return samples.select(slice(int(start * len(samples)), int(stop * len(samples))))
+
+
+def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
+    halves = [tuple(cut(s, *part) for s in quick) for part in ((0.0, 0.5), (0.5, 1.0))]
+    first = LiveCalibration(TABLE)
+    run(first, *halves[0])
+    data = accumulator_state.to_bytes(first.gathered(pending=True), first.model)
+    second = LiveCalibration(TABLE, earlier=accumulator_state.from_bytes(data, first.model))
+    assert second.n_windows > 20
+    run(second, *halves[1])
+    result, expected = second.solve(pending=True), offline(*halves)
+    assert_same(result.calibration, expected.calibration)
+    assert result.calibration.conditions == expected.calibration.conditions
+
+
+def test_a_state_comes_back_to_the_last_bit(quick):
+    live = LiveCalibration(TABLE)
+    run(live, *quick)
+    gathered = live.gathered()
+    data = accumulator_state.to_bytes(gathered, live.model)
+    again = accumulator_state.from_bytes(data, live.model)
+    assert accumulator_state.to_bytes(again, live.model) == data
+    assert_same(workflow.finish(again, live.model, TABLE).calibration, workflow.finish(gathered, live.model, TABLE).calibration, 1e-12)
+
+
+def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
+    live = LiveCalibration(TABLE)
+    data = accumulator_state.to_bytes(live.gathered(), live.model)
+    with pytest.raises(DocumentError, match='accel_size_effect.*start without resume'):
+        accumulator_state.from_bytes(data, replace(live.model, accelerometer=('bias', 'matrix')))
+    for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/1', b'accumulator/9')):
+        with pytest.raises(DocumentError, match='resume'):
+            accumulator_state.from_bytes(broken, live.model)
+
+
+def test_before_any_motion_it_waits_and_says_for_what():
+    live = LiveCalibration(TABLE)
+    with pytest.raises(NotObservableError):
+        live.solve()
+    groups = {(g.sensor, g.effect): g for g in live.groups()}
+    assert all(g.status == 'waiting' and g.needs for g in groups.values())
+    assert ('accelerometer', 'accel_size_effect') in groups
+
+
+def test_groups_name_the_motion_that_is_still_needed(quick):
+    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect')
+    live = LiveCalibration(TABLE, options)
+    still = [window for window in run(LiveCalibration(TABLE), *quick) if window.kind == 'static']
+    until = int(np.searchsorted(quick[0].stamp_ns, still[1].stamp_ns[-1]))
+    run(live, *(s.select(slice(0, until)) for s in quick))
+    live.solve(pending=True)
+    groups = {(g.sensor, g.effect): g for g in live.groups()}
+    lacking = [g for g in groups.values() if g.status != 'determined']
+    assert lacking and all(g.needs and g.sd > g.tolerance for g in lacking)
+    run(live, *(s.select(slice(until, None)) for s in quick), seed=1)
+    live.solve(pending=True)
+    done = {(g.sensor, g.effect): g for g in live.groups()}
+    assert all(g.sd <= g.tolerance and not g.needs for g in done.values() if g.status == 'determined')
+    assert sum(g.status == 'determined' for g in done.values()) > sum(g.status == 'determined' for g in groups.values())
+
+
+def test_residuals_are_what_the_model_leaves(quick):
+    live = LiveCalibration(TABLE, settings=LiveSettings(residual_rate=10.0))
+    windows = run(live, *quick)
+    assert live.residuals(windows) is None
+    result = live.solve(pending=True)
+    residuals = live.residuals(windows)
+    samples = sum(len(window) for window in windows)
+    assert 0.08 * samples < len(residuals) < 0.12 * samples
+    noise = result.solution.noise['gyroscope'].sample_sd()
+    assert np.all(np.abs(residuals.rate_s.std(axis=0) / noise - 1) < 0.15)
+    assert set(residuals.stamp_ns) <= set(quick[0].stamp_ns)
+
+
+def test_memory_stays_bounded(quick):
+    live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=2000))
+    imu, joints = quick
+    length = int(imu.stamp_ns[-1] - imu.stamp_ns[0]) + 10**10
+    largest = []
+    for turn in range(3):
+        run(live, replace(imu, stamp_ns=imu.stamp_ns + turn * length), replace(joints, stamp_ns=joints.stamp_ns + turn * length))
+        collector = live._collector
+        assert not collector.gathered.kept and not collector.gathered.windows
+        largest.append(collector.gatherer.n_buffered)
+    assert max(largest) < 5000
+
+
+def test_a_thermal_effect_waits_for_the_first_temperature(quick):
+    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias')
+    live = LiveCalibration(TABLE, options)
+    parts = list(blocks(*quick))[:5]
+    for block in parts:
+        assert live.push(block) == []
+    with pytest.raises(InputError, match='imu/temperature'):
+        live.solve()
+    warm = TemperatureSamples(parts[0].imu.stamp_ns[:1], np.array([31.4]))
+    live.push(SampleBlock(temperature=warm))
+    assert live.model.temperature_ref_c == 31.0
+    assert live._collector.gathered.first_stamp_ns == parts[0].imu.stamp_ns[0]
+
+
+def test_solving_takes_no_more_than_its_share():
+    pacer = SolvePacer(0.1)
+    assert pacer.due(0.0)
+    pacer.note(0.0, 2.0)
+    assert not pacer.due(19.9) and pacer.due(20.0)
