@@ -12,6 +12,8 @@ from imu_calibration.sensor_model import sensor_output
 
 ITERATIONS = 12
 """Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
+CONVERGED = 1e-6
+"""Samples whose last step is larger (m/s^2, rad/s) lie where the non-linear effects cannot be undone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class Corrected:
     rate: np.ndarray
     """Angular rate, rad/s, shape (n, 3)."""
     flagged: np.ndarray
-    """True where the input was saturated and the output cannot be trusted, shape (n,)."""
+    """True where the output cannot be trusted: the input was saturated, or too large for the inversion, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +94,8 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
     model, values = invertible_values(calibration)
     if temperature_c is None and needs_temperature(model):
         raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
-    true_force, true_rate = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
-    flagged = saturated(calibration, force_s, rate_s)
+    true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
+    flagged = saturated(calibration, force_s, rate_s) | (left > CONVERGED)
     if transfer is None:
         return Corrected(true_force, true_rate, flagged)
     return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged)
@@ -111,15 +113,15 @@ def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
     true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
     attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
     for _ in range(ITERATIONS):
-        change = 0.0
+        change = np.zeros(len(force_s))
         for sensor in ('gyroscope', 'accelerometer'):
             ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, temperature_c)
             step = (measured[sensor] - sensor_output(model, sensor, values, ref)) @ inverse[sensor].T
             true[sensor] = true[sensor] + step
-            change = max(change, float(np.max(np.abs(step), initial=0.0)))
-        if change < 1e-14:
+            change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
+        if np.max(change, initial=0.0) < 1e-14:
             break
-    return true['accelerometer'], true['gyroscope']
+    return true['accelerometer'], true['gyroscope'], change
 
 
 def moved(transfer, force_s, rate_s, alpha_s):
@@ -140,34 +142,6 @@ def saturated(calibration, force_s, rate_s):
 def arms_of(calibration):
     """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
     return calibration.value('accelerometer', 'accel_size_effect') if calibration.has('accelerometer', 'accel_size_effect') else np.zeros((3, 3))
-
-
-def output_covariance(calibration, sensor, measured_cov=None):
-    """
-    Return the covariance of the corrected output of one sample from the sensor's noise, shape (3, 3).
-
-    ``matrix^-1 N matrix^-T`` with N the message's covariance or, when that is unknown, the calibration's noise.
-    """
-    inverse = np.linalg.inv(calibration.value(sensor, 'matrix'))
-    if measured_cov is None:
-        measured_cov = np.diag(calibration.noise(sensor)[0]**2)
-    return inverse @ measured_cov @ inverse.T
-
-
-def parameter_covariance(calibration, sensor, force, rate, alpha):
-    """
-    Return what the uncertainty of bias, matrix and arms adds to the covariance of one corrected sample, shape (3, 3).
-
-    ``J P J'`` with J the derivative of the output with respect to the parameters, through the inverse matrix.
-    """
-    model, values = invertible_values(calibration)
-    keep = np.concatenate([np.arange(len(calibration.values))[calibration.model.slices[e.sensor, e.name]] for e in model.effects])
-    covariance = calibration.covariance[np.ix_(keep, keep)]
-    ref = Reference(np.zeros(1), np.eye(3)[None], np.atleast_2d(force), np.atleast_2d(rate), np.atleast_2d(alpha), 0.0,
-                    np.full(1, model.temperature_ref_c))
-    jacobian = np.stack([sensor_output(model, sensor, values + 1e-30j * unit, ref)[0].imag / 1e-30 for unit in np.eye(len(values))], axis=1)
-    jacobian = np.linalg.inv(calibration.value(sensor, 'matrix')) @ jacobian
-    return jacobian @ covariance @ jacobian.T
 
 
 def outside_conditions(calibration, rate_s, temperature_c=None):

@@ -3,9 +3,11 @@
 import numpy as np
 
 from imu_calibration import compensation
-from imu_calibration.compensation import arms_of, compensate, needs_temperature, output_covariance
+from imu_calibration.compensation import arms_of, compensate, needs_temperature
+from imu_calibration.compensation_covariance import Uncertainty
 from imu_calibration.differentiation import choose_derivative
 from imu_calibration.errors import InputError
+from imu_calibration.stamped_derivative import StampedDerivative, typical_period
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic that ends like this is refused: nobody should correct twice."""
@@ -33,34 +35,39 @@ class CompensationStream:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
         self.period, self.derivative = period, None
         self.count, self.flagged = 0, 0
-        self._past = np.zeros((0, 3))
-        self._fastest, self._temperatures = 0.0, []
+        self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
+        self._fastest, self._temperatures, self._last = 0.0, [], ()
 
     def correct(self, imu):
-        """Return `Corrected` for the next block of ImuSamples."""
+        """Return `Corrected` for the next block of ImuSamples; what is not finite stays so and leaves its neighbours alone."""
         self._settle(imu)
         temperature = self._temperature_at(imu.stamp_ns)
-        rate = np.concatenate([self._past, imu.rate_s])
-        alpha = self._alpha(rate)[len(self._past):]
-        self._past = rate[-(self.derivative.taps - 1):]
-        corrected = compensate(self.calibration, imu.force_s, imu.rate_s, alpha, temperature, self.transfer)
+        finite = np.isfinite(imu.rate_s).all(axis=1)
+        slope = np.zeros_like(imu.rate_s)
+        slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
+        corrected = compensate(self.calibration, imu.force_s, imu.rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
         self.count += len(imu)
         self.flagged += int(corrected.flagged.sum())
-        if len(imu):
-            self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s**2).sum(axis=1).max())))
+        if finite.any():
+            self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
+        self._remember(imu, slope, temperature)
         return corrected
 
     def _settle(self, imu):
         if self.derivative is not None:
             return
         if self.period is None:
-            steps = np.diff(imu.stamp_ns[:10_000])
-            self.period = float(np.median(steps[steps > 0])) * 1e-9 if np.any(steps > 0) else 0.01
+            self.period = typical_period(imu.stamp_ns[:10_000]) or 0.01
         self.derivative = derivative_for(self.calibration, self.period, self.transfer)
+        self._tracker = StampedDerivative(self.derivative)
+        self._uncertainty = Uncertainty(self.calibration, self.transfer, self.derivative)
 
-    def _alpha(self, rate):
-        """Angular acceleration of the true rate: the derivative of the measured one through the inverse matrix."""
-        return self.derivative.apply(rate) @ np.linalg.inv(self.calibration.value('gyroscope', 'matrix')).T
+    def _remember(self, imu, slope, temperature):
+        usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
+        if len(usable):
+            k = usable[-1]
+            dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
+            self._last = (imu.force_s[k], imu.rate_s[k], slope[k], dt)
 
     def _temperature_at(self, stamp_ns):
         if self.temperature is None or not len(self.temperature):
@@ -72,9 +79,19 @@ class CompensationStream:
             self._temperatures = [min(self._temperatures), max(self._temperatures)]
         return values
 
-    def covariances(self):
-        """Return the noise covariances of corrected (force, rate), each (3, 3), for messages whose own are unknown."""
-        return tuple(output_covariance(self.calibration, sensor) for sensor in ('accelerometer', 'gyroscope'))
+    def propagate(self, force_cov, rate_cov):
+        """
+        Return the covariances of corrected (force, rate), each (3, 3), at the last sample.
+
+        Parameters
+        ----------
+        force_cov, rate_cov : ndarray or None
+            Those of the measured ones, shape (3, 3); None: unknown, the calibration's noise is taken.
+
+        """
+        noise = self._uncertainty.noise
+        known = [n if c is None else c for c, n in zip((force_cov, rate_cov), noise)]
+        return self._uncertainty.at(*self._last).covariances(*known)
 
     def warnings(self):
         """Return lines about what was outside the calibration's conditions or could not be corrected."""
@@ -106,3 +123,20 @@ def refuse_corrected(topic):
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
         raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic with --imu-topic")
+
+
+def requested_transfer(frame_id, xyz, rpy):
+    """
+    Return the Transfer that options or parameters ask for, None without a target frame.
+
+    Raises
+    ------
+    InputError
+        When a pose comes without the name of its frame.
+
+    """
+    if frame_id:
+        return compensation.Transfer.from_pose(frame_id, xyz, rpy)
+    if any(xyz) or any(rpy):
+        raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well')
+    return None

@@ -41,8 +41,11 @@ def test_covariances_and_frame_follow_the_message_definition(tmp_path, frame_id)
     write_session(tmp_path / 'a', imu, joints, rate_cov=known)
     noise, gain = 4.0 * np.eye(3), np.array([[2.0, 0, 0], [1, 1, 0], [0, 0, 1]])
     turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+
+    def propagate(*measured):
+        return [noise if cov is None else gain @ cov @ gain.T for cov in measured]
     copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/c', lambda s: SimpleNamespace(force=s.force_s, rate=s.rate_s),
-                        covariances=lambda: (noise, noise), gains=(gain, gain), frame_id=frame_id, mat_ts=turn)
+                        propagate=propagate, frame_id=frame_id, mat_ts=turn)
     message = parse_imu(raw_messages(tmp_path / 'b', '/c')[7][1])
     assert message.frame_id == (frame_id or 'imu_link')
     np.testing.assert_array_equal(message.doubles[FIELDS['force_cov']], noise.ravel())   # was unknown

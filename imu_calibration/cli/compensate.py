@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from imu_calibration.compensation_stream import CompensationStream, refuse_corrected
+from imu_calibration.compensation_stream import CompensationStream, refuse_corrected, requested_transfer
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.errors import InputError
@@ -17,6 +17,11 @@ def add_arguments(parser):
     parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
     parser.add_argument('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
     parser.add_argument('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
+    parser.add_argument('--target-frame', metavar='FRAME', default='', help='move the corrected readings to another frame of the same rigid body')
+    parser.add_argument('--target-xyz', metavar='M', nargs=3, type=float, default=(0.0, 0.0, 0.0),
+                        help='place of the sensor in the target frame, m')
+    parser.add_argument('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
+                        help='roll, pitch, yaw of the sensor in the target frame, rad')
     recordings.add_topic_arguments(parser)
 
 
@@ -26,15 +31,17 @@ def run(options):
     calibration = files.read_calibration(options.calibration)
     if Path(options.output).exists():
         raise InputError(f'the output bag {options.output} must not exist yet; choose another name or remove it')
+    transfer = requested_transfer(options.target_frame, options.target_xyz, options.target_rpy)
     recording = recordings.open_bag(options.bag, options, want_joints=False)
     with recording, progress_bar('compensate', recording.message_counts.get(recording.imu_topic, 0)) as advance:
         refuse_corrected(recording.imu_topic)
-        stream = CompensationStream(calibration, temperature=recordings.temperatures(options.bag, options))
+        stream = CompensationStream(calibration, temperature=recordings.temperatures(options.bag, options), transfer=transfer)
 
         def correct(imu):
             advance(len(imu))
             return stream.correct(imu)
-        lost = copy_with_corrected(options.bag, options.output, recording.imu_topic, options.corrected_topic, correct)
+        lost = copy_with_corrected(options.bag, options.output, recording.imu_topic, options.corrected_topic, correct, stream.propagate,
+                                   options.target_frame or None, None if transfer is None else transfer.mat_ts)
     for line in stream.warnings():
         print(f'note: {line}')
     print(f'written: {options.output} with {options.corrected_topic} ({stream.count} samples)')
