@@ -124,10 +124,9 @@ def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
     problem = _Problem(accumulator, model, prior)
     values = problem.start()
     noises = noise or problem.first_noise(values)
-    for _ in range(2):
+    if noise is None:
+        # Once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
         values = problem.minimise(values, noises, _free(model, None), enough=0.01)
-        if noise is not None:
-            break
         noises = problem.update_noise(values, noises)
     values = problem.minimise(values, noises, _free(model, None))
     held = problem.undetermined(values, noises)

@@ -173,15 +173,20 @@ def _profile(gram):
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
 """Correlation times of MEMS biases: around 100 s, log-normal; a short session cannot tell them (field catalogue, section 6)."""
-WANDER_GAIN = 9.2
-"""Fall of minus twice the log likelihood that a wander must win over independent offsets: chi-square, two degrees of freedom, 1 %."""
-OFFSET_GAIN = 2.7
-"""The same for an offset against none: chi-square with half a degree of freedom on the boundary, 5 %."""
+CLEAR_GAIN = 30.0
+"""Fall of minus twice the log likelihood beyond which a wander's size is plain and its best estimate is taken."""
+OFFSET_GRID = np.array([0.0, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0])
+WANDER_GRID = np.array([0.0, 0.15, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5, 4.0, 6.3, 10.0, 25.0, 60.0])
+TIME_GRID = np.array([40.0, 100.0, 250.0])
+"""Offset and wander in units of the typical noise of a window mean; correlation times in s."""
 
 
 def estimate_offsets(rows, white, times, sessions, information):
     """
-    Return (offset_sd, wander_sd, wander_time) by restricted maximum likelihood.
+    Return (offset_sd, wander_sd, wander_time) from the restricted likelihood.
+
+    A short session leaves open how large a wander is, and a bias is only as certain as its wander is small. So the
+    variances are averaged over the likelihood (posterior means on a grid); only a wander that is plain gets its best value.
 
     Parameters
     ----------
@@ -197,28 +202,33 @@ def estimate_offsets(rows, white, times, sessions, information):
     def cost(offset, wander=0.0, time=TYPICAL_TIME):
         return likelihood(offset, wander, time) + (np.log(time / TYPICAL_TIME) / TIME_SPREAD)**2
 
-    ratios = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
-    costs = [cost(ratio * typical) for ratio in ratios]
-    offset = _refine(cost, ratios[int(np.argmin(costs))] * typical, costs[0])
-    alone = cost(offset)
-    if len(rows) < 12:
-        return offset, 0.0, 100.0
-    trials = [(share * ratio * typical, ratio * typical, time)
-              for time in (40.0, 120.0, 400.0) for ratio in (1.0, 3.0, 10.0, 30.0) for share in (0.0, 0.3)]
-    values = [cost(*trial) for trial in trials]
-    best = int(np.argmin(values))
-    start = np.log([max(trials[best][0], 0.1 * typical), trials[best][1], trials[best][2]])
-    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), np.exp(np.clip(x[2], 1.6, 8.0))), start, method='Nelder-Mead',
-                     options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03})
-    if alone - min(found.fun, values[best]) < WANDER_GAIN:
-        return offset, 0.0, 100.0
+    alone = np.array([cost(ratio * typical) for ratio in OFFSET_GRID])
+    offsets = OFFSET_GRID[alone < alone.min() + 20.0]
+    offsets = np.unique(np.concatenate([[0.0], offsets])) * typical
+    wanders = WANDER_GRID[WANDER_GRID > 0] * typical if len(rows) >= 12 else WANDER_GRID[:0]
+    trials = [(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID * typical]
+    trials += [(offset, wander, time) for wander in wanders for time in TIME_GRID for offset in offsets]
+    costs = np.concatenate([alone, [cost(*trial) for trial in trials[len(alone):]]])
+    best = int(np.argmin(costs))
+    if alone.min() - costs[best] > CLEAR_GAIN:
+        return _best_wander(cost, trials[best], typical)
+    return _posterior_mean(np.array(trials), costs - costs[best])
+
+
+def _posterior_mean(trials, costs):
+    """Return the roots of the mean variances, and the mean logarithm of the correlation time, over the likelihood."""
+    weight = np.exp(-0.5 * costs) * np.where(trials[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
+    weight /= weight.sum()
+    offset, wander = np.sqrt(weight @ trials[:, :2]**2)
+    wandering = weight * trials[:, 1]**2
+    if wandering.sum() <= 0:
+        return float(offset), 0.0, TYPICAL_TIME
+    return float(offset), float(wander), float(np.exp(wandering @ np.log(trials[:, 2]) / wandering.sum()))
+
+
+def _best_wander(cost, start, typical):
+    """Return the best values near a grid point."""
+    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), np.exp(np.clip(x[2], 1.6, 8.0))), np.log([max(start[0], 0.1 * typical), *start[1:]]),
+                     method='Nelder-Mead', options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03})
     offset_sd, wander_sd, wander_time = np.exp(np.append(found.x[:2], np.clip(found.x[2], 1.6, 8.0)))
     return float(offset_sd), float(wander_sd), float(wander_time)
-
-
-def _refine(cost, start, at_zero):
-    """Return the offset sd near a grid point, zero when zero does nearly as well."""
-    if start == 0:
-        return 0.0
-    found = minimize(lambda x: cost(np.exp(x[0])), [np.log(start)], method='Nelder-Mead', options={'maxfev': 40, 'xatol': 0.02, 'fatol': 0.01})
-    return float(np.exp(found.x[0])) if found.fun < at_zero - OFFSET_GAIN else 0.0
