@@ -8,9 +8,9 @@ from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard
-from msg_adapters.general_file import GeneralFile
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.ros1_file import Ros1File
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
@@ -144,12 +144,19 @@ class Recording:
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
             standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
-            deserialize = None if standard else deserializer(message_type, source.definitions, source.ros1)
+            deserialize = None if standard else self._general(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
             else:
                 decoders[topic] = Decoder(message_type, deserialize)
         return decoders
+
+    def _general(self, message_type):
+        try:
+            return deserializer(message_type, self.source.definitions, self.source.ros1)
+        except Exception as error:   # rosbags' parser raises many kinds
+            raise InputError(f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
+                             f'{" ".join(str(error).split())}; record again with standard messages') from error
 
     def close(self):
         """Close the files."""
@@ -177,7 +184,7 @@ def _open_source(path):
         raise InputError(f'a recording must be a rosbag2 folder, a .db3, .mcap or .bag file, got {path}, which does not exist; '
                          'check the path')
     try:
-        return GeneralFile(path) if path.suffix == '.bag' else Rosbag2(path)
+        return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
         raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file), got: {" ".join(str(error).split())}; '
                          'check the path, or record again') from error

@@ -7,6 +7,7 @@ from imu_calibration.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
+from msg_adapters.stamps import UnusableMessage
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 
@@ -23,11 +24,14 @@ class LiveGatherer:
         Joints of the table, in its order; default: those of the first message.
     max_messages : int
         Messages of one kind that are kept at most; the oldest go first and are counted as dropped.
+    frame_id : str, optional
+        Imu messages of another frame are counted as dropped; '' takes the frame of the first message, None any frame.
 
     """
 
-    def __init__(self, joint_names=None, max_messages=1_000_000):
-        self._topics = {'imu': _Topic(Decoder(IMU_TYPE), max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
+    def __init__(self, joint_names=None, max_messages=1_000_000, frame_id=None):
+        imu = Decoder(IMU_TYPE) if frame_id is None else FrameDecoder(frame_id)
+        self._topics = {'imu': _Topic(imu, max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
                         'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
 
     def add_imu(self, message):
@@ -61,6 +65,31 @@ class LiveGatherer:
             dropped.update(topic.decoder.dropped)
             topic.decoder.dropped.clear()
         return SampleBlock(**samples, dropped=dropped or None)
+
+
+class FrameDecoder(Decoder):
+    """
+    Decode Imu messages of one frame; those of others are counted as dropped.
+
+    Parameters
+    ----------
+    frame_id : str
+        The frame; '' takes that of the first message.
+
+    """
+
+    def __init__(self, frame_id=''):
+        super().__init__(IMU_TYPE)
+        self.frame_id = frame_id
+        decode_layout, read_row = self.decode_layout, self.read_row
+        self.decode_layout = lambda layout, packed: decode_layout(self._checked(layout, layout.names[0]), packed)
+        self.read_row = lambda message: read_row(self._checked(message, message.header.frame_id))
+
+    def _checked(self, passed, frame_id):
+        self.frame_id = self.frame_id or frame_id
+        if frame_id != self.frame_id:
+            raise UnusableMessage(f"Imu message of another frame than '{self.frame_id}'")
+        return passed
 
 
 class _Topic:

@@ -37,7 +37,7 @@ class Rosbag2:
         self.path, self.folder = Path(path), None
         self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
         self._lost, self.files = {}, []
-        by_message = self.metadata.get('compression_mode', '').lower() == 'message'
+        by_message = str(self.metadata.get('compression_mode', '')).lower() == 'message'
         try:
             errors = [self._open(path, decompress_message if by_message else None) for path in self._storage_paths()]
             if not self.files:
@@ -124,7 +124,9 @@ class Rosbag2:
     def _open(self, path, unpack):
         """Open one storage file; return the error when that fails."""
         try:
-            opened = FILES[_storage_suffix(path)]
+            opened = FILES.get(_storage_suffix(path))
+            if opened is None:
+                raise ValueError(f'a storage file must end in {", ".join(FILES)}, with {" or ".join(COMPRESSED)} behind it when compressed')
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(opened(plain, unpack))
             self._lost.update(self.files[-1].lost)

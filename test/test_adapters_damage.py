@@ -8,12 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.compressed import zstd
+from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.write import write_session
 from test_adapters_bag import make_session
@@ -249,3 +250,24 @@ def test_bags_of_another_writer(tmp_path, session, storage, mode):
     np.testing.assert_array_equal(found_joints.position, joints.position)
     np.testing.assert_array_equal(found_joints.velocity[:67], joints.velocity[:67])
     assert np.isnan(found_joints.velocity[67:]).all()
+
+
+@pytest.mark.parametrize('text, usable', [('float32', True), ('complicated', False)])
+def test_another_definition_of_a_type_takes_the_general_path(tmp_path, session, text, usable):
+    """A bag says itself what its messages hold: here covariances of single precision, and no definition that makes sense."""
+    store = get_typestore(Stores.EMPTY)
+    definition = standard_definition('sensor_msgs/msg/Imu').text.replace('float64[9]', 'float32[9]')
+    store.register(get_types_from_msg(definition, 'sensor_msgs/msg/Imu'))
+    full = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9) as writer:
+        topic = writer.add_connection('/imu/data_raw', 'sensor_msgs/msg/Imu', msgdef=definition if usable else text, rihs01='x')
+        for row in encode_imu(session[0].select(slice(0, 30))):
+            message = full.deserialize_cdr(row.tobytes(), 'sensor_msgs/msg/Imu')
+            for name in ('orientation', 'angular_velocity', 'linear_acceleration'):
+                setattr(message, f'{name}_covariance', getattr(message, f'{name}_covariance').astype(np.float32))
+            writer.write(topic, 0, bytes(store.serialize_cdr(message, 'sensor_msgs/msg/Imu')))
+    if usable:
+        np.testing.assert_array_equal(read(tmp_path / 'bag')[0].rate_s, session[0].rate_s[:30])
+    else:
+        with pytest.raises(InputError, match='the definition of sensor_msgs/msg/Imu'):
+            read(tmp_path / 'bag')

@@ -1,4 +1,4 @@
-"""Bags as far as rosbags reads them, one raw message at a time: ROS 1 bags, and whatever the quick readers do not know."""
+"""ROS 1 bags as far as rosbags reads them, one raw message at a time."""
 
 from collections import defaultdict
 from contextlib import suppress
@@ -10,14 +10,14 @@ STRETCH = 8192
 """Messages per stretch."""
 
 
-class GeneralFile:
-    """One bag through rosbags' reader."""
+class Ros1File:
+    """One .bag file through rosbags' reader."""
+
+    ros1 = True
 
     def __init__(self, path):
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        self.ros1 = Path(path).suffix == '.bag'
-        self.reader = (Reader1 if self.ros1 else Reader2)(Path(path))
+        from rosbags.rosbag1 import Reader
+        self.reader = Reader(Path(path))
         self.reader.open()
         self.lost = {}
         self.counts = {}
@@ -26,8 +26,7 @@ class GeneralFile:
         for connection in self.reader.connections:
             self.types[connection.topic] = connection.msgtype
             self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
-            encoding = 'ros2idl' if connection.msgdef.format.name == 'IDL' else 'ros2msg'
-            self.definitions[connection.msgtype] = (encoding, connection.msgdef.data)
+            self.definitions[connection.msgtype] = ('ros2msg', connection.msgdef.data)
 
     @property
     def duration_ns(self):
