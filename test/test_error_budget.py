@@ -1,0 +1,107 @@
+"""The error budget: what it predicts is what happens when the same recording is calibrated against a wrong reference."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration import error_budget as budgets
+from imu_calibration.estimation import solve
+from imu_calibration.gathering import gather
+from imu_calibration.noise import GRADES
+from imu_calibration.profiles import make_profile
+from imu_calibration.samples import SampleBlock
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table, tilt
+from imu_calibration.workflow import CalibrationOptions, calibrate
+
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+                            'up': [0, 0, 1], 'gravity': 9.81, 'latitude': 48.8, 'azimuth_deg': 0.0})
+NO_TILT = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect', reference_model='none')
+SIZES = np.array([1e-3] * 3 + [1e-4] * 9 + [1e-4] * 9)
+
+
+@pytest.fixture(scope='module')
+def recording():
+    """A short session of an IMU with a size effect."""
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
+    values = random_values(model, 'industrial', 4)
+    imu, joints, _ = simulate(model, values, TABLE, make_profile('quick', 4, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), 4)
+    return SampleBlock(imu, joints)
+
+
+def calibrated(recording, table, options=NO_TILT):
+    """Calibrate against a table."""
+    return calibrate([lambda: iter([recording])], table, options)
+
+
+@pytest.fixture(scope='module')
+def result(recording):
+    """The calibration against the true table."""
+    return calibrated(recording, replace(TABLE, mount_xyz=(0.0, 0.0, 0.0)))
+
+
+def moved(recording, result, false_table):
+    """Return how the estimate moves when the reference is wrong, at the same weights."""
+    gathered = gather(iter([recording]), false_table, result.model)
+    return solve(gathered.accumulator, result.model, noise=result.solution.noise).values - result.solution.values
+
+
+@pytest.mark.parametrize('axis', (0, 1))
+def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, result, axis):
+    angle = 1e-3 * np.eye(2)[axis]
+    shift = budgets.parameter_shifts(result, [budgets._Tilted(angle)])[0].sum(axis=0)
+    actual = -moved(recording, result, tilt(result.table, angle))
+    assert np.linalg.norm(shift[:12]) > 1e-4
+    for effect in result.solution.model.effects[:3]:
+        part = result.solution.model.slices[effect.sensor, effect.name]
+        assert actual[part] == pytest.approx(shift[part], abs=0.02 * np.max(np.abs(shift[part])) + 1e-9)
+
+
+def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
+    shift = budgets.parameter_shifts(result, [budgets._Heavier(0.01)])[0].sum(axis=0)
+    assert shift[3:12] == pytest.approx(result.solution.values[3:12] * 0.01 / 9.81, abs=3e-7)
+    actual = -moved(recording, result, replace(result.table, gravity=9.82))
+    assert actual[:21] == pytest.approx(shift[:21], abs=5e-6)
+
+
+def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
+    shift = budgets.parameter_shifts(result, [budgets._Faster(1e-3)])[0].sum(axis=0)
+    names = result.solution.param_names
+    arms, matrix = (result.solution.model.slices[key] for key in (('accelerometer', 'accel_size_effect'), ('gyroscope', 'matrix')))
+    assert names[matrix.start] == 'gyroscope.matrix.xx'
+    assert shift[matrix] == pytest.approx(1e-3 * result.solution.values[matrix], abs=2e-6)
+    assert shift[arms] == pytest.approx(2e-3 * result.solution.values[arms], abs=2e-5)
+
+
+def test_joint_errors_are_drawn_anew_in_every_window(result):
+    """The sd of the budget is that of random joint errors put through the same shifts."""
+    budget = budgets.error_budget(result)
+    changes = [budgets._Turned(1.0 * budgets.ReferenceErrors().joint_position, k) for k in range(3)]
+    shifts = budgets.parameter_shifts(result, changes)
+    rng = np.random.default_rng(5)
+    draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
+    own = budget.causes['joint position']
+    large = own > 1e-12
+    assert draws.std(axis=0)[large] == pytest.approx(own[large], rel=0.06)  # 4000 draws: 1.1 % each, five of it
+
+
+def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
+    without = budgets.error_budget(result)
+    assert list(without.causes) == ['noise', 'levelling', 'joint position', 'table rate', 'gravity']
+    matrix = result.solution.model.slices['accelerometer', 'matrix']
+    assert np.max(without.causes['levelling'][matrix]) > 10 * np.max(without.causes['noise'][matrix])
+    with_tilt = budgets.error_budget(calibrated(recording, TABLE, CalibrationOptions()))
+    assert 'levelling' not in with_tilt.causes
+
+
+def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result):
+    small, large = (budgets.error_budget(result, replace(budgets.ReferenceErrors(), joint_position=size)) for size in (1e-5, 1e-4))
+    assert small.total**2 == pytest.approx(sum(part**2 for part in small.causes.values()), rel=1e-12)
+    assert large.causes['joint position'] == pytest.approx(10 * small.causes['joint position'], rel=1e-3, abs=1e-12)
+
+
+def test_gravity_sd_of_the_table_description_is_used(result):
+    stated = replace(result, table=replace(result.table, gravity_sd=1e-3))
+    assert 'to 0.001' in budgets.error_budget(stated).texts['gravity']
