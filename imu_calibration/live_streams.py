@@ -1,0 +1,84 @@
+"""How the streams of a live session are doing, by header stamps: rates, silence, what is being dropped."""
+
+from dataclasses import dataclass
+
+from imu_calibration.workflow import dropped
+
+SILENT_AFTER = 2.0
+"""Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
+RECENT = 10.0
+"""Seconds for which a loss is called recent."""
+GOOD, TROUBLE, SILENT = 'good', 'trouble', 'silent'
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """The state of all streams together."""
+
+    word: str
+    """'good', 'trouble' or 'silent'."""
+    message: str
+    """One line: what is wrong and what to do."""
+    values: dict
+    """Figures by name."""
+
+
+class StreamWatch:
+    """Takes note of every block and says how the streams are."""
+
+    def __init__(self):
+        self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
+        self._newest = {}
+        self._arrived = {}
+        self._period = {}
+        self._lost, self._lost_at, self._recent = {}, None, {}
+
+    @property
+    def last_arrival(self):
+        """When the last message came, s of the clock given to `note`; None before the first."""
+        return max(self._arrived.values(), default=None)
+
+    @property
+    def n_imu(self):
+        """Imu samples so far."""
+        return self._count['imu']
+
+    def note(self, block, now):
+        """Take a SampleBlock that arrived at `now`, s of a steady clock."""
+        for name in self._count:
+            samples = getattr(block, name)
+            if samples is None or not len(samples):
+                continue
+            first, last = int(samples.stamp_ns[0]), int(samples.stamp_ns[-1])
+            if len(samples) > 1 and last > first:
+                self._period[name] = (last - first) * 1e-9 / (len(samples) - 1)
+            self._count[name] += len(samples)
+            self._newest[name], self._arrived[name] = last, now
+
+    def note_counts(self, counts, now):
+        """Take the counts of what became of the samples."""
+        lost = dropped(counts)
+        grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
+        if grown:
+            self._recent, self._lost_at = grown, now
+        self._lost = lost
+
+    def state(self, now):
+        """Return the StreamState at `now`."""
+        values = {f'{name} messages': count for name, count in self._count.items()}
+        values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
+        values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
+        silent = [name for name in ('imu', 'joints') if now - self._arrived.get(name, float('-inf')) > SILENT_AFTER]
+        if len(silent) == 2:
+            return StreamState(SILENT, 'neither Imu nor JointState messages come; check the topics imu/data_raw and joint_states', values)
+        if silent:
+            missing = {'imu': 'Imu messages do not come (imu/data_raw)', 'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
+            return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
+        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9
+        if abs(lead) > SILENT_AFTER:
+            ahead = 'ahead of' if lead > 0 else 'behind'
+            return StreamState(TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {ahead} the joint stamps; bring the clocks together', values)
+        if self._lost_at is not None and now - self._lost_at < RECENT:
+            lost = ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
+            return StreamState(TROUBLE, f'dropped lately: {lost}', values)
+        return StreamState(GOOD, 'Imu and JointState messages come', values)

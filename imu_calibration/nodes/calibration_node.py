@@ -1,0 +1,143 @@
+"""calibration_node: calibrates an IMU on a table while the table moves."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, JointState, Temperature
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from imu_calibration import accumulator_state
+from imu_calibration.cli import files
+from imu_calibration.errors import InputError
+from imu_calibration.live_calibration import LiveCalibration, LiveSettings
+from imu_calibration.nodes.batches import BatchSubscription
+from imu_calibration.nodes.calibration_status import statuses_of
+from imu_calibration.nodes.calibration_worker import CalibrationWorker, accumulator_file
+from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
+from imu_calibration.resources import config_file
+from imu_calibration.settings import WindowSettings, setting
+from imu_calibration.workflow import CalibrationOptions
+from msg_adapters.encode import encode_imu, rows
+from msg_adapters.live import LiveGatherer
+
+INPUT_DEPTH = 5000
+"""Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
+COMPLAINT_PERIOD = 10.0
+"""Seconds between two warnings."""
+
+
+@dataclass(frozen=True)
+class CalibrationNodeSettings:
+    """What the node reads, asks for and writes."""
+
+    table_file: str = setting('', '', 'table description, path; it must be given', symptom='the node refuses to start and says why')
+    frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
+                            symptom='every Imu message is dropped, diagnostics say so')
+    reliable: bool = setting(False, '', 'subscribe reliably instead of best-effort', symptom='a best-effort publisher never connects')
+    accelerometer_model: str = setting('', '', 'named model or effect names joined by +; empty: bias+matrix, and accel_size_effect when the rotation '
+                                       'shows it', symptom='an effect that is there stays in the residuals')
+    gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix', symptom='an effect that is there stays in the residuals')
+    reference_model: str = setting('', '', "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
+                                   'azimuth is unknown', symptom='a tilted table shows as accelerometer bias')
+    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml', symptom='good parameters are called weak')
+    save_file: str = setting('calibration.yaml', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz',
+                             symptom='~/save answers that the place is not writable')
+    resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
+                           symptom='old motion of another IMU enters the calibration')
+    autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
+                                     'after a crash the session starts from the last ~/save')
+
+
+class CalibrationNode(Node):
+    """Listens, and tells what the worker finds."""
+
+    def __init__(self):
+        super().__init__('calibration_node')
+        self.settings = declare_parameters(self, CalibrationNodeSettings)
+        self._live_settings = declare_parameters(self, LiveSettings)
+        self._options = self._read_options(declare_parameters(self, WindowSettings))
+        self._table = self._read_table()
+        self._gatherer = LiveGatherer(self._table.joint_names, frame_id=self.settings.frame_id)
+        self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
+        self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
+        self.worker = CalibrationWorker(self._gatherer, self._make_live, self.settings.save_file, self.settings.autosave_period,
+                                        self._publish_document, self._publish_residuals, self._complain)
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        for what in ('solve', 'save', 'reset'):
+            self.create_service(Trigger, f'~/{what}', lambda request, response, what=what: self._serve(what, response))
+        qos = input_qos(self.settings.reliable, INPUT_DEPTH)
+        self._inputs = [BatchSubscription(self, kind, topic, add, qos) for kind, topic, add in (
+            (Imu, 'imu/data_raw', self._gatherer.add_imu), (JointState, 'joint_states', self._gatherer.add_joints),
+            (Temperature, 'imu/temperature', self._gatherer.add_temperature))]
+        self.worker.start()
+
+    def close(self):
+        """End the worker after what it is doing."""
+        self.worker.end()
+
+    def _read_table(self):
+        if not self.settings.table_file:
+            raise InputError("parameter 'table_file' must name a table description, none was given; start with "
+                             '--ros-args -p table_file:=/path/to/table.yaml')
+        return files.read_table(Path(self.settings.table_file).expanduser())
+
+    def _read_options(self, windows):
+        settings = self.settings
+        tolerances = files.read_mapping(settings.tolerances_file or config_file('tolerances.yaml'), 'tolerance file')
+        return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
+                                  tolerances, windows)
+
+    def _make_live(self, resume):
+        live = LiveCalibration(self._table, self._options, self._live_settings)
+        saved = accumulator_file(self.settings.save_file)
+        if not (resume and self.settings.resume and saved.is_file()):
+            return live
+        data = saved.read_bytes()
+        earlier = accumulator_state.from_bytes(data, live.model or accumulator_state.saved_model(data))
+        live = LiveCalibration(self._table, self._options, self._live_settings, earlier)
+        self.get_logger().info(f'goes on with {live.n_windows} windows from {saved}')
+        return live
+
+    def _serve(self, what, response):
+        request = self.worker.ask(what)
+        while not request.done.wait(0.005):
+            for subscription in self._inputs:
+                subscription.drain()
+            if not self.worker.is_alive():
+                break
+        response.success, response.message = request.success, request.message
+        self._diagnostics.publish_now()
+        return response
+
+    def _publish_document(self, text):
+        self._document.publish(String(data=text))
+
+    def _publish_residuals(self, residuals):
+        for message in rows(encode_imu(residuals)):
+            self._residual.publish(bytes(message))
+
+    def _complain(self, line):
+        self.get_logger().warning(line, throttle_duration_sec=COMPLAINT_PERIOD)
+
+    def _statuses(self):
+        if self.worker.failure is not None:
+            raise self.worker.failure
+        state = self.worker.state
+        if state.streams is not None and state.streams.word == 'trouble':
+            self._complain(state.streams.message)
+        return statuses_of(state)
+
+
+def main(arguments=None):
+    """Run the node; return the exit code."""
+    return run_node(CalibrationNode, arguments)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
