@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from imu_calibration.calibration import HELD
 from imu_calibration.errors import InputError
@@ -106,7 +106,7 @@ def _groups(names, difference, covariance, held):
         scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
         chi2 = float((d / scale) @ np.linalg.pinv(block / np.outer(scale, scale), rcond=1e-9, hermitian=True) @ (d / scale))
         rank = int(np.linalg.matrix_rank(block / np.outer(scale, scale), tol=1e-9, hermitian=True))
-        found.append((key, chi2, max(rank, 1), float(stats.chi2.sf(chi2, max(rank, 1)))))
+        found.append((key, chi2, max(rank, 1), float(chdtrc(max(rank, 1), chi2))))
     return found
 
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,7 @@ class CausalDerivative:
 
     def apply(self, rate_s):
         """Return the angular acceleration, shape (n, 3); the first `taps - 1` samples use the shorter past there is."""
+        from scipy.signal import lfilter   # here, because scipy.signal takes a second to import
         n, taps = len(rate_s), self.taps
         alpha = lfilter(self.weights, [1.0], rate_s, axis=0) if n else np.zeros((0, 3))
         for k in range(min(taps - 1, n)):

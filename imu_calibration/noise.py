@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 STANDARD_GRAVITY = 9.80665
 MICRO_G = 1e-6 * STANDARD_GRAVITY
@@ -99,6 +98,7 @@ def gauss_markov(standard_deviation, correlation_time, step, shape, rng):
     ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, started from its stationary
     distribution.
     """
+    from scipy.signal import lfilter   # here, because scipy.signal takes a second to import
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
     drive[1:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))

@@ -3,7 +3,6 @@
 from collections import deque
 
 import numpy as np
-from scipy.signal import lfilter
 
 RESET_NS = 1_000_000_000
 """A larger step back is a new setting of the clock, a smaller one a sample that came late."""
@@ -96,6 +95,12 @@ class StampedDerivative:
             part = k / (missing + 1)
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
 
+    def seed(self, other):
+        """Take over the past of another derivative of the same stream, as far as this window reaches."""
+        self._newest = other._newest
+        for x, y, z in list(other._window)[-self.taps:]:
+            self._add(x, y, z)
+
     def push_block(self, stamp_ns, values):
         """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
         out = np.empty(values.shape)
@@ -114,6 +119,7 @@ class StampedDerivative:
 
     def _regular(self, stamp_ns, values, start, end, out):
         """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
+        from scipy.signal import lfilter   # here, because scipy.signal takes a second to import
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
         stretch = values[start - taps + 1:end]

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration import turntable
+from imu_calibration.chain import rotation
 from imu_calibration.effects.base import Effect
 
 ARCMIN = np.pi / 180 / 60
@@ -30,7 +30,7 @@ def _axes(table, motion, values):
     for k, angle in enumerate(values, start=1):
         before, axis = np.asarray(table.joints[k - 1].axis, float), np.asarray(table.joints[k].axis, float)
         normal = np.cross(before, axis)
-        turned = Rotation.from_rotvec(angle * normal / np.linalg.norm(normal)).apply(axis)
+        turned = rotation(angle * normal / np.linalg.norm(normal)) @ axis
         joints[k] = replace(joints[k], axis=tuple(turned))
     return [(1.0, replace(table, joints=tuple(joints)), motion)]
 
