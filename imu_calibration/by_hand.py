@@ -1,6 +1,6 @@
 """Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,28 +45,6 @@ class ByHandSettings:
     known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
                                    'too small: misalignments too sure')
     g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it", symptom="off: it shows as drift and turn scatter")
-
-
-@dataclass(frozen=True)
-class NominalScaling:
-    """How raw counts become SI units: ``value = (counts - offset) / scale``; numbers, or three of them."""
-
-    accelerometer_offset: object = 0.0
-    """Counts at zero specific force."""
-    accelerometer_scale: object = 1.0
-    """Counts per m/s^2."""
-    gyroscope_offset: object = 0.0
-    """Counts at zero rate."""
-    gyroscope_scale: object = 1.0
-    """Counts per rad/s."""
-
-    def apply(self, imu):
-        """Return `imu` in SI units."""
-        scales = np.abs(np.concatenate([np.atleast_1d(np.asarray(s, float)) for s in (self.accelerometer_scale, self.gyroscope_scale)]))
-        if not np.all(np.isfinite(scales) & (scales > 0)):
-            raise InputError(f'nominal scale factors must be finite and not zero, got {scales.tolist()}; give counts per SI unit')
-        return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
-                       rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
 
 
 @dataclass(frozen=True)
@@ -164,7 +142,7 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     stills : sequence of slices or (start, stop), optional
         Intervals at rest; found by `windows.find_still` when not given.
     settings : ByHandSettings
-    nominal : NominalScaling, optional
+    nominal : gathering.NominalScaling, optional
         Conversion from counts; the result then refers to the converted values.
     known_turns : sequence of KnownTurn
         Full turns by hand, beside what gravity says.
@@ -182,7 +160,7 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
 
     """
     imu = imu if nominal is None else nominal.apply(imu)
-    time = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
+    time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     poses, noise = average_poses(imu, _as_ranges(imu, stills))
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:
@@ -248,6 +226,14 @@ def _statistics(found, poses, turns, gravity):
         result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
         result[f'{name}_dof'] = float(found.scatter.dof[index])
     return result
+
+
+def _rising(time):
+    """Spread repeated stamps over the step that follows: their order is known, their moments are not."""
+    if np.all(np.diff(time) > 0):
+        return time
+    kept = np.concatenate([[True], np.diff(time) > 0])
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))
 
 
 def _as_ranges(imu, stills):

@@ -54,13 +54,14 @@ def solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback):
     Solution
 
     """
-    state, scatter, steps = _iterate(_first_state(poses, gravity, priors), poses, turns, gravity, modelled, priors, fallback, fallback)
+    memory = {}
+    state, scatter, steps = _iterate(_first_state(poses, gravity, priors), poses, turns, gravity, modelled, priors, fallback, fallback, memory)
     held = np.zeros(N_PARAMS, bool)
-    held[modelled] = choose_held(_factor(state, poses, turns, gravity, scatter)[:, modelled], priors[modelled])
+    held[modelled] = choose_held(_factor(state, poses, turns, gravity, scatter, memory)[:, modelled], priors[modelled])
     state = State(np.where(held, NOMINAL, state.values), state.up, state.drift)
     start = np.maximum(scatter.variance, 0.01 * fallback)
-    state, scatter, more = _iterate(state, poses, turns, gravity, modelled & ~held, LOOSE * priors, start, fallback)
-    factor = _factor(state, poses, turns, gravity, scatter)
+    state, scatter, more = _iterate(state, poses, turns, gravity, modelled & ~held, LOOSE * priors, start, fallback, memory)
+    factor = _factor(state, poses, turns, gravity, scatter, memory)
     cov = _covariance(factor, modelled & ~held, held, priors, state.values, gravity_sd / gravity)
     return Solution(state, cov, held, scatter, factor, steps + more)
 
@@ -108,12 +109,12 @@ def _first_state(poses, gravity, priors):
     return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
 
 
-def _iterate(state, poses, turns, gravity, free, priors, variance, fallback):
+def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, memory):
     """Repeat steps and scatter estimates until neither moves."""
     count = len(poses.start)
     scatter = Scatter(np.array(variance, float), np.full(len(fallback), np.inf), np.full(len(fallback), np.nan))
     for number in range(1, ITERATIONS + 1):
-        system = build_system(state, poses, turns, gravity)
+        system = build_system(state, poses, turns, gravity, memory)
         design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),
                             np.hstack([np.zeros((free.sum(), 5 * count)), np.eye(N_PARAMS)[free][:, free]])])
         residual = np.concatenate([system.residual, (NOMINAL - state.values)[free]])
@@ -132,9 +133,9 @@ def _iterate(state, poses, turns, gravity, free, priors, variance, fallback):
     return state, scatter, number
 
 
-def _factor(state, poses, turns, gravity, scatter):
+def _factor(state, poses, turns, gravity, scatter, memory):
     """Return the triangular factor of the parameters with directions and drifts eliminated, at inflated variances."""
-    system = build_system(state, poses, turns, gravity)
+    system = build_system(state, poses, turns, gravity, memory)
     root = np.sqrt(scatter.total(system.noise, system.component, inflated=True))
     full = np.linalg.qr(np.hstack([system.nuisance, system.main]) / root[:, None], mode='r')
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]

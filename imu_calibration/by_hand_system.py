@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.reference import skew
-from imu_calibration.turn_integration import integrate_turn
+from imu_calibration.turn_integration import integrate_turn, small_rotation
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 """Entries of the accelerometer matrix that the gauge leaves free."""
@@ -22,6 +22,8 @@ COMPONENTS = ('pose', 'drift', 'turn')
 """Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
 
 
+NEAR = 1e-3
+"""rad; the square of it, times a turn's few radians, is what first order leaves out."""
 CALM = 0.05
 """Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
 
@@ -138,14 +140,28 @@ def norm_rows(values, force, gravity):
     return norm - gravity, np.hstack(columns)
 
 
-def build_system(state, poses, turns, gravity):
-    """Stack the rows of poses, bias drifts and turns at the current state."""
-    rows = [_pose_rows(state, poses, gravity), _drift_rows(state, poses, gravity), _calm_rows(state, poses)]
-    rows += [_gravity_turn_rows(state, t) if t.rotation is None else _known_turn_rows(state, t) for t in turns]
+def build_system(state, poses, turns, gravity, memory=None):
+    """
+    Stack the rows of poses, bias drifts and turns at the current state.
+
+    Parameters
+    ----------
+    state : State
+    poses : Poses
+    turns : list of TurnData
+    gravity : float
+    memory : dict, optional
+        Turns integrated before; near their parameters they are corrected to first order instead of being integrated anew.
+
+    """
+    memory = {} if memory is None else memory
+    across = tangent(state.up)
+    rows = [_pose_rows(state, poses, gravity, across), _drift_rows(state, poses, gravity), _calm_rows(state, poses)]
+    rows += [_gravity_turn_rows(state, t, k, memory, across) if t.rotation is None else _known_turn_rows(state, t) for k, t in enumerate(turns)]
     return System(*(np.concatenate(parts) for parts in zip(*rows)))
 
 
-def _pose_rows(state, poses, gravity):
+def _pose_rows(state, poses, gravity, across):
     """``force = bias + matrix @ (gravity * up)``: three rows per pose, two of them spent on its direction."""
     bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
@@ -156,7 +172,7 @@ def _pose_rows(state, poses, gravity):
     for column, (i, j) in enumerate(LOWER):
         main[:, i, 3 + column] = true[:, j]
     nuisance = np.zeros((count, 3, 5 * count))
-    blocks = gravity * matrix @ tangent(state.up)
+    blocks = gravity * matrix @ across
     for k in range(count):
         nuisance[k, :, 2 * k:2 * k + 2] = blocks[k]
     return _flat(residual, nuisance, main, poses.force_sem**2, 0)
@@ -185,19 +201,32 @@ def _drift_columns(count):
     return nuisance
 
 
-def _gravity_turn_rows(state, data):
+def _integrated(state, data, bias, key, memory):
+    """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly moved since."""
+    _, _, _, matrix, sensitivity = unpack(state.values)
+    if key in memory:
+        (old_bias, old_matrix, old_sensitivity), turn = memory[key]
+        psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
+               + turn.by_sensitivity.reshape(3, 9) @ (sensitivity - old_sensitivity).ravel())
+        if np.linalg.norm(psi) < NEAR:
+            return small_rotation(-psi) @ turn.mat_ji, turn
+    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, _true_force(state, data))
+    memory[key] = ((bias, matrix, sensitivity), turn)
+    return turn.mat_ji, turn
+
+
+def _gravity_turn_rows(state, data, key, memory, across):
     """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows."""
-    _, _, bias, matrix, sensitivity = unpack(state.values)
     count, i, j = len(state.up), data.first, data.last
-    turn = integrate_turn(data.time, data.rate, bias + 0.5 * (state.drift[i] + state.drift[j]), matrix, sensitivity, _true_force(state, data))
-    carried = turn.mat_ji @ state.up[i]
-    across_i, across_j = tangent(state.up[[i, j]])
+    mat_ji, turn = _integrated(state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    carried = mat_ji @ state.up[i]
+    across_i, across_j = across[i], across[j]
     by_psi = across_j.T @ skew(carried)
     main, nuisance = np.zeros((2, N_PARAMS)), np.zeros((2, 5 * count))
     main[:, GYRO_BIAS] = by_psi @ turn.by_bias
     main[:, GYRO_MATRIX] = by_psi @ turn.by_matrix.reshape(3, 9)
     main[:, SENSITIVITY] = by_psi @ turn.by_sensitivity.reshape(3, 9)
-    nuisance[:, 2 * i:2 * i + 2] += across_j.T @ turn.mat_ji @ across_i
+    nuisance[:, 2 * i:2 * i + 2] += across_j.T @ mat_ji @ across_i
     nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
     for pose in (i, j):
         nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, GYRO_BIAS]
@@ -207,12 +236,15 @@ def _gravity_turn_rows(state, data):
 def _known_turn_rows(state, data):
     """``matrix^-1 integral(measured - bias) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
     _, _, bias, matrix, sensitivity = unpack(state.values)
-    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, _true_force(state, data))
+    force = _true_force(state, data)
+    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, force)
+    impulse = 0.5 * np.diff(data.time) @ (force[:-1] + force[1:])
     inverse = np.linalg.inv(matrix)
     rotation = inverse @ turn.integral
     main = np.zeros((3, N_PARAMS))
     main[:, GYRO_BIAS] = -turn.duration * inverse
     main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
+    main[:, SENSITIVITY] = -np.einsum('rp,q->rpq', inverse, impulse).reshape(3, 9)
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
     return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
 

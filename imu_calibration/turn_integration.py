@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.reference import skew
 
 MAGNUS_SECOND = 1.0 / 12.0
-"""Weight of ``dt^2 rate_k x rate_{k+1}`` in the rotation vector when the body rate is linear in time between two samples."""
+"""Weight of ``dt^2 rate_k x rate_{k+1}`` and of ``-dt^2 (slope_{k+1} - slope_k)`` in the rotation vector of a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,14 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     """
     Integrate ``rate = matrix^-1 (measured - bias - sensitivity @ force)`` over one stretch of samples.
 
-    Between two samples the rate is taken as linear in time and the rotation vector is the Magnus series to second order
-    (fourth order in the step); the steps are multiplied by a prefix product, log2(n) passes over the samples.
+    The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12 (w1' - w0') + h^2/12 w0 x w1``
+    with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by a prefix product, log2(n) passes
+    over the samples.
 
     Parameters
     ----------
     time : array, shape (n,)
-        Seconds, not falling; n >= 2.
+        Seconds, rising; n >= 2.
     rate_measured : array, shape (n, 3)
         Gyroscope readings, rad/s.
     bias, matrix : arrays, shape (3,) and (3, 3)
@@ -60,12 +61,16 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     rate = centred @ inverse.T
     step = np.diff(time)
     first, second = rate[:-1], rate[1:]
-    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * np.cross(first, second)
+    slopes = _slope_weights(time)
+    slope = slopes[1][:, None] * rate
+    slope[1:] += slopes[0][1:, None] * rate[:-1]
+    slope[:-1] += slopes[2][:-1, None] * rate[1:]
+    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * (np.cross(first, second) - np.diff(slope, axis=0))
     forward = _prefix_product(_quaternion(vectors))
     mat_ki = _matrix_to_sensor(forward)
     to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)
     gain = to_last @ _right_jacobian(vectors)
-    weight = _per_sample(gain, step, first, second)
+    weight = _per_sample(gain, step, first, second, slopes)
     by_inverse = np.einsum('mir,mc->irc', weight, centred)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
     by_sensitivity = np.zeros((3, 3, 3)) if force is None else -np.einsum('mip,mq->ipq', weight @ inverse, force)
@@ -74,12 +79,35 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_sensitivity, integral, path, float(time[-1] - time[0]))
 
 
-def _per_sample(gain, step, first, second):
-    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step and begins the next."""
+def small_rotation(vector):
+    """Return the rotation matrix of one rotation vector, to second order in what the caller keeps small."""
+    cross = skew(vector)
+    return np.eye(3) + cross + 0.5 * cross @ cross
+
+
+def _slope_weights(time):
+    """Return weights of the sample before, the sample itself and the one after in its slope, shape (3, n), 1/s; one-sided at the ends."""
+    step = np.diff(time)
+    before, after = step[:-1], step[1:]
+    weights = np.zeros((3, len(time)))
+    weights[0, 1:-1], weights[2, 1:-1] = -after / (before * (before + after)), before / (after * (before + after))
+    weights[0, -1], weights[2, 0] = -1 / step[-1], 1 / step[0]
+    weights[1] = -weights[0] - weights[2]
+    return weights
+
+
+def _per_sample(gain, step, first, second, slopes):
+    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step, begins the next, and bends its neighbours."""
     half, square = 0.5 * step[:, None, None] * np.eye(3), MAGNUS_SECOND * (step**2)[:, None, None]
     weight = np.zeros((len(step) + 1, 3, 3))
     weight[:-1] += gain @ (half - square * skew(second))
     weight[1:] += gain @ (half + square * skew(first))
+    by_slope = np.zeros_like(weight)
+    by_slope[:-1] += gain * square
+    by_slope[1:] -= gain * square
+    weight += slopes[1][:, None, None] * by_slope
+    weight[:-1] += slopes[0][1:, None, None] * by_slope[1:]
+    weight[1:] += slopes[2][:-1, None, None] * by_slope[:-1]
     return weight
 
 

@@ -70,7 +70,8 @@ def estimate_scatter(design, residual, noise, group, start, fallback):
     """
     count = len(start)
     member = np.array([group == c for c in range(count)], float)
-    free = _evaluate(design, residual, noise, group, member, np.array(fallback, float))[2] >= DOF_LEAST
+    large = 100 * (np.asarray(fallback, float) + (member @ noise) / np.maximum(member.sum(1), 1))  # where only the layout of the rows counts
+    free = _evaluate(design, residual, noise, group, member, large)[2] >= DOF_LEAST
     current = np.where(free, start, fallback)
     for _ in range(STEPS):
         score, information, dof, typical = _evaluate(design, residual, noise, group, member, current)

@@ -1,0 +1,320 @@
+"""Calibration by hand: identities, Jacobians, honest uncertainty, what is held, and real recordings."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.by_hand import ByHandSettings, KnownTurn, calibrate_by_hand
+from imu_calibration.by_hand_poses import g_sensitivity_evidence
+from imu_calibration.by_hand_system import (
+    N_PARAMS, NOMINAL, PARAM_NAMES, SENSITIVITY, Poses, State, TurnData, build_system, moved, norm_rows, unpack)
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.gathering import NominalScaling
+from imu_calibration.samples import ImuSamples
+from imu_calibration.still_search import find_still
+from imu_calibration.turn_integration import integrate_turn
+from imu_calibration.variance_components import estimate_scatter
+
+GRAVITY = 9.81
+FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+
+
+def random_truth(rng, sensitivity=0.0):
+    truth = NOMINAL.copy()
+    truth[0:3] += rng.normal(0, 0.2, 3)
+    truth[3:9] += rng.normal(0, 0.01, 6)
+    truth[9:12] += rng.normal(0, 0.02, 3)
+    truth[12:21] += rng.normal(0, 0.01, 9)
+    truth[SENSITIVITY] += rng.normal(0, sensitivity, 9) if sensitivity else 0.0
+    return truth
+
+
+def turn_samples(start, rotvec, wobble, period, duration):
+    """Attitudes and exact body rates of a turn that starts and ends at rest; the axis wobbles on the way."""
+    s = np.arange(period, duration - 0.5 * period, period) / duration
+    share, speed = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s)**2 / duration
+    bump, bump_speed = 4 * share * (1 - share), 4 * speed * (1 - 2 * share)
+    inner = Rotation.from_rotvec(np.outer(bump, wobble))
+    attitude = start * Rotation.from_rotvec(np.outer(share, rotvec)) * inner
+    return attitude, inner.inv().apply(np.outer(speed, rotvec)) + np.outer(bump_speed, wobble)
+
+
+def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.0, drift_sd=0.0, sensitivity=0.0,
+             attitudes=None, truth=None, wobble=0.4):
+    """A recording held still in poses with turns between; returns (imu, ranges, true parameters)."""
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng, sensitivity) if truth is None else truth
+    bias_f, matrix_f, bias_w, matrix_w, response = unpack(truth)
+    attitude = Rotation.random(random_state=rng) if attitudes is None else attitudes[0]
+    count, force, rate, ranges, total = int(still / period), [], [], [], 0
+    for pose in range(n_poses):
+        up = attitude.inv().apply([0, 0, GRAVITY])
+        drift = rng.normal(0, drift_sd, 3)
+        force.append(np.tile(matrix_f @ up + bias_f + rng.normal(0, pose_sd, 3), (count, 1)))
+        rate.append(np.tile(bias_w + drift + response @ up, (count, 1)))
+        ranges.append(slice(total, total + count))
+        if pose == n_poses - 1:
+            break
+        rotvec = rng.normal(size=3)
+        rotvec *= rng.uniform(1.2, 2.6) / np.linalg.norm(rotvec)
+        if attitudes is not None:
+            rotvec = (attitude.inv() * attitudes[pose + 1]).as_rotvec()
+        on_the_way, body_rate = turn_samples(attitude, rotvec, rng.normal(0, wobble, 3), period, duration)
+        true_force = on_the_way.inv().apply([0, 0, GRAVITY])
+        force.append(true_force @ matrix_f.T + bias_f)
+        rate.append(body_rate @ matrix_w.T + bias_w + drift + true_force @ response.T)
+        total += count + len(body_rate)
+        attitude = attitude * Rotation.from_rotvec(rotvec)
+    force, rate = np.concatenate(force), np.concatenate(rate)
+    stamp_ns = 10**9 + np.round(np.arange(len(force)) * period * 1e9).astype(np.int64)
+    noisy = (force + rng.normal(0, force_sd, force.shape), rate + rng.normal(0, rate_sd, rate.shape))
+    return ImuSamples(stamp_ns, *noisy, 'imu_link'), ranges, truth
+
+
+def differences(found, truth):
+    names = [n for n in found.param_names if n in PARAM_NAMES]
+    index = [found.param_names.index(n) for n in names]
+    error = found.values[index] - truth[[PARAM_NAMES.index(n) for n in names]]
+    return error, found.covariance[np.ix_(index, index)]
+
+
+# identities and Jacobians
+
+def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
+    rng = np.random.default_rng(1)
+    time = np.cumsum(rng.uniform(0.008, 0.012, 300))
+    rate, force = rng.normal(0, 2, (300, 3)), rng.normal(0, 9, (300, 3))
+    bias, matrix, response = rng.normal(0, 0.1, 3), np.eye(3) + rng.normal(0, 0.05, (3, 3)), rng.normal(0, 1e-3, (3, 3))
+    turn = integrate_turn(time, rate, bias, matrix, response, force)
+    true = np.linalg.solve(matrix, (rate - bias - force @ response.T).T).T
+    step = np.diff(time)[:, None]
+    slope = np.gradient(true, time, axis=0)
+    vectors = 0.5 * step * (true[1:] + true[:-1]) + step**2 / 12 * (np.cross(true[:-1], true[1:]) - np.diff(slope, axis=0))
+    attitude = Rotation.identity()
+    for vector in vectors:
+        attitude = attitude * Rotation.from_rotvec(vector)
+    np.testing.assert_allclose(turn.mat_ji, attitude.as_matrix().T, atol=1e-12)
+
+    def psi(*changed):
+        return -Rotation.from_matrix(integrate_turn(time, rate, *changed, force).mat_ji @ turn.mat_ji.T).as_rotvec()
+
+    def slope(make, size=1e-6):
+        return np.stack([(psi(*make(size * e)) - psi(*make(-size * e))) / (2 * size) for e in np.eye(9)], axis=1)
+
+    np.testing.assert_allclose(slope(lambda e: (bias + e[:3], matrix, response))[:, :3], turn.by_bias, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(slope(lambda e: (bias, matrix + e.reshape(3, 3), response)), turn.by_matrix.reshape(3, 9), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(slope(lambda e: (bias, matrix, response + e.reshape(3, 3))), turn.by_sensitivity.reshape(3, 9), rtol=1e-6, atol=1e-6)
+
+
+def test_turn_is_of_third_order_in_the_step():
+    """Halving the step lowers the error by about eight; straight lines between the rates would give four and start at 8e-4."""
+    errors = []
+    for period in (0.04, 0.02):
+        attitude, rate = turn_samples(Rotation.identity(), [1.5, -0.5, 0.8], [0.3, 0.5, -0.2], period, 1.6)
+        rest = np.zeros((1, 3))
+        turn = integrate_turn(period * np.arange(len(rate) + 2), np.concatenate([rest, rate, rest]), np.zeros(3), np.eye(3))
+        errors.append(Rotation.from_matrix(turn.mat_ji @ Rotation.from_rotvec([1.5, -0.5, 0.8]).as_matrix()).magnitude())
+    assert errors[0] < 3e-4 and errors[1] < errors[0] / 7
+
+
+def test_system_is_the_derivative_of_its_residuals():
+    rng = np.random.default_rng(2)
+    up = rng.normal(size=(3, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    state = State(random_truth(rng, 1e-3), up, rng.normal(0, 0.01, (3, 3)))
+    poses = Poses(rng.normal(0, 9, (3, 3)), rng.normal(0, 0.1, (3, 3)), np.full((3, 3), 0.01), np.full((3, 3), 0.001), np.arange(3), np.arange(3) + 1)
+    time = 0.01 * np.arange(100)
+    data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
+    turns = [TurnData(*data, 0, 1), TurnData(*data, 1, 2), TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))]
+    system = build_system(state, poses, turns, GRAVITY)
+    design = np.hstack([system.nuisance, system.main])
+    size = 1e-6
+    slopes = []
+    for step in size * np.eye(design.shape[1]):
+        # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
+        ahead, behind = (build_system(moved(state, s * step, 3), poses, turns, GRAVITY).residual for s in (1, -1))
+        slopes.append(-(ahead - behind) / (2 * size))
+    slopes = np.array(slopes).T
+    accelerometer = np.arange(15, 24)
+    rest = np.setdiff1d(np.arange(design.shape[1]), accelerometer)
+    static = system.component == 0
+    np.testing.assert_allclose(design[static], slopes[static], atol=1e-6)
+    # tangent planes turn with the direction after a turn: to first order only where the turn already fits, so not compared there
+    directions = np.arange(6)
+    np.testing.assert_allclose(design[:, np.setdiff1d(rest, directions)], slopes[:, np.setdiff1d(rest, directions)], atol=2e-6)
+
+
+def test_norm_rows_are_minus_the_derivative_of_the_norm():
+    rng = np.random.default_rng(3)
+    values, force = random_truth(rng), rng.normal(0, 9, (5, 3))
+    columns = norm_rows(values, force, GRAVITY)[1]
+    for k in range(9):
+        step = 1e-6 * np.eye(N_PARAMS)[k]
+        slope = (norm_rows(values + step, force, GRAVITY)[0] - norm_rows(values - step, force, GRAVITY)[0]) / 2e-6
+        np.testing.assert_allclose(columns[:, k], -slope, rtol=1e-6, atol=1e-7)
+
+
+def test_scatter_is_found_beside_the_noise():
+    rng = np.random.default_rng(4)
+    noise, group = rng.uniform(0.5, 1.5, 4000), np.repeat([0, 1, -1, 0], 1000)
+    design = rng.normal(size=(4000, 5))
+    error = rng.normal(size=4000) * np.sqrt(noise + np.array([2.0, 0.0, 0.0])[group])
+    found = estimate_scatter(design, design @ np.ones(5) + error, noise, group, np.array([1.0, 1.0]), np.array([9.0, 9.0]))
+    assert abs(found.variance[0] - 2.0) < 4 * 3.0 * np.sqrt(2 / 2000)
+    assert found.variance[1] < 0.2
+    assert 1900 < found.dof[0] < 2100
+
+
+# recovery of the truth
+
+def test_noise_free_recording_gives_the_truth():
+    imu, ranges, truth = simulate(5, force_sd=1e-9, rate_sd=1e-9, still=0.5, period=0.005, duration=1.0)
+    error, _ = differences(calibrate_by_hand(imu, GRAVITY, ranges), truth)
+    assert np.max(np.abs(error[:9])) < 1e-7  # poses alone: only the 1e-9 noise
+    assert np.max(np.abs(error[9:])) < 1e-6  # the integration's error at 5 ms
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('scatter', [{'pose_sd': 0.003, 'drift_sd': 3e-4}, {'pose_sd': 0.003, 'drift_sd': 3e-4, 'sensitivity': 5e-4}])
+def test_reported_sd_are_honest(scatter):
+    """
+    100 random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
+
+    With 21 (30) parameters of which about a third is independent, the mean over 100 seeds scatters by 0.04; the scatter of
+    poses comes from some 10 degrees of freedom, which the report makes up for.
+    """
+    normalised, inside = [], []
+    for seed in range(100):
+        imu, ranges, truth = simulate(seed, n_poses=14, **scatter)
+        error, covariance = differences(calibrate_by_hand(imu, GRAVITY, ranges), truth)
+        normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
+        inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
+    print(f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %')
+    assert 0.85 < np.mean(normalised) < 1.2
+    assert 0.925 < np.mean(inside) < 0.98
+
+
+def test_counts_give_the_same_as_si():
+    imu, ranges, _ = simulate(6)
+    nominal = NominalScaling(32768, 415, (32768, 32000, 33000), 4770)
+    counts = ImuSamples(imu.stamp_ns, imu.force_s * 415 + 32768, imu.rate_s * 4770 + np.array([32768, 32000, 33000]))
+    np.testing.assert_allclose(calibrate_by_hand(counts, GRAVITY, ranges, nominal=nominal).values, calibrate_by_hand(imu, GRAVITY, ranges).values,
+                               atol=1e-8)
+
+
+def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
+    imu, ranges, _ = simulate(7)
+    right, wrong = calibrate_by_hand(imu, GRAVITY, ranges), calibrate_by_hand(imu, 1.01 * GRAVITY, ranges)
+    np.testing.assert_allclose(wrong.accelerometer[1] * 1.01, right.accelerometer[1], atol=1e-6)
+    np.testing.assert_allclose(wrong.gyroscope[1], right.gyroscope[1], atol=1e-5)
+    unsure = calibrate_by_hand(imu, GRAVITY, ranges, gravity_sd=0.02)
+    np.testing.assert_allclose(unsure.sd_of('accelerometer.matrix.xx')**2 - right.sd_of('accelerometer.matrix.xx')**2,
+                               (0.02 / GRAVITY * right.value('accelerometer.matrix.xx'))**2, rtol=1e-6)
+    assert unsure.sd_of('accelerometer.bias.x') == right.sd_of('accelerometer.bias.x')
+
+
+def test_axes_follow_the_gauge():
+    imu, ranges, _ = simulate(8)
+    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    assert found.gauge['axes'] == 'accelerometer_lower_triangular'
+    for name in ('xy', 'xz', 'yz'):
+        assert found.value(f'accelerometer.matrix.{name}') == 0.0 and found.sd_of(f'accelerometer.matrix.{name}') == 0.0
+
+
+# what cannot be seen
+
+def face_attitudes(ups):
+    """Attitudes in which `ups` (sensor frame) point up."""
+    return [Rotation.align_vectors([[0, 0, 1]], [up])[0] for up in ups]
+
+
+def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
+    """Without the turns, that is: the angles between the faces as the gyroscope saw them do say something."""
+    truth = NOMINAL.copy()
+    imu, ranges, _ = simulate(9, n_poses=6, attitudes=face_attitudes(FACES), truth=truth)
+    found = calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(turn_maximum=0.5))
+    status = dict(zip(found.param_names, found.statuses))
+    for name in ('yx', 'zx', 'zy'):
+        full = f'accelerometer.matrix.{name}'
+        assert status[full] == 'held' and found.value(full) == 0.0
+        assert found.sd_of(full) == found.priors[found.param_names.index(full)]
+    assert status['accelerometer.matrix.xx'] != 'held' and status['accelerometer.bias.z'] != 'held'
+    needs = found.advice[0]['needs']
+    assert set(found.advice[0]['parameters']) >= {f'accelerometer.matrix.{n}' for n in ('yx', 'zx', 'zy')}
+    assert needs.startswith('hold it still with') and sum(axis in needs.split(' with ')[1].split(' up')[0] for axis in 'xyz') >= 2
+
+
+def test_turns_about_one_axis_leave_the_others_weak_or_held():
+    tilts = [Rotation.from_rotvec([angle, 0, 0]) for angle in np.linspace(0, 5.5, 12)]
+    imu, ranges, _ = simulate(10, attitudes=tilts)
+    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    status = dict(zip(found.param_names, found.statuses))
+    assert status['gyroscope.matrix.xx'] == 'determined'
+    assert status['accelerometer.matrix.xx'] != 'determined'
+    assert 'turn it by 180 deg' in found.advice[-1]['needs']
+
+
+def test_too_few_attitudes_are_refused_with_their_number():
+    imu, ranges, _ = simulate(11, n_poses=3)
+    with pytest.raises(NotObservableError, match=r'at least 4 different attitudes .* got 3 in 3 intervals'):
+        calibrate_by_hand(imu, GRAVITY, ranges)
+    with pytest.raises(NotObservableError, match='no interval at rest'):
+        calibrate_by_hand(imu, GRAVITY, [])
+
+
+def test_unknown_choice_for_g_sensitivity_is_refused():
+    imu, ranges, _ = simulate(11, n_poses=5)
+    with pytest.raises(InputError, match='g_sensitivity'):
+        calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(g_sensitivity='maybe'))
+
+
+def test_clipped_and_torn_turns_are_left_out():
+    imu, ranges, truth = simulate(12)
+    rate, stamp_ns = np.clip(imu.rate_s, -2.2, 2.2), imu.stamp_ns.copy()
+    middle = (ranges[4].stop + ranges[5].start) // 2
+    stamp_ns[middle:] += 10**9
+    found = calibrate_by_hand(ImuSamples(stamp_ns, imu.force_s, rate), GRAVITY, ranges)
+    dropped = found.statistics['turns_dropped']
+    assert dropped['clipped'] >= 1 and dropped['gap'] == 1
+    error, covariance = differences(found, truth)
+    assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(covariance)))
+
+
+# further effects
+
+def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
+    imu, ranges, truth = simulate(13, sensitivity=5e-4, drift_sd=1e-4)
+    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    assert 'gyroscope.gyro_g_sensitivity.xx' in found.param_names
+    error, covariance = differences(found, truth)
+    assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(covariance)))
+    without = calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(g_sensitivity='off'))
+    assert without.statistics['drift_scatter_sd'] > 5 * found.statistics['drift_scatter_sd']
+    quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 30)]
+    assert not any('gyroscope.gyro_g_sensitivity.xx' in calibrate_by_hand(imu, GRAVITY, r).param_names for imu, r in quiet)
+
+
+def test_g_sensitivity_test_keeps_its_level():
+    rng = np.random.default_rng(14)
+    values = []
+    for _ in range(2000):
+        poses = Poses(rng.normal(0, 6, (15, 3)), rng.normal(0, 1e-4, (15, 3)), None, None, None, None)
+        values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
+    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.02  # four sd of 2000 trials
+
+
+def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_see():
+    """Poses tilted about x only: the z gyroscope is not seen but for one full turn about z, z up."""
+    tilts = [Rotation.from_rotvec([angle, 0, 0]) for angle in np.linspace(0, 5.5, 12)]
+    imu, ranges, truth = simulate(15, attitudes=tilts, wobble=0.0)
+    _, rate = turn_samples(Rotation.identity(), [0, 0, 2 * np.pi], [0, 0, 0], 0.02, 4.0)
+    bias_f, matrix_f, bias_w, matrix_w, _ = unpack(truth)
+    extra = ImuSamples(imu.stamp_ns[-1] + 20_000_000 * np.arange(1, len(rate) + 1), np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)),
+                       rate @ matrix_w.T + bias_w)
+    both = ImuSamples.concatenate([imu, extra])
+    turn = KnownTurn(len(imu), len(both), (0, 0, 1), 2 * np.pi)
+    before, after = calibrate_by_hand(imu, GRAVITY, ranges), calibrate_by_hand(both, GRAVITY, ranges, known_turns=[turn])
+    name = 'gyroscope.matrix.zz'
+    assert before.sd_of(name) > 5 * after.sd_of(name)
+    assert abs(after.value(name) - truth[PARAM_NAMES.index(name)]) < 4 * after.sd_of(name)
+    assert after.sd_of(name) == pytest.approx(0.017 / (2 * np.pi), rel=0.2)  # a hand's degree in a full turn
