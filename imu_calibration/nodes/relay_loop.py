@@ -1,0 +1,118 @@
+"""
+From a subscription to a publisher as serialized bytes, without the executor in between.
+
+The wait set and the handles are inner parts of rclpy; `available` says whether they are there. All other callbacks of the
+node run in a second thread with the public executor.
+"""
+
+import sys
+import threading
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+try:
+    from rclpy.impl.implementation_singleton import rclpy_implementation as _inner
+    from rclpy.signals import SignalHandlerGuardCondition
+except ImportError:
+    _inner = None
+
+BATCH = 256
+"""Messages taken in a row at most before the context is looked at."""
+WAIT_NS = 500_000_000
+"""Longest wait; a signal ends it at once."""
+SWITCH_INTERVAL = 5e-4
+"""The message thread gets the interpreter back from the other thread within this time, s."""
+
+
+class OutsideExecutor(CallbackGroup):
+    """Callbacks that the executor never takes: their subscription is read by `relay`."""
+
+    def can_execute(self, entity):
+        """Return False: never by the executor."""
+        return False
+
+    def beginning_execution(self, entity):
+        """Return False: never by the executor."""
+        return False
+
+    def ending_execution(self, entity):
+        """Do nothing."""
+
+
+def available():
+    """Return whether this rclpy has the inner parts that `relay` leans on."""
+    wait_set = getattr(_inner, 'WaitSet', None)
+    needed = {wait_set: ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
+              getattr(_inner, 'Subscription', None): ('take_message',), getattr(_inner, 'Publisher', None): ('publish_raw',)}
+    return all(part is not None and all(hasattr(part, name) for name in names) for part, names in needed.items())
+
+
+def relay(node, subscription, publisher, convert):
+    """
+    Publish what `convert` makes of each message until the context ends.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Its other callbacks run in a second thread.
+    subscription : rclpy.subscription.Subscription
+        In a callback group `OutsideExecutor`.
+    publisher : rclpy.publisher.Publisher
+    convert : callable
+        Serialized message (bytes) -> serialized message, or None to publish nothing.
+
+    """
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    failures = []
+    thread = threading.Thread(target=_spin, args=(executor, failures, node.context), name='callbacks', daemon=True)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    thread.start()
+    try:
+        _drain(node.context, subscription, publisher, convert)
+    finally:
+        sys.setswitchinterval(before)
+        executor.shutdown(timeout_sec=2.0)
+        thread.join(timeout=2.0)
+    if failures:
+        raise failures[0]
+
+
+def _spin(executor, failures, context):
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except BaseException as error:
+        failures.append(error)
+        context.try_shutdown()
+
+
+def _drain(context, subscription, publisher, convert):
+    guard = SignalHandlerGuardCondition(context)
+    message_type = subscription.msg_type
+    try:
+        with subscription.handle, publisher.handle, guard.handle, context.handle:
+            wait_set = _inner.WaitSet(1, 1, 0, 0, 0, 0, context.handle)
+            take, publish = subscription.handle.take_message, _publish_raw(publisher)
+            while context.ok():
+                wait_set.clear_entities()
+                wait_set.add_subscription(subscription.handle)
+                wait_set.add_guard_condition(guard.handle)
+                wait_set.wait(WAIT_NS)
+                for _ in range(BATCH):
+                    taken = take(message_type, True)
+                    if taken is None:
+                        break
+                    converted = convert(taken[0])
+                    if converted is not None:
+                        publish(converted)
+    finally:
+        guard.destroy()
+
+
+def _publish_raw(publisher):
+    handle = publisher.handle
+    return handle.publish_raw if hasattr(handle, 'publish_raw') else publisher.publish
