@@ -57,7 +57,8 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
     if nominal is not None:
         imu = nominal.apply(imu)
     hand = calibrate_by_hand(imu, STANDARD_GRAVITY if gravity is None else gravity, gravity_sd=0.02 if gravity is None else 0.0)
-    model = SensorModel()
+    responds = any('.gyro_g_sensitivity.' in name for name in hand.param_names)
+    model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity') if responds else ('bias', 'matrix'))
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
     sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == 'held' for k in order])
@@ -72,9 +73,9 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
 
 def _statistics(hand, counts, n_samples):
     found = hand.statistics
-    per_sensor = {s: {'noise_sd': [float(v) for v in np.broadcast_to(found.get(f'{s}_noise_sd', 0.0), 3)],
-                      'between_window_sd': float(found.get({'accelerometer': 'pose_scatter_sd', 'gyroscope': 'drift_scatter_sd'}[s], 0.0)),
-                      'wander_sd': 0.0} for s in SENSORS}
+    keys = {'accelerometer': ('force_noise_sd', 'pose_scatter_sd'), 'gyroscope': ('rate_noise_sd', 'drift_scatter_sd')}
+    per_sensor = {s: {'noise_sd': [float(v) for v in found[keys[s][0]]], 'between_window_sd': float(found[keys[s][1]]), 'wander_sd': 0.0}
+                  for s in SENSORS}
     return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
             'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}
 
