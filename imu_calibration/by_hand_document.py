@@ -78,5 +78,3 @@ def _statistics(hand, counts, n_samples):
                   for s in SENSORS}
     return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
             'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}
-
-
