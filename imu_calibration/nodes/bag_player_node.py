@@ -1,0 +1,125 @@
+"""bag_player_node: replays a rosbag2 recording onto real topics, as serialized bytes."""
+
+import importlib
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import rclpy
+from rclpy.node import Node
+
+from imu_calibration.errors import InputError
+from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.playback import Batch, Pace, Playback
+from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.settings import setting
+from msg_adapters.rosbag2 import Rosbag2
+
+PAUSE = 0.01
+"""Seconds between the last message of a round and the first of the next, when the bag is played again and again."""
+
+
+@dataclass(frozen=True)
+class PlayerSettings:
+    """What to play, and how fast."""
+
+    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why')
+    topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing')
+    rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible', (0.0, 10000.0), 'too large: messages are lost')
+    clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
+    loop: bool = setting(False, '', 'start again at the end; the stamps then jump back', symptom='the node ends after one round')
+    wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start', (0, 100), 'the first messages are missed')
+    acknowledged: bool = setting(False, '', 'wait until reliable subscribers have got the messages, however fast the pace', symptom='losses at high pace')
+    stop_at_end: bool = setting(True, '', 'end the node after the last message', symptom='the node does not end')
+
+
+class BagPlayerNode(Node):
+    """Publishes the messages of a recording."""
+
+    def __init__(self):
+        super().__init__('bag_player_node')
+        self.settings = declare_parameters(self, PlayerSettings)
+        self._bag = self._open()
+        self._topics = self._choose()
+        self._players = [self._publisher(name) for name in self._topics]
+        first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
+        pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers, self.settings.acknowledged)
+        self._playback = Playback(self, self._players, self._batches(first), pace, first, self._players, self._ended)
+        self._playback.start()
+
+    def close(self):
+        """Stop publishing and close the files."""
+        self._playback.end()
+        self._bag.close()
+
+    def _open(self):
+        path = self.settings.bag
+        if not path:
+            raise InputError("parameter 'bag' must name a rosbag2 recording, none was given; start with --ros-args -p bag:=/path/to/bag")
+        try:
+            return Rosbag2(path)
+        except Exception as error:   # rosbag2 files raise many kinds
+            raise InputError(f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())}; check the path') from error
+
+    def _choose(self):
+        asked = self.settings.topics.split()
+        unknown = [name for name in asked if name not in self._bag.types]
+        if unknown:
+            raise InputError(f'{self.settings.bag} must hold the topics asked for, it has no {", ".join(unknown)}; it holds {", ".join(sorted(self._bag.types))}')
+        chosen = []
+        for name in asked or sorted(self._bag.types):
+            if _message_class(self._bag.types[name]) is not None:
+                chosen.append(name)
+            elif asked:
+                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; leave the topic out')
+            else:
+                self.get_logger().warning(f'{name} is left out: its type {self._bag.types[name]} is not installed')
+        if not chosen:
+            raise InputError(f'{self.settings.bag} must hold a topic whose type is installed, it holds none; check the bag')
+        return chosen
+
+    def _publisher(self, name):
+        latched = any(profile.get('durability') == 'transient_local' for profile in self._bag.qos(name))
+        # Relative, so that namespaces and remappings move it.
+        return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), latched_qos() if latched else output_qos())
+
+    def _batches(self, first_ns):
+        """Yield Batch after Batch, round after round."""
+        offset = 0.0
+        while True:
+            until = offset
+            for raw in self._bag.raw_stretches(self._topics):
+                due = np.maximum.accumulate(np.maximum((raw.received_ns - first_ns) * 1e-9 + offset, until))
+                until = float(due[-1])
+                messages = [raw.packed.view(k) for k in range(len(raw.packed))]
+                yield Batch(due, [self._players[k] for k in raw.topic], messages, until)
+            offset = until + PAUSE
+            if not self.settings.loop:
+                return
+
+    def _ended(self, error):
+        if error is not None and rclpy.ok():
+            self.get_logger().error(f'stopped playing: {type(error).__name__}: {error}')
+        elif error is None:
+            self.get_logger().info(f'played {self._playback.n_published} messages')
+        if error is not None or self.settings.stop_at_end:
+            rclpy.try_shutdown()
+
+
+def _message_class(message_type):
+    """Return the class of a type such as sensor_msgs/msg/Imu, or None when it is not installed."""
+    package, _, name = message_type.split('/') if message_type.count('/') == 2 else ('', '', '')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError, ValueError):
+        return None
+
+
+def main(arguments=None):
+    """Run the node; return the exit code."""
+    return run_node(BagPlayerNode, arguments)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

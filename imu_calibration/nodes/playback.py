@@ -1,0 +1,170 @@
+"""Publishing serialized messages at their times: in real time, faster, or as fast as they are taken."""
+
+import queue
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+AHEAD = 3
+"""Batches that are made ahead of their time."""
+SHORTEST_SLEEP = 0.001
+"""Seconds; messages that are due by then go out together."""
+UNACKNOWLEDGED = 400
+"""Messages that may be under way when every one is to arrive; below the depth of the outputs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Messages of a stretch of time, in order."""
+
+    time: np.ndarray
+    """When each is due, s since the start, not falling, shape (n,)."""
+    publisher: list
+    """Which publisher each goes to."""
+    messages: list
+    """Serialized messages (bytes or memoryviews)."""
+    until: float
+    """End of the stretch, s."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast messages go out."""
+
+    factor: float = 1.0
+    """Seconds of messages per second; 0: as fast as possible."""
+    clock_rate: float = 0.0
+    """/clock messages per second; 0: none."""
+    subscribers: int = 0
+    """Subscribers of each awaited topic to wait for before the start."""
+    acknowledged: bool = False
+    """Whether to wait for reliable subscribers, so that none of them loses anything."""
+
+
+class Playback(threading.Thread):
+    """
+    Publishes batches in a thread of its own; another thread makes them ahead.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    publishers : list of Publisher
+    batches : iterator of Batch
+    pace : Pace
+    clock_start_ns : int
+        Time on /clock at the start.
+    awaited : list of Publisher
+        Those whose subscribers are waited for.
+    on_end : callable
+        Called when all is out, or with the exception that ended it.
+
+    """
+
+    def __init__(self, node, publishers, batches, pace, clock_start_ns=0, awaited=(), on_end=lambda error: None):
+        super().__init__(name='playback', daemon=True)
+        self._publishers, self._batches, self._pace, self._awaited, self._on_end = publishers, batches, pace, awaited, on_end
+        self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
+        self._clock = node.create_publisher(Clock, '/clock', QoSProfile(depth=10)) if pace.clock_rate else None
+        self._ready = queue.Queue(maxsize=AHEAD)
+        self._ending = threading.Event()
+        self.n_published = 0
+
+    def end(self):
+        """Stop as soon as possible."""
+        self._ending.set()
+        if self.is_alive():
+            self.join(5.0)
+
+    def run(self):
+        """Publish everything."""
+        error = None
+        try:
+            maker = threading.Thread(target=self._make, daemon=True)
+            maker.start()
+            self._wait_for_subscribers()
+            start = time.monotonic()
+            while (batch := self._next()) is not None:
+                if isinstance(batch, BaseException):
+                    raise batch
+                self._publish(batch, start)
+            if not self._ending.is_set():
+                self._settle()
+        except BaseException as raised:
+            error = raised
+        if not self._ending.is_set():
+            self._on_end(error)
+
+    def _make(self):
+        try:
+            for batch in self._batches:
+                self._offer(batch)
+                if self._ending.is_set():
+                    return
+            self._offer(None)
+        except BaseException as error:
+            self._offer(error)
+
+    def _offer(self, batch):
+        while not self._ending.is_set():
+            try:
+                return self._ready.put(batch, timeout=0.2)
+            except queue.Full:
+                continue
+
+    def _next(self):
+        while not self._ending.is_set():
+            try:
+                return self._ready.get(timeout=0.2)
+            except queue.Empty:
+                continue
+        return None
+
+    def _wait_for_subscribers(self):
+        while any(publisher.get_subscription_count() < self._pace.subscribers for publisher in self._awaited):
+            if self._ending.wait(0.05):
+                return
+        if self._awaited and self._pace.subscribers:
+            self._ending.wait(0.3)   # the other side may find us a little later than we find it
+
+    def _publish(self, batch, start):
+        done = 0
+        while done < len(batch.messages) and not self._ending.is_set():
+            upto, now = len(batch.messages), batch.until
+            if self._pace.factor:
+                now = (time.monotonic() - start) * self._pace.factor
+                upto = int(np.searchsorted(batch.time, now, side='right'))
+            if self._pace.acknowledged:
+                upto = min(upto, done + UNACKNOWLEDGED)
+            self._tick(float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now)
+            for publisher, message in zip(batch.publisher[done:upto], batch.messages[done:upto], strict=True):
+                publisher.publish(bytes(message))
+            self.n_published += upto - done
+            if self._pace.acknowledged and upto > done:
+                self._wait_for_acknowledgement()
+            done = upto
+            if self._pace.factor and done < len(batch.messages):
+                wait = (batch.time[done] - now) / self._pace.factor
+                time.sleep(min(max(wait, SHORTEST_SLEEP), 0.05))
+
+    def _wait_for_acknowledgement(self):
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=5.0))
+
+    def _tick(self, now):
+        """Publish /clock when it is due."""
+        if self._clock is None or now < self._next_clock:
+            return
+        self._next_clock = now + max(self._pace.factor, 1e-3) / self._pace.clock_rate
+        stamp_ns = self._clock_start_ns + int(round(now * 1e9))
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = stamp_ns // 10**9, stamp_ns % 10**9
+        self._clock.publish(message)
+
+    def _settle(self):
+        self._wait_for_acknowledgement()
+        self._ending.wait(0.5)

@@ -1,0 +1,185 @@
+"""simulator_node: a turntable that carries an IMU, live."""
+
+import queue
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, JointState, Temperature
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from imu_calibration.calibration import DETERMINED, Calibration
+from imu_calibration.cli import files
+from imu_calibration.documents import calibration_to_text
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.joint_trajectory import TableMotion
+from imu_calibration.live_simulation import LiveSimulation
+from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.playback import Batch, Pace, Playback
+from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.noise import GRADES
+from imu_calibration.profiles import make_profile
+from imu_calibration.resources import config_file
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.settings import setting
+from imu_calibration.simulation import SimulationOptions, random_values
+from imu_calibration.turntable import Table
+from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows
+
+STRETCH = 0.2
+"""Seconds of simulated time that are computed together, times the time factor; a trajectory takes effect that much later."""
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """The table, its motion, the IMU and the pace."""
+
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml', symptom='joint names are not those expected')
+    profile: str = setting('quick', '', "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until a trajectory comes on "
+                           'joint_trajectory', symptom='the node refuses and lists the names')
+    repeat: bool = setting(False, '', 'start the profile again at its end', symptom='the table rests after one round')
+    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting', symptom='the node does not end')
+    calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU', symptom='another IMU is simulated')
+    grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)), symptom='noise too large or small')
+    seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
+    imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
+    imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time', (1.0, 20000.0), 'too large: the machine cannot keep up')
+    joint_rate: float = setting(100.0, 'Hz', 'JointState messages per second of simulated time', (1.0, 20000.0), 'too small: fast motion is not followed')
+    velocity: bool = setting(True, '', 'whether JointState holds velocities', symptom='velocities are missing')
+    encoder_resolution: float = setting(0.0, 'rad', 'step of the joint positions; 0: continuous', (0.0, 0.1), 'too large: rough reference')
+    stamp_jitter: float = setting(0.0, 's', 'standard deviation of the Imu stamps', (0.0, 0.01), 'too large: stamps out of order')
+    temperature: bool = setting(False, '', 'publish imu/temperature, warming up from 25 C', symptom='thermal effects cannot be calibrated')
+    frame_id: str = setting('imu_link', '', 'frame of the Imu messages', symptom='another frame_id')
+    truth: bool = setting(False, '', 'publish imu/truth: what a perfect IMU would measure', symptom='no messages on imu/truth')
+    time_factor: float = setting(1.0, '1', 'seconds of simulated time per second; 0: as fast as possible', (0.0, 10000.0), 'too large: messages are lost')
+    clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
+    start_time: float = setting(0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day')
+    wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start', (0, 100), 'the first messages are missed')
+    acknowledged: bool = setting(False, '', 'wait until reliable subscribers have got the messages, however fast the pace', symptom='losses at high pace')
+
+
+class SimulatorNode(Node):
+    """Publishes what a LiveSimulation makes."""
+
+    def __init__(self):
+        super().__init__('simulator_node')
+        self.settings = settings = declare_parameters(self, SimulatorSettings)
+        self._table, self._motion = self._make_table()
+        model, values = self._true_imu()
+        start_ns = int(settings.start_time * 1e9) or time.time_ns()
+        self._simulation = LiveSimulation(model, values, self._table, self._motion, self._options(), settings.seed, start_ns)
+        self._trajectories = queue.Queue()
+        self._publish_truth(model, values)
+        kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
+        kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [(Imu, 'imu/truth')] * settings.truth
+        publishers = [self.create_publisher(kind, topic, output_qos()) for kind, topic in kinds]
+        self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
+        pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers, settings.acknowledged)
+        self._playback = Playback(self, publishers, self._batches(), pace, start_ns, publishers[:1], self._ended)
+        self.create_subscription(JointTrajectory, 'joint_trajectory', self._follow, 10)
+        self._playback.start()
+
+    def close(self):
+        """Stop publishing."""
+        self._playback.end()
+
+    def _make_table(self):
+        settings = self.settings
+        table = files.read_table(Path(settings.table_file or config_file('table_three_axis.yaml')).expanduser())
+        if settings.profile in ('', 'none'):
+            return table, TableMotion(None, len(table.joint_names))
+        profile = make_profile(settings.profile, settings.seed, table)
+        if profile.table is not None:
+            table = Table.from_mapping(profile.table)
+        return table, TableMotion(profile, len(table.joint_names), settings.repeat)
+
+    def _true_imu(self):
+        settings = self.settings
+        if settings.grade not in GRADES:
+            raise InputError(f"parameter 'grade' must be one of {', '.join(sorted(GRADES))}, got '{settings.grade}'")
+        if settings.calibration_file:
+            calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
+            return calibration.model, calibration.values
+        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(self._table.joint_names))
+        return model, random_values(model, settings.grade, settings.seed if settings.imu_seed < 0 else settings.imu_seed)
+
+    def _options(self):
+        settings = self.settings
+        noise = replace(GRADES[settings.grade].noise, encoder_resolution=settings.encoder_resolution, stamp_jitter=settings.stamp_jitter)
+        return SimulationOptions(settings.imu_rate, settings.joint_rate, noise, settings.velocity, 25.0 if settings.temperature else None,
+                                 frame_id=settings.frame_id)
+
+    def _publish_truth(self, model, values):
+        truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), self.settings.frame_id,
+                            {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': self.settings.seed}})
+        self._truth = self.create_publisher(String, '~/truth', latched_qos())
+        self._truth.publish(String(data=calibration_to_text(truth)))
+
+    def _batches(self):
+        """Yield Batch after Batch, a trajectory that came taking over between two of them."""
+        until, step = 0.0, STRETCH * max(self.settings.time_factor, 1.0)
+        while until < self._motion.end or not self.settings.stop_at_end:
+            while not self._trajectories.empty():
+                self._take_over(until, self._trajectories.get())
+            until = min(until + step, self._motion.end) if self.settings.stop_at_end else until + step
+            yield self._batch(self._simulation.take(until), until)
+
+    def _batch(self, block, until):
+        parts = [(self._to['imu/data_raw'], block.imu, encode_imu), (self._to['joint_states'], block.joints, self._encode_joints)]
+        if 'imu/temperature' in self._to:
+            parts.append((self._to['imu/temperature'], block.temperature, encode_temperature))
+        if 'imu/truth' in self._to:
+            parts.append((self._to['imu/truth'], block.truth, encode_imu))
+        due = np.concatenate([(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts])
+        publishers = [publisher for publisher, samples, _ in parts for _ in range(len(samples))]
+        messages = [message for _, samples, encode in parts if len(samples) for message in rows(encode(samples))]
+        order = np.argsort(due, kind='stable')
+        return Batch(due[order], [publishers[k] for k in order], [messages[k] for k in order], until)
+
+    def _encode_joints(self, joints):
+        return encode_joints(joints, with_velocity=self.settings.velocity)
+
+    def _follow(self, message):
+        names = list(self._table.joint_names)
+        missing = [name for name in names if name not in message.joint_names]
+        if missing:
+            self.get_logger().warning(f'a trajectory must name the joints {", ".join(names)}, {", ".join(missing)} are missing; it is not followed')
+            return
+        self._trajectories.put(message)
+
+    def _take_over(self, now, message):
+        order = [list(message.joint_names).index(name) for name in self._table.joint_names]
+        points = message.points
+        times = [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points]
+
+        def column(name):
+            found = [list(getattr(point, name)) for point in points]
+            return np.array(found)[:, order] if found and all(len(row) == len(message.joint_names) for row in found) else None
+
+        positions = column('positions')
+        try:
+            self._motion.follow(now, times, np.zeros((0, 0)) if positions is None else positions, column('velocities'), column('accelerations'))
+        except ImuCalibrationError as error:
+            self.get_logger().warning(f'{error}; the trajectory is not followed')
+
+    def _ended(self, error):
+        if error is not None and rclpy.ok():
+            self.get_logger().error(f'stopped publishing: {type(error).__name__}: {error}')
+        elif error is None:
+            self.get_logger().info(f'the profile has ended, {self._playback.n_published} messages were published')
+        rclpy.try_shutdown()
+
+
+def main(arguments=None):
+    """Run the node; return the exit code."""
+    return run_node(SimulatorNode, arguments)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
