@@ -8,6 +8,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
@@ -27,7 +28,8 @@ def generate_launch_description():
         Node(
             package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'),
-                        {'calibration_file': LaunchConfiguration('calibration'), 'use_sim_time': LaunchConfiguration('use_sim_time')}],
+                        {'calibration_file': ParameterValue(LaunchConfiguration('calibration'), value_type=str),
+                         'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
             remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('imu/data_corrected', LaunchConfiguration('corrected'))],
         ),
     ])

@@ -8,6 +8,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
@@ -15,7 +16,7 @@ CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 
 def generate_launch_description():
     """Describe the simulator and the two nodes that listen to it."""
-    table = {'table_file': LaunchConfiguration('table')}
+    table = {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str)}
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description, YAML'),

@@ -21,8 +21,8 @@ EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simul
 ROSDEP_KEYS = {
     'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip',
-    # what rosbags itself decompresses with, installed with it; compression is in the standard library from Python 3.14 on
-    'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
+    # installed with those that need them; compression is in the standard library from Python 3.14 on
+    'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
 }
 READ_SETUP = '''
 import json, setuptools
