@@ -1,0 +1,111 @@
+"""
+What the whole ``imu_calibration calibrate`` of a long bag costs, beside rosbags merely iterating over its raw messages.
+
+Every repetition times both on the same bag one after the other, so that a busy machine slows both; the ratio is the median over the
+repetitions. The command is run as a user runs it, imports included. Run it alone with
+``python benchmarks/bench_calibrate.py [--minutes M] [--repetitions N]``.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+if __name__ == '__main__':
+    sys.path.insert(0, str(ROOT))
+
+from rosbags.highlevel import AnyReader   # noqa: E402
+
+from benchmarks.bags import long_session, write_bench_bag   # noqa: E402
+from imu_calibration.resources import config_file   # noqa: E402
+
+REPETITIONS = 5
+MINUTES = 60.0
+LIMITS = {'mcap': 2.0, 'sqlite3': 4.0}
+"""Storage -> largest ratio to bare iteration."""
+GROWTH, GROWTH_LIMIT = 4.0, 4.4
+"""Factor of the length, and the largest factor of the time that goes with it."""
+MEMORY_LIMIT_MB = 500.0
+
+
+class Row(NamedTuple):
+    """One line of the benchmark."""
+
+    name: str
+    """What was measured."""
+    value: float
+    """The figure, median over the repetitions."""
+    unit: str
+    """Its unit."""
+    limit: float
+    """What it may be at most."""
+    note: str
+    """The times behind it."""
+
+
+def bench_calibrate(minutes=MINUTES, repetitions=REPETITIONS):
+    """Return the rows: time against bare iteration, growth with the length, and peak memory, per storage."""
+    with TemporaryDirectory() as folder:
+        session, rows = long_session(minutes), []
+        short = tuple(samples.select(samples.stamp_ns - samples.stamp_ns[0] < 60e9 * minutes / GROWTH) for samples in session)
+        for storage, limit in LIMITS.items():
+            long_bag = write_bench_bag(Path(folder, f'long_{storage}'), minutes, storage, session=session)
+            short_bag = write_bench_bag(Path(folder, f'short_{storage}'), minutes / GROWTH, storage, session=short)
+            rows += _measure(long_bag, short_bag, storage, limit, repetitions, Path(folder, 'result'))
+    return rows
+
+
+def _measure(long_bag, short_bag, storage, limit, repetitions, output):
+    iterate(long_bag)   # reads the file into the page cache, so that both find it there
+    runs = [(iterate(long_bag), *calibrate(long_bag, output), *calibrate(short_bag, output)) for _ in range(repetitions)]
+    bare, long, long_mb, short, short_mb = (median(column) for column in zip(*runs, strict=True))
+    return [
+        Row(f'calibrate against bare iteration, {storage}', median(run[1] / run[0] for run in runs), 'x', limit, f'{long:.1f} s against {bare:.1f} s'),
+        Row(f'time at {GROWTH:g} x the length, {storage}', median(run[1] / run[3] for run in runs), 'x', GROWTH_LIMIT, f'{long:.1f} s against {short:.1f} s'),
+        Row(f'peak memory, {storage}', max(run[2] for run in runs), 'MB', MEMORY_LIMIT_MB, f'{short_mb:.0f} MB at a quarter of the length'),
+    ]
+
+
+def iterate(bag):
+    """Return the seconds that rosbags takes for all raw messages of a bag."""
+    start = time.perf_counter()
+    with AnyReader([bag]) as reader:
+        for _ in reader.messages():
+            pass
+    return time.perf_counter() - start
+
+
+def calibrate(bag, output):
+    """Return (seconds, peak memory in MB) of calibrating a bag in a process of its own."""
+    command = [sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_three_axis.yaml')),
+               '--output', str(output), '--no-report']
+    start = time.perf_counter()
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode not in (0, 3):
+        raise RuntimeError(f'calibrate must end with 0 or 3, it ended with {process.returncode}; run it by hand: {" ".join(command)}')
+    return seconds, usage.ru_maxrss / 1024
+
+
+def main():
+    """Print the rows; exit code 1 when a limit is passed."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--minutes', type=float, default=MINUTES, help='length of the bags at 1 kHz, default 60')
+    parser.add_argument('--repetitions', type=int, default=REPETITIONS)
+    options = parser.parse_args()
+    rows = bench_calibrate(options.minutes, options.repetitions)
+    for row in rows:
+        print(f'{row.name:50s} {row.value:7.2f} {row.unit:2s} (at most {row.limit:g} {row.unit})  {row.note}')
+    return 1 if any(row.value > row.limit for row in rows) else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
