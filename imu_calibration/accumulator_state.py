@@ -33,7 +33,8 @@ def to_bytes(gathered, model):
     header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in _MODEL}, 'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
-              'within': [list(key) for key in accumulator.within], **{name: getattr(gathered, name) for name in _PLAIN}}
+              'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
+              'slow_rows': accumulator.slow_rows, **{name: getattr(gathered, name) for name in _PLAIN}}
     arrays = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
               'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
               'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
@@ -42,7 +43,8 @@ def to_bytes(gathered, model):
     for sensor in _sensors(rows):
         for name in ('mean', 'noise_variance', 'inflation'):
             arrays[f'{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
-    arrays |= {f'within.{number}': factor for number, factor in enumerate(accumulator.within.values())}
+    for name in ('within', 'slow'):
+        arrays |= {f'{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
     target = io.BytesIO()
     np.savez(target, **arrays)
     return target.getvalue()
@@ -102,11 +104,11 @@ def _gathered(header, arrays):
         statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
                       for sensor, (mean, variance, inflation) in columns.items()}
         rows.append(WindowStatistics(kind, float(numbers[k, 0]), float(numbers[k, 1]), int(whole[k, 0]), statistics, int(whole[k, 1])))
-    within = {tuple(key): arrays[f'within.{number}'] for number, key in enumerate(header['within'])}
+    within, slow = ({tuple(key): arrays[f'{name}.{number}'] for number, key in enumerate(header[name])} for name in ('within', 'slow'))
     poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
     plain = {name: header[name] for name in _PLAIN}
     plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
-    return Gathered(Accumulator(rows, within, header['samples'], header['windows']), poses=poses, **plain)
+    return Gathered(Accumulator(rows, within, slow, header['slow_rows'], header['samples'], header['windows']), poses=poses, **plain)
 
 
 def _sensors(rows):

@@ -305,10 +305,17 @@ class _Problem:
         for kind, factor in self.within[sensor].items():
             squares = (self._misfit(sensor, factor, values)**2).sum(axis=0)
             scale[kind] = np.maximum(squares / (self.dof_within[kind] * noise.white_variance), 1.0)
+            if self.accumulator.slow_rows.get(kind, 0) > self.accumulator.windows[kind]:
+                scale[kind] = np.maximum(scale[kind], self._slow_misfit(sensor, kind, values) / (noise.white_variance * noise.inflation))
         noise = replace(noise, kind_scale=scale)
         design, information = self._linearised(sensor, values, noise, noises)
         offsets = estimate_offsets(design, self.mean_variance(noise), self.times, self.sessions, information)
         return replace(noise, offset_sd=offsets[0], wander_sd=offsets[1], wander_time=offsets[2])
+
+    def _slow_misfit(self, sensor, kind, values):
+        """Return the variance per sample that the slow part of the misfit speaks of: more than the samples' own when it is correlated."""
+        squares = (self._misfit(sensor, self.accumulator.slow[sensor, kind], values)**2).sum(axis=0)
+        return squares / (self.accumulator.slow_rows[kind] - self.accumulator.windows[kind])
 
     def _linearised(self, sensor, values, noise, noises):
         """Return mean rows ``[design | residual]`` in the parameters, and the Gram matrix of what else is known of them."""

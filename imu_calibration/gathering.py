@@ -194,8 +194,9 @@ def restrict(accumulator, wide, narrow):
             index[name] = np.arange(start, start + width)
             start += width
         chosen[sensor] = np.concatenate([index[name] for name, _ in narrow.groups(sensor)] + [np.arange(start, start + 3)])
-    small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows))
-    small.within = {(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in accumulator.within.items()}
+    small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
+    small.within, small.slow = ({(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
+                                for factors in (accumulator.within, accumulator.slow))
     small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
     return small
 

@@ -1,6 +1,6 @@
 """The streaming least-squares system: windows go in one at a time, memory stays bounded, systems of several recordings merge."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -24,6 +24,10 @@ class Accumulator:
     """Windows in order of time with their mean rows (WindowStatistics whose `within` is empty)."""
     within: dict = field(default_factory=dict)
     """(sensor, kind) -> triangular factor of the centred rows."""
+    slow: dict = field(default_factory=dict)
+    """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
+    slow_rows: dict = field(default_factory=dict)
+    """Kind -> number of rows behind `slow`."""
     samples: dict = field(default_factory=dict)
     """Kind -> number of samples."""
     windows: dict = field(default_factory=dict)
@@ -32,25 +36,32 @@ class Accumulator:
     def add(self, window):
         """Take one window (WindowStatistics)."""
         for sensor in SENSORS:
-            self._stack((sensor, window.kind), window.sensors[sensor].within)
+            statistics = window.sensors[sensor]
+            _stack(self.within, (sensor, window.kind), statistics.within)
+            if statistics.slow_rows:
+                _stack(self.slow, (sensor, window.kind), statistics.slow)
+        self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + statistics.slow_rows
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
         if len(self.rows) > CAPACITY:
             self._thin()
 
+    def copy(self):
+        """Return an accumulator that goes its own way; rows and factors are never changed in place."""
+        return Accumulator(list(self.rows), *(dict(getattr(self, f.name)) for f in fields(self)[1:]))
+
     def merge(self, other):
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
-        for key, factor in other.within.items():
-            self._stack(key, factor)
+        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
+            for key, factor in its.items():
+                _stack(mine, key, factor)
+        for kind, count in other.slow_rows.items():
+            self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
         self.rows.extend(other.rows)
         for kind, count in other.samples.items():
             self._count(kind, count, other.windows[kind])
         while len(self.rows) > CAPACITY:
             self._thin()
-
-    def _stack(self, key, factor):
-        known = self.within.get(key)
-        self.within[key] = factor if known is None or not len(known) else triangular(np.concatenate([known, factor])) if len(factor) else known
 
     def _count(self, kind, samples, windows):
         self.samples[kind] = self.samples.get(kind, 0) + samples
@@ -67,12 +78,18 @@ class Accumulator:
                 index += 1
                 continue
             for sensor in SENSORS:
-                self._stack((sensor, first.kind), _difference(first, second, sensor))
+                _stack(self.within, (sensor, first.kind), _difference(first, second, sensor))
             thinned.append(_joined(first, second))
             index += 2
         if len(thinned) == len(self.rows):
             del thinned[0]
         self.rows = thinned
+
+
+def _stack(factors, key, factor):
+    """Add rows to the triangular factor under `key`."""
+    known = factors.get(key)
+    factors[key] = factor if known is None or not len(known) else triangular(np.concatenate([known, factor])) if len(factor) else known
 
 
 def _difference(first, second, sensor):
@@ -94,7 +111,7 @@ def _joined(first, second):
 
 
 def _without_within(window):
-    if all(len(s.within) == 0 for s in window.sensors.values()):
+    if all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
         return window
     sensors = {name: SensorStatistics(s.mean, s.within[:0].copy(), s.noise_variance, s.inflation) for name, s in window.sensors.items()}
     return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session)

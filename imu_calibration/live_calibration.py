@@ -259,10 +259,7 @@ class _LiveCollector(Collector):
 
 def _copied(gathered):
     """Return a copy that shares only what nobody changes in place."""
-    accumulator = copy.copy(gathered.accumulator)
-    accumulator.rows = list(accumulator.rows)
-    accumulator.within, accumulator.samples, accumulator.windows = (
-        dict(part) for part in (accumulator.within, accumulator.samples, accumulator.windows))
+    accumulator = gathered.accumulator.copy()
     return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), windows=[], kept=[], counts=dict(gathered.counts))
 
 

@@ -8,6 +8,8 @@ from scipy.linalg import lapack
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.sensor_model import columns
 
+SLOW_TIME = 0.25
+"""Length of the pieces whose means tell correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
 BLOCK = 2000
 """Rows per orthogonal factorisation: tall blocks cost more than stacked small ones."""
 
@@ -29,6 +31,10 @@ class SensorStatistics:
     """Variance of the output about its mean (static windows; else NaN), shape (3,)."""
     inflation: np.ndarray
     """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
+    slow: np.ndarray | None = None
+    """Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; its misfit shows what white noise does not."""
+    slow_rows: int = 0
+    """Number of those pieces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +76,9 @@ def reduce_window(window, model, table, session=0, column_function=columns):
     if static and temperature is not None:
         temperature = np.array([temperature.mean()])
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    reduce = _reduce_static if static else _reduce_moving
-    sensors = {sensor: reduce(column_function(model, sensor, table, window.motion, temperature), outputs[sensor]) for sensor in SENSORS}
+    length = 0 if static or len(window.time) < 2 else int(round(SLOW_TIME * (len(window.time) - 1) / (window.time[-1] - window.time[0])))
+    designs = {sensor: column_function(model, sensor, table, window.motion, temperature) for sensor in SENSORS}
+    sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
     return WindowStatistics(window.kind, float(window.time.mean()), float(window.time[-1] - window.time[0]), len(window.time), sensors, session)
 
 
@@ -81,11 +88,13 @@ def _reduce_static(design, output):
     return SensorStatistics(mean, np.zeros((0, len(mean))), variance, inflation)
 
 
-def _reduce_moving(design, output):
+def _reduce_moving(design, output, length):
     rows = np.concatenate([design, output], axis=1)
     mean = rows.mean(axis=0)
-    unknown = np.full(3, np.nan)
-    return SensorStatistics(mean, triangular(rows - mean), unknown, unknown)
+    rows -= mean
+    unknown, pieces = np.full(3, np.nan), len(rows) // length if length > 1 else 0
+    slow = rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
+    return SensorStatistics(mean, triangular(rows), unknown, unknown, triangular(slow), pieces)
 
 
 def batch_statistics(output, batches=16):
