@@ -6,7 +6,6 @@ import numpy as np
 
 from imu_calibration.profiles import make_profile
 from imu_calibration.resources import config_file
-from imu_calibration.samples import ImuSamples, JointSamples
 from imu_calibration.sensor_model import SensorModel
 from imu_calibration.simulation import SimulationOptions, random_values, simulate
 from imu_calibration.turntable import Table

@@ -72,7 +72,8 @@ def _check(recording, corrected_topic):
     if foreign:
         raise InputError(f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them')
     if corrected_topic in recording.message_counts:
-        raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already beside {name}; choose another name')
+        raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already beside {name}; '
+                         'choose another name')
 
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):

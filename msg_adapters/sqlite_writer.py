@@ -31,7 +31,8 @@ class SqliteWriter:
 
     def add_topic(self, topic_id, name, definition, qos):
         """Declare a topic; `definition` is a TypeDefinition."""
-        self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)', (topic_id, name, definition.type, 'cdr', qos, definition.digest))
+        self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
+                                (topic_id, name, definition.type, 'cdr', qos, definition.digest))
         known = self.connection.execute('SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)).fetchone()
         if not known and definition.text:
             self.connection.execute(

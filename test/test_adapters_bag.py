@@ -47,7 +47,8 @@ def test_rosbags_reads_what_is_written(tmp_path, storage):
         messages = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(reader.topics['/imu/data_raw'].connections)]
         assert reader.topics['/joint_states'].msgcount == 60
         assert reader.duration == joints.stamp_ns[-1] - imu.stamp_ns[0] + 1 or reader.duration == imu.stamp_ns[-1] - imu.stamp_ns[0] + 1
-    np.testing.assert_array_equal([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in messages], imu.force_s)
+    force_s = [[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for m in messages]
+    np.testing.assert_array_equal(force_s, imu.force_s)
     assert {m.orientation_covariance[0] for m in messages} == {-1.0}
 
 

@@ -154,7 +154,8 @@ def test_absent_readings_come_as_nan():
 
 
 def test_joint_states_that_do_not_fit_are_counted_by_reason():
-    messages = [joint_message((1, 0), '', ['a', 'b'], [1, 2]), joint_message((2, 0), '', ['a'], [1]), joint_message((3, 0), '', ['b', 'a'], [])]
+    messages = [joint_message((1, 0), '', ['a', 'b'], [1, 2]), joint_message((2, 0), '', ['a'], [1]),
+                joint_message((3, 0), '', ['b', 'a'], [])]
     for deserialize in (None, GENERAL[JOINT_STATE_TYPE]):
         decoder = JointDecoder(('b', 'a'), deserialize)
         samples = decoder.decode(Packed.join([serialize(message) for message in messages]))
@@ -183,8 +184,10 @@ def test_the_written_definitions_are_the_standard_ones(message_type):
 
 def test_definitions_with_comments_are_standard_and_others_are_not():
     text = standard_definition(IMU_TYPE).text
-    noisy = '# A comment = with a sign\r\n\n' + text.replace('string frame_id', 'string frame_id  # where').replace(
-        'MSG: std_msgs/Header', 'MSG: std_msgs/msg/Header').replace('float64 w', 'float64 w 1').replace('\nint32 sec', '\nint32 K=5\nint32 sec')
+    noisy = '# A comment = with a sign\r\n\n' + text
+    for plain, other in (('string frame_id', 'string frame_id  # where'), ('MSG: std_msgs/Header', 'MSG: std_msgs/msg/Header'),
+                         ('float64 w', 'float64 w 1'), ('\nint32 sec', '\nint32 K=5\nint32 sec')):
+        noisy = noisy.replace(plain, other)
     assert is_standard(IMU_TYPE, 'ros2msg', noisy) and is_standard(IMU_TYPE, '', '')
     assert not is_standard(IMU_TYPE, 'ros2msg', text.replace('float64[9] angular', 'float32[9] angular'))
     assert not is_standard(IMU_TYPE, 'ros2msg', text.replace('string frame_id\n', 'string frame_id\nuint32 seq\n'))
@@ -195,7 +198,8 @@ def test_definitions_with_comments_are_standard_and_others_are_not():
 def test_live_messages_give_the_samples_of_a_bag(as_bytes):
     imu, joints, temperature = make_session(40)
     gatherer = LiveGatherer(joints.names, max_messages=30)
-    for add, table, message_type in ((gatherer.add_imu, encode_imu(imu), IMU_TYPE), (gatherer.add_joints, encode_joints(joints), JOINT_STATE_TYPE),
+    for add, table, message_type in ((gatherer.add_imu, encode_imu(imu), IMU_TYPE),
+                                     (gatherer.add_joints, encode_joints(joints), JOINT_STATE_TYPE),
                                      (gatherer.add_temperature, encode_temperature(temperature), TEMPERATURE_TYPE)):
         for row in table:
             add(row.tobytes() if as_bytes else STORE.deserialize_cdr(row.tobytes(), message_type))

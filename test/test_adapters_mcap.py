@@ -70,7 +70,8 @@ def test_messages_outside_of_chunks(tmp_path, parts, finished):
 def test_chunks_without_indexes_and_definitions_in_the_middle(tmp_path, parts):
     imu, joints, definitions, messages = parts
     cut = len(messages) // 3
-    data = chunk(definitions + b''.join(messages[:cut])) + b''.join(messages[cut:2 * cut]) + chunk(definitions + b''.join(messages[2 * cut:]))
+    first, middle, last = (b''.join(messages[part]) for part in (slice(cut), slice(cut, 2 * cut), slice(2 * cut, None)))
+    data = chunk(definitions + first) + middle + chunk(definitions + last)
     private = record(0x80, b'of an application')
     check(write_file(tmp_path / 'x.mcap', private + data), imu, joints)
 
@@ -98,7 +99,7 @@ def test_walking_finds_every_message_whatever_the_pattern(runs, cut):
     np.testing.assert_array_equal(found.size, [len(data) - 31 for data in records])
     cut = min(cut, len(content))
     shorter, _, end = walk(whole[:len(content) - cut])
-    assert end <= len(content) - cut and len(shorter.start) == sum(start + size <= end for start, size in zip(found.start, found.size, strict=True))
+    assert end <= len(content) - cut and len(shorter.start) == int((found.start + found.size <= end).sum())
     offsets = {number: found.start[found.channel == number] - 31 for number in (3, 1, 2)}
     indexed = indexed_messages(whole[:-9], list(offsets.items()))
     if records:

@@ -72,7 +72,8 @@ def test_ros1_bags_take_the_general_path(tmp_path):
             for k, row in enumerate(table):
                 message = ros2.deserialize_cdr(row.tobytes(), kind)
                 header = store.types['std_msgs/msg/Header'](k, message.header.stamp, message.header.frame_id)
-                message = store.types[kind](header, *[getattr(message, name) for name in list(vars(message)) if name != 'header' and name[0] != '_'])
+                fields = [value for name, value in vars(message).items() if name != 'header' and name[0] != '_']
+                message = store.types[kind](header, *fields)
                 writer.write(connection, 10**18 + k, store.serialize_ros1(message, kind))
     with open_recording(path) as recording:
         blocks = list(recording.blocks(('inner', 'outer', 'middle')))
