@@ -1,0 +1,42 @@
+"""Numbers as the report prints them: a real minus sign, thin units, no more digits than are known."""
+
+import numpy as np
+
+from imu_calibration.units import for_people, significant, with_sd
+
+
+def text(value, digits=3):
+    """Return a number with `digits` significant digits and a real minus sign; an en dash for what is not a number."""
+    if value is None or not np.isfinite(value):
+        return '–'
+    shown = significant(float(value), digits)
+    if 'e' in shown:
+        mantissa, _, power = shown.partition('e')
+        shown = f'{mantissa}·10{_raised(int(power))}'
+    return shown.replace('-', '−')
+
+
+def _raised(power):
+    return str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
+
+
+def fixed(value, places):
+    """Return a number with so many decimals and a real minus sign."""
+    return '–' if value is None or not np.isfinite(value) else f'{value:.{places}f}'.replace('-', '−')
+
+
+def pair(value, sd):
+    """Return (value, sd) as text with the digits that the sd supports."""
+    return tuple(part.replace('-', '−') for part in with_sd(value, sd))
+
+
+def people(value, sd, unit):
+    """Return (value, sd, unit) as text in people's units; dimensionless stays plain."""
+    factor, shown = for_people(unit)
+    return (*pair(value * factor, sd * factor), '' if shown == '1' else shown)
+
+
+def in_unit(value, unit, digits=3):
+    """Return a value in people's units with its unit."""
+    factor, shown = for_people(unit)
+    return text(value * factor, digits) + ('' if shown == '1' else f' {shown}')

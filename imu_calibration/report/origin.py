@@ -1,0 +1,60 @@
+"""Where the calibration comes from: recording, table, settings, what was used and what was dropped."""
+
+from imu_calibration.report.numbers import fixed, in_unit, text
+from imu_calibration.settings import describe
+from imu_calibration.workflow import CalibrationOptions
+
+
+def recording_facts(result):
+    """Return (what, value) of the recording, for the head of the page."""
+    calibration, conditions = result.calibration, result.calibration.conditions
+    bags = calibration.provenance.get('bags') or []
+    facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'), ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
+             ('length', _duration(conditions.get('duration_s'))), ('frame', calibration.frame_id or 'not named'),
+             ('reference', 'gravity, by hand' if result.table is None else f'table with {len(result.table.joints)} joints ({", ".join(result.table.joint_names)})')]
+    if conditions.get('largest_rate'):
+        facts.append(('fastest turn', in_unit(conditions['largest_rate'], 'rad/s')))
+    if conditions.get('temperature_range_c'):
+        facts.append(('temperature', ' to '.join(fixed(t, 1) for t in conditions['temperature_range_c']) + ' °C'))
+    return facts
+
+
+def _duration(seconds):
+    if seconds is None:
+        return 'unknown'
+    minutes, rest = divmod(round(seconds), 60)
+    return f'{minutes} min {rest} s' if minutes else f'{rest} s'
+
+
+def origin_section(result):
+    """Return the tables of windows, drops, settings, table description and provenance."""
+    calibration, statistics = result.calibration, result.calibration.statistics
+    used = [(kind, count, (statistics.get('samples_used') or {}).get(kind, '')) for kind, count in (statistics.get('windows') or {}).items()]
+    stream = statistics.get('stream') or {}
+    kept_out = [(reason, count) for reason, count in stream.items() if reason not in dict(statistics.get('windows') or {}) and count]
+    bags = [(bag['name'], bag['sha256']) for bag in calibration.provenance.get('bags') or []]
+    return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()), 'settings': _settings(result.options),
+            'table': _table(result.table), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
+            'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing') for sensor in ('accelerometer', 'gyroscope', 'reference')]}
+
+
+def _settings(options):
+    """Return (name, value, unit, meaning, whether it was changed) of the settings in force."""
+    options = options or CalibrationOptions()
+    return [(name, text(getattr(options.windows, name)), unit, meaning, getattr(options.windows, name) != default)
+            for name, default, unit, meaning, _, _ in describe(options.windows)]
+
+
+def _table(table):
+    if table is None:
+        return []
+    rows = [(f'joint {joint.name}', f'axis ({", ".join(text(a) for a in joint.axis)})' +
+             (f', at ({", ".join(text(a) for a in joint.xyz)}) m' if any(joint.xyz) else '')) for joint in table.joints]
+    rows += [('up', f'({", ".join(text(a) for a in table.up)})'),
+             ('gravity', f'{fixed(table.gravity_value, 5)} m/s²' + (' as given' if table.gravity is not None else ', WGS 84 normal gravity')
+              + (f', sd {text(table.gravity_sd)} m/s²' if table.gravity_sd else ''))]
+    rows.append(('place', 'not given: Earth rate is estimated' if table.latitude is None
+                 else f'latitude {text(table.latitude, 5)}°' + (f', azimuth {text(table.azimuth_deg, 4)}°' if table.azimuth_deg is not None else ', azimuth not given')))
+    rows.append(('mount', f'roll, pitch, yaw ({", ".join(text(a) for a in table.mount_rpy_deg)})°'
+                 + ('; place not given' if table.mount_xyz is None else f'; at ({", ".join(text(a) for a in table.mount_xyz)}) m')))
+    return rows

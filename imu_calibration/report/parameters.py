@@ -1,0 +1,70 @@
+"""The parameter table: every value with its standard deviation, tolerance, status and the reason for it."""
+
+import numpy as np
+
+from imu_calibration import observability
+from imu_calibration.calibration import DETERMINED, HELD, IN_REFERENCE
+from imu_calibration.estimation import make_prior
+from imu_calibration.report.numbers import in_unit, pair, people, text
+
+TITLES = {'bias': 'bias', 'matrix': 'matrix (scale factors and axis directions)', 'accel_size_effect': 'size effect: origin to the sensitive point of each axis',
+          'lever_arm': 'lever arm of the triad (the table’s business)', 'table_tilt': 'table tilt', 'earth_rate': 'Earth rate in the level frame'}
+SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
+USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked', 'none': 'belongs to the table or the session, not removed'}
+
+
+def parameter_groups(result):
+    """Return the table: groups with title, explanation and rows."""
+    calibration, needs = result.calibration, motions_needed(result)
+    groups = []
+    for effect in calibration.model.effects:
+        part = calibration.model.slices[effect.sensor, effect.name]
+        rows = [_row(result, index, effect.unit_of(k), effect.components[k], needs) for k, index in enumerate(range(part.start, part.stop))]
+        section = 'reference' if effect.name in IN_REFERENCE else effect.sensor
+        groups.append({'sensor': SENSOR_TITLES[section], 'title': TITLES.get(effect.name, effect.name.replace('_', ' ')), 'name': effect.name,
+                       'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
+    return groups
+
+
+def _row(result, index, unit, component, needs):
+    calibration = result.calibration
+    value, sd, tolerance = calibration.values[index], calibration.sd[index], result.tolerances[index]
+    shown = people(value, sd, unit)
+    share = sd / tolerance
+    return {'name': calibration.param_names[index], 'component': component, 'value': shown[0], 'sd': shown[1], 'unit': shown[2],
+            'si': ' ± '.join(pair(value, sd)) + ('' if unit == '1' else f' {unit}'), 'tolerance': in_unit(tolerance, unit, 2),
+            'share': text(share, 2), 'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
+
+
+def _bar(share):
+    """Return the length of the bar in percent: logarithmic, a thousandth of the tolerance to ten times it."""
+    return round(float(np.clip((np.log10(max(share, 1e-9)) + 3) / 4, 0.02, 1.0)) * 100, 1)
+
+
+def _why(calibration, index, share, needs):
+    status, name = calibration.status[index], calibration.param_names[index]
+    if calibration.sd[index] == 0:
+        return 'fixed by the choice of axes'
+    if status == DETERMINED:
+        return f'sd is {text(100 * share, 2)} % of the tolerance'
+    motion = needs.get(name, '')
+    wanted = f'; needs: {motion}' if motion else ''
+    if status == HELD:
+        return 'the recording says next to nothing: value and sd are the prior’s' + wanted
+    return f'estimated, but its sd is {text(share, 2)} times the tolerance' + wanted
+
+
+def motions_needed(result):
+    """Return parameter name -> the motion that would serve it best, for all that are not determined."""
+    calibration = result.calibration
+    if all(status == DETERMINED for status in calibration.status):
+        return {}
+    if result.table is None:
+        return {name: d['needs'] for d in calibration.undetermined for name in d['parameters']}
+    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, make_prior(result.solution.model).sd)
+    return {name: motion if not np.isfinite(sd) else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'
+            for name, (motion, sd) in needed.items()}
+
+
+def _tolerance(result, name):
+    return result.tolerances[result.calibration.param_names.index(name)]

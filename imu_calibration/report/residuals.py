@@ -1,0 +1,132 @@
+"""Residuals: windows before and after calibration beside the noise floor, their autocorrelation, chi-square, noise and wander."""
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
+from imu_calibration.report.numbers import in_unit, text
+from imu_calibration.sensor_model import predict
+from imu_calibration.units import for_people
+
+UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
+LAG_SECONDS = 2.0
+"""Longest lag that is drawn."""
+KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins', 'dynamic': 'within dynamic stretches'}
+
+
+def residual_section(result, errors):
+    """Return figures and tables of the residuals."""
+    figures = {sensor: draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor),
+                            f'Errors of the {sensor} in every window, before and after calibration') for sensor in SENSORS}
+    traces = autocorrelation(result) if result.table is not None else {}
+    return {'windows': figures, 'autocorrelation': draw('autocorrelation', (8.6, 2.7), _Lags(traces), 'Autocorrelation of the residuals within moving windows') if traces else None,
+            'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration), 'errors': error_rows(errors)}
+
+
+class _Windows:
+    """Two panels over time: before, and after with the noise floor."""
+
+    def __init__(self, errors, sensor):
+        self.errors, self.sensor = errors, sensor
+
+    def __call__(self, figure):
+        errors, sensor = self.errors, self.sensor
+        factor, unit = for_people(UNIT[sensor])
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.25])
+        self._points(upper, errors.before[sensor] * factor, hollow=True)
+        floor = 2 * errors.floor[sensor].max(axis=1) * factor
+        order = np.argsort(errors.time)
+        lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
+        self._points(lower, errors.after[sensor] * factor)
+        upper.set_title(f'before: rms {text(errors.rms(sensor, "before") * factor)} {unit}')
+        lower.set_title(f'after: rms {text(errors.rms(sensor, "after") * factor)} {unit}; grey: two sd of what noise alone leaves')
+        for axes in (upper, lower):
+            axes.axhline(0, color=GREY, lw=0.6)
+            axes.set_ylabel(unit)
+        lower.set_xlabel('time, s')
+        axis_legend(upper, 'lower right', bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+
+    def _points(self, axes, values, hollow=False):
+        for kind in np.unique(self.errors.kind):
+            rows = self.errors.kind == kind
+            for column, colour in enumerate(AXIS.values()):
+                axes.plot(self.errors.time[rows], values[rows, column], MARKER.get(kind, 'o'), color=colour, markersize=3.8, mfc='none' if hollow else colour,
+                          mew=0.8, alpha=0.9, ls='none')
+
+
+def autocorrelation(result):
+    """
+    Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise), from the kept moving windows.
+
+    Each window's residual is taken about its own mean; windows are weighted by their length.
+    """
+    model, values, table = result.solution.model, result.solution.values, result.table
+    windows = [w for w in result.gathered.kept if len(w) >= 100][:60]
+    if not windows:
+        return {}
+    period = float(np.median([w.period for w in windows]))
+    n_lags = max(2, min(int(LAG_SECONDS / period), min(len(w) for w in windows) // 2))
+    sums = {sensor: np.zeros((n_lags, 3)) for sensor in SENSORS}
+    for window in windows:
+        for sensor, measured, predicted in zip(SENSORS, (window.force_s, window.rate_s), predict(model, values, table, window.motion, window.temperature_c)):
+            rest = measured - predicted
+            sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
+    bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
+    return {sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound) for sensor, total in sums.items()}
+
+
+def _lagged(rest, n_lags):
+    """Return sums of products at each lag, shape (n_lags, 3), by FFT."""
+    size = 2**int(np.ceil(np.log2(2 * len(rest))))
+    spectrum = np.fft.rfft(rest, size, axis=0)
+    return np.fft.irfft(np.abs(spectrum)**2, size, axis=0)[:n_lags]
+
+
+class _Lags:
+    """One panel per sensor."""
+
+    def __init__(self, traces):
+        self.traces = traces
+
+    def __call__(self, figure):
+        panels = figure.subplots(1, len(self.traces), sharey=True, squeeze=False)[0]
+        for axes, (sensor, (lags, values, bound)) in zip(panels, self.traces.items()):
+            axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
+            for column, colour in enumerate(AXIS.values()):
+                axes.plot(lags[1:], values[1:, column], color=colour, lw=1.0)
+            limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
+            axes.set_ylim(-limit, limit)
+            axes.set_title(sensor)
+            axes.set_xlabel('lag, s')
+        panels[0].set_ylabel('autocorrelation')
+        axis_legend(panels[-1])
+
+
+def noise_rows(calibration):
+    """Return one row per sensor: noise of a sample, factor at low frequency, scatter between windows, wander."""
+    rows = []
+    for sensor in SENSORS:
+        found, unit = calibration.statistics.get(sensor, {}), UNIT[sensor]
+        white = np.asarray(found.get('noise_sd', [np.nan] * 3), float)
+        wander = found.get('wander_sd') or 0.0
+        rows.append({'sensor': sensor, 'noise': [in_unit(v, unit) for v in white], 'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
+                     'between': in_unit(found.get('between_window_sd', 0.0), unit, 2) if found.get('between_window_sd') else 'none seen',
+                     'wander': f'{in_unit(wander, unit, 2)} over {text(found.get("wander_time_s"), 2)} s' if wander else 'none seen',
+                     'moving': in_unit(found['residual_rms_moving'], unit) if found.get('residual_rms_moving') is not None else '–'})
+    return rows
+
+
+def chi2_rows(calibration):
+    """Return chi-square per degree of freedom by kind of window, one row per kind."""
+    found = {sensor: calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {} for sensor in SENSORS}
+    kinds = list(dict.fromkeys(kind for sensor in SENSORS for kind in found[sensor]))
+    return [{'kind': KIND_TEXT.get(kind, kind), 'values': [text(found[sensor].get(kind)) for sensor in SENSORS]} for kind in kinds]
+
+
+def error_rows(errors):
+    """Return rms errors of window means by kind, before and after."""
+    rows = []
+    for kind in dict.fromkeys(errors.kind.tolist()):
+        cells = [in_unit(errors.rms(sensor, which, kind), UNIT[sensor]) for sensor in SENSORS for which in ('before', 'after')]
+        rows.append({'kind': KIND_TEXT[kind].replace('within ', ''), 'count': int((errors.kind == kind).sum()), 'cells': cells})
+    return rows

@@ -1,0 +1,79 @@
+"""How to apply the calibration: the formula, the numbers to copy, and one sample carried through."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from imu_calibration.compensation import arms_of, compensate, invertible
+from imu_calibration.reference import lever_matrix
+from imu_calibration.report.numbers import fixed, text
+from imu_calibration.turntable import reference_motion
+
+
+def worked_sample(result):
+    """Return the section: matrices, arms, one raw sample, each step and the outcome."""
+    calibration = result.calibration
+    sample = _sample(result)
+    force, rate, alpha = (getattr(sample, name) for name in ('force', 'rate', 'alpha'))
+    corrected = compensate(calibration, force[None], rate[None], alpha[None], sample.temperature)
+    inverses = {s: np.linalg.inv(calibration.value(s, 'matrix')) for s in ('accelerometer', 'gyroscope')}
+    linear_force = inverses['accelerometer'] @ (force - calibration.value('accelerometer', 'bias'))
+    plain = not further_effects(calibration)
+    arms = arms_of(calibration)
+    turning = lever_matrix(corrected.rate, alpha[None])[0]
+    return {
+        'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.value(s, 'bias')], 'unit': unit, 'inverse': [[fixed(v, 7) for v in row] for row in inverses[s]]}
+                     for name, s, unit in (('Accelerometer', 'accelerometer', 'm/s²'), ('Gyroscope', 'gyroscope', 'rad/s'))],
+        'arms': [[fixed(v * 1e3, 3) for v in row] for row in arms] if np.any(arms) else None, 'further': further_effects(calibration), 'where': sample.where,
+        'steps': _steps(sample, linear_force, inverses['gyroscope'] @ (rate - calibration.value('gyroscope', 'bias')), turning, arms, corrected, plain),
+        'reference_known': sample.true_force is not None}
+
+
+def further_effects(calibration):
+    """Return the effects beside bias, matrix and size effect that compensation takes out."""
+    return [e.name for e in invertible(calibration.model).effects if e.name not in ('bias', 'matrix', 'accel_size_effect')]
+
+
+def _steps(sample, linear_force, linear_rate, turning, arms, corrected, plain):
+    steps = [('raw rate', 'rad/s', sample.rate, ''), ('corrected rate', 'rad/s', linear_rate if plain else corrected.rate[0], 'M⁻¹ (raw − b), gyroscope'),
+             ('raw specific force', 'm/s²', sample.force, ''), ('bias and matrix taken out', 'm/s²', linear_force, 'M⁻¹ (raw − b), accelerometer')]
+    if np.any(arms):
+        felt = np.array([turning[i] @ arms[i] for i in range(3)])
+        steps.append(('lever-arm terms', 'm/s²', felt, 'row i: (α × rᵢ + ω × (ω × rᵢ))ᵢ'))
+    steps.append(('corrected specific force', 'm/s²', corrected.force[0], 'the line above taken off' if np.any(arms) and plain else ''))
+    if sample.true_force is not None:
+        steps += [('the table says: force', 'm/s²', sample.true_force, 'noise of one sample remains'), ('the table says: rate', 'rad/s', sample.true_rate, '')]
+    return [{'what': what, 'unit': unit, 'values': [fixed(v, 5) for v in values], 'how': how, 'mark': what.startswith('corrected')}
+            for what, unit, values, how in steps]
+
+
+def _sample(result):
+    """Return the sample that is carried through: the fastest of the kept ones, else a pose."""
+    kept = [window for window in result.gathered.kept if len(window.motion) == len(window.time)] if result.table is not None else []
+    if kept:
+        return _moving_sample(result, kept)
+    rows = result.solution.poses if result.table is None else None
+    if rows is not None:
+        force, rate = rows.force[0], rows.rate[0]
+    else:
+        row = result.gathered.accumulator.rows[0]
+        force, rate = (row.sensors[s].mean[-3:] for s in ('accelerometer', 'gyroscope'))
+    return SimpleNamespace(force=force, rate=rate, alpha=np.zeros(3), temperature=_reference_temperature(result), true_force=None, true_rate=None,
+                           where='the mean of the first pose at rest')
+
+
+def _reference_temperature(result):
+    return np.full(1, result.calibration.model.temperature_ref_c)
+
+
+def _moving_sample(result, kept):
+    speeds = [np.linalg.norm(window.rate_s, axis=1) for window in kept]
+    best = int(np.argmax([speed.max() for speed in speeds]))
+    window, index = kept[best], int(np.argmax(speeds[best]))
+    ref = reference_motion(result.table, window.motion.select(slice(index, index + 1)))
+    arm = result.calibration.value('accelerometer', 'lever_arm') if result.calibration.has('accelerometer', 'lever_arm') else np.zeros(3)
+    true_force = ref.force_s[0] + lever_matrix(ref.rate_s, ref.alpha_s)[0] @ arm
+    temperature = _reference_temperature(result) if window.temperature_c is None else window.temperature_c[index:index + 1]
+    where = f'the fastest sample that was kept, at {text(window.time[index], 4)} s, with the table’s angular acceleration α = ({", ".join(fixed(a, 3) for a in ref.alpha_s[0])}) rad/s²'
+    return SimpleNamespace(force=window.force_s[index], rate=window.rate_s[index], alpha=ref.alpha_s[0], temperature=temperature, true_force=true_force,
+                           true_rate=ref.rate_s[0], where=where)
