@@ -1,6 +1,6 @@
 """A model is a list of effects: its parameters, its columns, its prediction."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -57,6 +57,10 @@ class SensorModel:
     """Temperature at which thermal effects vanish, degrees Celsius."""
     point: dict = field(default_factory=dict)
     """Where the columns were linearised: effect name -> values."""
+
+    def __reduce__(self):
+        """Travel to other processes without what was worked out: effects hold functions that cannot be sent."""
+        return SensorModel, tuple(getattr(self, f.name) for f in fields(self))
 
     @cached_property
     def effects(self):
