@@ -93,16 +93,16 @@ def _thinned(window, most=50):
 
 
 def may_be_clipped(windows, sensor):
-    """Return whether several samples share the largest output exactly, and few come close below it."""
-    size = np.concatenate([np.abs(measured(w, sensor)).max(axis=1) for w in windows])
+    """Return whether several samples share the largest output exactly, more than share any of the next smaller outputs."""
+    size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
     level = size.max(initial=0.0)
-    at = size >= level * (1 - 1e-12)
-    below = size[~at]
-    if at.sum() < LEAST_CLIPPED or not len(below):
+    at = int((size >= level * (1 - 1e-12)).sum())
+    if at < LEAST_CLIPPED or level == 0:
         return False
-    gap = level - below.max()
-    near = (below > level - max(2 * gap, 1e-3 * level)).sum() if gap > 0 else 0
-    return bool(at.sum() >= LEAST_CLIPPED and (at.sum() > 3 * near or at.sum() > 0.2 * near and at.sum() > 20) and level > 0)
+    # A coarse output repeats all its values; those just below the largest show how often.
+    below = np.sort(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)])[-500:]
+    _, repeats = np.unique(below, return_counts=True)
+    return bool(at > 3 * (repeats[-5:].mean() if len(repeats) else 1.0))
 
 
 def find_saturation(windows, predicted, noise_sd, sensor):
@@ -127,7 +127,7 @@ def find_saturation(windows, predicted, noise_sd, sensor):
     beyond = norm.sf((level - np.abs(expected)) / noise_sd)
     n_expected = float(beyond.sum())
     agree = float(beyond[clipped].sum())
-    if n_expected < 3 or agree < 0.5 * clipped.sum() * 0.5:
+    if n_expected < LEAST_CLIPPED or agree < 0.25 * clipped.sum():
         return None
     far = np.abs(expected) > level
     before, after = output - expected, output - np.clip(expected, -level, level)

@@ -1,6 +1,6 @@
 """From windows to findings: the one function that asks every effect, and the sentence that says what was found."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,13 +53,41 @@ def diagnose(windows, table, model, settings=None, progress=None):
         When there are too few windows to hold any out.
 
     """
+    found = investigate(windows, table, model, progress)
+    result = _assembled(windows, table, found)
+    if progress:
+        progress(1.0)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Investigation:
+    """The search before it is put into words."""
+
+    used: list
+    """Windows that were fitted to, without clipped samples."""
+    attempt: Attempt
+    """The last linearisation with its evidence."""
+    explained: Explained
+    """What noise leaves and what the choices leave."""
+    named: list
+    """Questions that became findings, in the order found."""
+    limits: list
+    """Saturations."""
+    not_testable: list
+    """Effects that could not be asked about."""
+
+
+def investigate(windows, table, model, progress=None):
+    """Return the `Investigation` of a recording: the search itself, arguments as in `diagnose`."""
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < LEAST_WINDOWS:
         raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, {len(used)} were found; '
                                  'rest in more poses, or spin and swing the table')
     report = progress or (lambda share: None)
+    model = with_joints_of(model, table)
     used, limits = _without_clipping(used, table, model)
-    effects, not_testable = testable_effects(replace_joints(model, table), table, used)
+    effects, not_testable = testable_effects(model, table, used)
     asked = without_saturation(effects)
     attempt = Attempt(used, table, model, asked, progress=lambda share: report(0.5 * share))
     chosen = attempt.search.run()
@@ -70,13 +98,10 @@ def diagnose(windows, table, model, settings=None, progress=None):
         chosen = attempt.search.run()
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
-    named = explained.pruned(chosen)
-    result = _assembled(windows, used, table, model, attempt, explained, named, limits, not_testable)
-    report(1.0)
-    return result
+    return Investigation(used, attempt, explained, explained.pruned(chosen), limits, not_testable)
 
 
-def replace_joints(model, table):
+def with_joints_of(model, table):
     """Return the model with the joints of the table."""
     return model if tuple(model.joint_names) == tuple(table.joint_names) else replace(model, joint_names=tuple(table.joint_names))
 
@@ -101,15 +126,18 @@ def _without_clipping(windows, table, model):
     return censoring.without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found
 
 
-def _assembled(windows, used, table, model, attempt, explained, named, limits, not_testable):
+def _assembled(windows, table, found):
+    attempt, named, limits = found.attempt, found.named, found.limits
+    model = attempt.baseline
     baseline = extended_solution(attempt.lifted, attempt.noise, model, [])
     solution = extended_solution(attempt.lifted, attempt.noise, model, named, limits) if named or limits else baseline
     findings = [_clipping(limit, solution) for limit in limits]
-    for place, question in enumerate(named):
-        findings.append(_finding(attempt, explained, named, place, solution, table))
+    for place in range(len(named)):
+        findings.append(_finding(attempt, found.explained, named, place, solution, table))
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), unexplained(attempt, explained, named), _candidates(attempt, named), tuple(not_testable), baseline, solution,
-                     heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution), len(used), int(attempt.locked.sum()))
+    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), _candidates(attempt, named), tuple(found.not_testable), baseline,
+                     solution, heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution), len(found.used),
+                     int(attempt.locked.sum()))
 
 
 def _finding(attempt, explained, named, place, solution, table):

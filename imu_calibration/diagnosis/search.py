@@ -12,8 +12,14 @@ PRICE = 1.0
 """Price of a parameter beside what held-out prediction charges, nats."""
 TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
+ABSURD = 50.0
+"""A size beyond this many times the largest that the catalogue knows of is no explanation."""
 MOST_FINDINGS = 6
+"""Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
+"""Members of a class of effects that are not told apart, the named one included."""
+CONTAINS = {'lever_arm': 'accel_size_effect'}
+"""Effects that are special cases of others; the simpler one that does as well wins, and is no rival of the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,7 @@ class Search:
         if question.effect.name.endswith('_bandwidth') and value[0] < 0:
             return False
         largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
-        return bool(np.all(np.abs(value) - 3 * sd < 20 * largest))
+        return bool(np.all(np.abs(value) - 3 * sd < ABSURD * largest))
 
     def run(self):
         """Return the chosen questions in the order in which they were found."""
@@ -137,6 +143,8 @@ class Search:
         for other in self.others(chosen):
             trial = chosen[:place] + [other] + chosen[place + 1:]
             difference = self.cost(trial) - cost
+            if CONTAINS.get(question.name) == other.name:
+                continue
             if difference < TIE and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)

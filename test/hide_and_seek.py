@@ -1,0 +1,209 @@
+"""
+Hide and seek: effects are hidden in sessions made by physics, and `diagnose` has to find them.
+
+Run as ``python test/hide_and_seek.py`` (or ``make hide-and-seek``): about an hour on two cores. Prints a confusion matrix and the figures and
+draws them into docs/. ``--seeds 3 --fast`` and ``--parts effects,none`` run less; what was run stands beside every figure.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+
+import numpy as np  # noqa: E402
+from hide_and_seek_report import report  # noqa: E402
+from hiding import Sizes, all_effects, options_of, record  # noqa: E402
+from physics_draw import OUTSIDE  # noqa: E402
+
+from imu_calibration.diagnosis import diagnose  # noqa: E402
+from imu_calibration.diagnosis.diagnose import investigate  # noqa: E402
+from imu_calibration.diagnosis.gain import heldout_gain  # noqa: E402
+from imu_calibration.diagnosis.stories import sensors_of  # noqa: E402
+
+FIRST_SEED = 5000
+"""Seeds from here on were never used while the search was developed."""
+PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power')
+DEG = np.pi / 180
+TRAPS = {
+    'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0}, 'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG}, 'two_seconds_lost': {'dropped': 'both'},
+    'knock_on_table': {'knock': True}, 'wrong_covariance': {'wrong_covariance': True}, 'wander': {'noise': 'realistic'},
+    'mounted_at_45_deg': {'mount_rpy_deg': (45.0, 0.0, 0.0)}, 'two_axis_table': {'table': 'two_axis'}, 'only_at_rest': {'profile': 'static_only'},
+}
+"""What must not produce a finding."""
+SEPARATED = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'accel_size_effect', 'lever_arm', 'gyro_quadratic', 'gyro_scale_asymmetry',
+             'accel_bandwidth', 'gyro_bandwidth', 'time_offset', 'accel_thermal_bias', 'accel_bias_drift')
+"""Effects with near relatives, sought again in sessions made to separate them."""
+POWER = ('accel_quadratic', 'gyro_g_sensitivity', 'time_offset', 'gyro_thermal_bias', 'table_tilt')
+POWER_SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+
+
+def seek(recording, hidden, **labels):
+    """Diagnose a recording and return one row of the record."""
+    start = time.process_time()
+    diagnosis = diagnose(recording.windows, recording.table, recording.model)
+    row = {**labels, 'hidden': sorted(hidden or ()), 'seconds': time.process_time() - start,
+           'found': [f.effect for f in diagnosis.findings], 'classes': [list(f.indistinguishable_from) for f in diagnosis.findings],
+           'unexplained': any(rest.significant for rest in diagnosis.unexplained.values()), 'errors_in_sd': {}}
+    for finding in diagnosis.findings:
+        if finding.effect in recording.truth and finding.effect in (hidden or ()):
+            true = np.ravel(recording.truth[finding.effect])
+            if finding.effect.endswith('_saturation'):
+                value = next(iter(finding.parameters.values()))[0]
+                row['level_error'] = float(abs(value / true[0] - 1))
+                continue
+            row['errors_in_sd'][finding.effect] = [float((value - t) / sd) for (value, sd, _), t in zip(finding.parameters.values(), true)]
+    return row
+
+
+def oracle(recording, effect):
+    """Return the held-out rms of what was found over that of a searcher who was told the effect, or None where nothing compares."""
+    found = investigate(recording.windows, recording.table, recording.model)
+    told = [q for q in found.attempt.questions if q.name == effect]
+    if not told or found.limits:
+        return None
+    search = found.attempt.search
+    best = min(told, key=lambda q: search.evidence.loss(search.used([q])))
+    sensors = sensors_of(best.effect)
+    pair = [heldout_gain(found.attempt, [], choice, sensors) for choice in (found.named, [best])]
+    return pair[0].heldout_rms_after / pair[1].heldout_rms_after if pair[0].measure == pair[1].measure and pair[0].sensor == pair[1].sensor else None
+
+
+def effects_of_seed(seed, noise, effects, factor=5.0, profile='random', table='three_axis', part='effects'):
+    """Hide each effect in one session; the empty session gives the sizes."""
+    options = {'profile': profile, 'table': table}
+    empty = record(seed, None, noise, **options)
+    sizes = Sizes(empty)
+    rows = [seek(empty, None, part='none' if part == 'effects' else 'none ' + part, seed=seed, noise=noise)]
+    for effect in effects:
+        hidden = {effect: sizes.hidden(effect, seed, factor)}
+        recording = record(seed, hidden, noise, **options, **options_of(effect))
+        row = seek(recording, hidden, part=part, seed=seed, noise=noise)
+        if part == 'effects' and seed % 4 == 0:
+            row['oracle_ratio'] = oracle(recording, effect)
+        rows.append(row)
+    return rows
+
+
+def separating_of_seed(seed, noise, effects):
+    """Hide each effect in a session made to separate relatives: many angles, three speeds both ways, on an arm."""
+    return effects_of_seed(seed, noise, effects, profile='separating', table='centrifuge', part='separating')
+
+
+def none_of_seed(seed, noise):
+    """Hide nothing."""
+    return [seek(record(seed, None, noise), None, part='none', seed=seed, noise=noise)]
+
+
+def outside_of_seed(seed, noise, names):
+    """Hide causes that no catalogue holds."""
+    return [seek(record(seed, {name: None}, noise), {name: None}, part='outside', seed=seed, noise=noise) for name in names]
+
+
+def pair_of_seed(seed, noise):
+    """Hide two effects at once."""
+    rng = np.random.default_rng(seed)
+    names = [name for name in all_effects() if name != 'earth_rate']
+    first, second = (str(name) for name in rng.choice(names, 2, replace=False))
+    sizes = Sizes(record(seed, None, noise))
+    hidden = {name: sizes.hidden(name, seed, 5.0) for name in (first, second)}
+    return [seek(record(seed, hidden, noise), hidden, part='pairs', seed=seed, noise=noise)]
+
+
+def traps_of_seed(seed, names):
+    """Set traps that must not produce a finding."""
+    rows = []
+    for name in names:
+        options = {'noise': 'white', **TRAPS[name]}
+        rows.append(seek(record(seed, None, **options), None, part='traps', trap=name, seed=seed, noise=options['noise']))
+    return rows
+
+
+def power_of_seed(seed, noise, effects, factors):
+    """Hide effects around the smallest detectable size."""
+    sizes = Sizes(record(seed, None, noise))
+    rows = []
+    for effect in effects:
+        for factor in factors:
+            hidden = {effect: sizes.hidden(effect, seed, factor)}
+            rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part='power', factor=factor, seed=seed, noise=noise))
+    return rows
+
+
+def tasks_of(options):
+    """Return (function, arguments) of everything that is to run, the most important first."""
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    effects = options.effects.split(',') if options.effects else all_effects()
+    tasks = []
+    if 'effects' in options.parts:
+        tasks += [(effects_of_seed, (seed, noise, effects)) for seed in seeds for noise in options.noise]
+    if 'none' in options.parts:
+        tasks += [(none_of_seed, (seed, noise)) for seed in range(options.first_seed + 100, options.first_seed + 100 + 2 * options.seeds) for noise in options.noise]
+    if 'outside' in options.parts:
+        tasks += [(outside_of_seed, (seed, 'realistic', tuple(OUTSIDE))) for seed in seeds[:max(options.seeds // 2, 1)]]
+    if 'pairs' in options.parts:
+        tasks += [(pair_of_seed, (seed, 'white')) for seed in range(options.first_seed + 200, options.first_seed + 200 + options.seeds)]
+    if 'traps' in options.parts:
+        tasks += [(traps_of_seed, (seed, tuple(TRAPS))) for seed in seeds[:max(options.seeds // 5, 1)]]
+    if 'separating' in options.parts:
+        tasks += [(separating_of_seed, (seed, 'white', SEPARATED)) for seed in seeds[:max(options.seeds // 5, 1)]]
+    if 'power' in options.parts:
+        tasks += [(power_of_seed, (seed, 'white', POWER, POWER_SIZES)) for seed in range(options.first_seed + 300, options.first_seed + 300 + max(options.seeds // 3, 1))]
+    return tasks
+
+
+def run(task):
+    """Run one task; a failure is a row of its own."""
+    function, arguments = task
+    try:
+        return function(*arguments)
+    except Exception as problem:  # noqa: B902 - one broken session must not lose an hour of others
+        return [{'part': 'failed', 'what': f'{function.__name__}{arguments[:2]}', 'why': repr(problem)}]
+
+
+def main(arguments=None):
+    """Run the tasks on two processes, keep a record, print and draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, default=20, help='sessions per effect and noise')
+    parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
+    parser.add_argument('--effects', help='names joined by commas; default all')
+    parser.add_argument('--parts', default=','.join(PARTS), type=lambda text: text.split(','))
+    parser.add_argument('--noise', default='white,realistic', type=lambda text: text.split(','))
+    parser.add_argument('--processes', type=int, default=2)
+    parser.add_argument('--fast', action='store_true', help='one seed, white noise')
+    parser.add_argument('--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session')
+    parser.add_argument('--docs', type=Path, default=Path(__file__).parent.parent / 'docs', help='where pictures go')
+    parser.add_argument('--from-record', action='store_true', help='only print and draw what the record holds')
+    options = parser.parse_args(arguments)
+    if options.fast:
+        options.seeds, options.noise = 1, ['white']
+    rows = []
+    if options.from_record:
+        rows = [json.loads(line) for line in options.record.read_text().splitlines()]
+    else:
+        rows = _work(tasks_of(options), options)
+    report(rows, options.docs)
+    return 0
+
+
+def _work(tasks, options):
+    options.record.parent.mkdir(parents=True, exist_ok=True)
+    rows, start = [], time.time()
+    with options.record.open('w') as record_file, ProcessPoolExecutor(options.processes) as pool:
+        for done, new in enumerate(pool.map(run, tasks), start=1):
+            rows += new
+            record_file.writelines(json.dumps(row) + '\n' for row in new)
+            record_file.flush()
+            print(f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {(time.time() - start) / 60:.1f} min', end='', file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return rows
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,185 @@
+"""Figures and pictures of hide and seek, from its record."""
+
+from collections import Counter, defaultdict
+from datetime import date
+
+import numpy as np
+
+
+def report(rows, docs):
+    """Print the figures of a record and draw its confusion matrix and power curves into `docs`."""
+    parts = defaultdict(list)
+    for row in rows:
+        parts[row['part']].append(row)
+    print(f'Hide and seek, {date.today().isoformat()}, {len(rows)} sessions')
+    _effects(parts['effects'], 'five times the smallest detectable size')
+    _parameters(parts['effects'] + parts['separating'])
+    _separating(parts['separating'])
+    _nothing(parts['none'], 'nothing hidden')
+    _outside(parts['outside'])
+    _pairs(parts['pairs'])
+    _traps(parts['traps'])
+    _oracle(parts['effects'])
+    _seconds(rows)
+    for row in parts['failed']:
+        print(f"FAILED {row['what']}: {row['why']}")
+    docs.mkdir(parents=True, exist_ok=True)
+    if parts['effects']:
+        draw_confusion(parts['effects'], docs / 'hide_and_seek_confusion.png')
+    if parts['power']:
+        _power(parts['power'], docs / 'hide_and_seek_power.png')
+
+
+def first_is_right(row):
+    """Return whether the hidden effect is the first finding or in its class."""
+    return bool(row['found']) and row['hidden'][0] in [row['found'][0]] + row['classes'][0]
+
+
+def strictly_first(row):
+    """Return whether the hidden effect is the first finding."""
+    return bool(row['found']) and row['hidden'][0] == row['found'][0]
+
+
+def _share(values):
+    values = list(values)
+    return f'{sum(values)}/{len(values)} ({100 * np.mean(values):.1f} %)' if values else 'none'
+
+
+def _effects(rows, what):
+    if not rows:
+        return
+    for noise in sorted({row['noise'] for row in rows}):
+        some = [row for row in rows if row['noise'] == noise]
+        print(f'\nfirst finding right or in its class, {what}, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
+              f'{_share(map(strictly_first, some))}; nothing else named {_share(len(row["found"]) == 1 for row in some)}')
+    names = sorted({row['hidden'][0] for row in rows})
+    weak = [(name, [first_is_right(row) for row in rows if row['hidden'][0] == name]) for name in names]
+    for name, right in weak:
+        if np.mean(right) < 1:
+            print(f'  {name}: {_share(right)}')
+    print_confusion(rows)
+
+
+def print_confusion(rows):
+    """Print hidden effect against first finding, members of its class in brackets."""
+    print('\nhidden -> first finding [classes]')
+    for name in sorted({row['hidden'][0] for row in rows}):
+        some = [row for row in rows if row['hidden'][0] == name]
+        found = Counter(row['found'][0] if row['found'] else 'nothing' for row in some)
+        mates = Counter(mate for row in some if row['found'] for mate in row['classes'][0])
+        line = ', '.join(f'{effect} {count}' for effect, count in found.most_common())
+        print(f'  {name:24s} {line}' + (f"   [{', '.join(f'{mate} {count}' for mate, count in mates.most_common())}]" if mates else ''))
+
+
+def _parameters(rows):
+    errors = [error for row in rows for values in row['errors_in_sd'].values() for error in values]
+    if errors:
+        errors = np.abs(errors)
+        print(f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {np.sqrt(np.mean(np.minimum(errors, 10)**2)):.2f}')
+    levels = [row['level_error'] for row in rows if 'level_error' in row]
+    if levels:
+        print(f'saturation level within 1 %: {_share(level < 0.01 for level in levels)}')
+
+
+def _separating(rows):
+    if rows:
+        print(f'\nsessions made to separate: strictly first {_share(map(strictly_first, rows))}')
+        for row in rows:
+            if not strictly_first(row):
+                print(f"  {row['hidden'][0]} seed {row['seed']}: {row['found']} {row['classes']}")
+
+
+def _nothing(rows, what):
+    for noise in sorted({row['noise'] for row in rows}):
+        some = [row for row in rows if row['noise'] == noise]
+        print(f'\n{what}, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)} {[row["found"] for row in some if row["found"]]}; '
+              f'significant rest in {_share(row["unexplained"] for row in some)}')
+
+
+def _outside(rows):
+    if not rows:
+        return
+    print(f'\ncauses outside the catalogue: unexplained significant in {_share(row["unexplained"] for row in rows)}, nothing named in '
+          f'{_share(not row["found"] for row in rows)}')
+    for name in sorted({row['hidden'][0] for row in rows}):
+        some = [row for row in rows if row['hidden'][0] == name]
+        print(f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named {_share(not row["found"] for row in some)} '
+              f'{[row["found"] for row in some if row["found"]]}')
+
+
+def both_found(row):
+    """Return whether each hidden effect is a finding or in the class of one."""
+    known = [set([found] + mates) for found, mates in zip(row['found'], row['classes'])]
+    return all(any(name in members for members in known) for name in row['hidden'])
+
+
+def _pairs(rows):
+    if rows:
+        print(f'\npairs: both found in {_share(map(both_found, rows))}')
+        for row in rows:
+            if not both_found(row):
+                print(f"  {row['hidden']}: {row['found']} {row['classes']}")
+
+
+def _traps(rows):
+    if rows:
+        print(f'\ntraps: a finding in {_share(bool(row["found"]) for row in rows)}')
+        for row in rows:
+            if row['found']:
+                print(f"  {row['trap']} seed {row['seed']}: {row['found']}")
+
+
+def _oracle(rows):
+    ratios = [row['oracle_ratio'] for row in rows if row.get('oracle_ratio') is not None]
+    if ratios:
+        print(f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} ({len(ratios)} sessions)')
+
+
+def _seconds(rows):
+    seconds = [row['seconds'] for row in rows if 'seconds' in row]
+    if seconds:
+        print(f'\nprocessor time per diagnosis: median {np.median(seconds):.1f} s, largest {np.max(seconds):.1f} s')
+
+
+def draw_confusion(rows, path):
+    """Draw hidden effects against first findings."""
+    from matplotlib.figure import Figure
+    names = sorted({row['hidden'][0] for row in rows})
+    found = names + sorted({row['found'][0] for row in rows if row['found']} - set(names)) + ['nothing']
+    table = np.zeros((len(names), len(found)))
+    for row in rows:
+        table[names.index(row['hidden'][0]), found.index(row['found'][0] if row['found'] else 'nothing')] += 1
+    figure = Figure(figsize=(11, 9.5), layout='constrained')
+    axes = figure.add_subplot()
+    axes.imshow(table / np.maximum(table.sum(axis=1, keepdims=True), 1), cmap='Blues', vmin=0, vmax=1)
+    for (i, j), count in np.ndenumerate(table):
+        if count:
+            axes.text(j, i, f'{count:.0f}', ha='center', va='center', fontsize=7, color='white' if count > 0.6 * table[i].sum() else 'black')
+    axes.set_xticks(range(len(found)), found, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_xlabel('first finding')
+    axes.set_ylabel('hidden')
+    right = np.mean([first_is_right(row) for row in rows])
+    axes.set_title(f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right or in the declared class',
+                   fontsize=10)
+    figure.savefig(path, dpi=110)
+
+
+def _power(rows, path):
+    from matplotlib.figure import Figure
+    figure = Figure(figsize=(7, 4.5), layout='constrained')
+    axes = figure.add_subplot()
+    print('\ndetection power against size (in smallest detectable sizes)')
+    for effect in sorted({row['hidden'][0] for row in rows}):
+        some = [row for row in rows if row['hidden'][0] == effect]
+        factors = sorted({row['factor'] for row in some})
+        power = [np.mean([first_is_right(row) for row in some if row['factor'] == factor]) for factor in factors]
+        axes.plot(factors, power, 'o-', label=effect)
+        print(f'  {effect:24s} ' + ', '.join(f'{factor:g}: {value:.2f}' for factor, value in zip(factors, power)))
+    axes.axhline(0.5, color='grey', lw=0.8)
+    axes.set_xlabel('size / smallest detectable size')
+    axes.set_ylabel('share of sessions in which it is found')
+    axes.set_ylim(-0.03, 1.03)
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,112 @@
+"""Sessions with something hidden in them, as large as a search could just detect, or any multiple of it; recorded through a bag."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import physics
+from physics_draw import EFFECTS, draw_value, generator
+from scipy.optimize import brentq
+from scipy.stats import chi2, ncx2
+
+from imu_calibration.diagnosis.diagnose import investigate
+from imu_calibration.diagnosis.search import FAMILY_WISE
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.turntable import Table
+from imu_calibration.windows import MotionGatherer
+
+NOT_SIZED = {'earth_rate'}
+"""The Earth turns as fast as it does: it is sought with a tactical grade of noise, where it is well above detectability."""
+LEAST_CLIPPED_SHARE = 2e-4
+"""Smallest detectable share of clipped samples: about six in five minutes at 100 Hz."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What the searcher gets, and the truth."""
+
+    table: Table
+    windows: list
+    truth: dict
+
+    @property
+    def model(self):
+        """The baseline: bias and matrix."""
+        return SensorModel(joint_names=self.table.joint_names)
+
+
+def record(seed, hidden=None, noise='white', through_bag=True, **options):
+    """Return the Recording of a session made by physics (`physics.make_session`), written to a bag and read again."""
+    session = physics.make_session(seed, hidden, noise, **options)
+    table = Table.from_mapping(session.table)
+    gatherer = MotionGatherer(table)
+    windows = []
+    if through_bag:
+        from msg_adapters.bag import open_recording
+        with tempfile.TemporaryDirectory() as folder:
+            physics.write_bag(session, Path(folder) / 'bag')
+            with open_recording(Path(folder) / 'bag') as bag:
+                for block in bag.blocks():
+                    windows += gatherer.push(block)
+    else:
+        windows += gatherer.push(session.block)
+    windows += gatherer.finish()
+    return Recording(table, windows, session.truth['values'])
+
+
+def options_of(effect):
+    """Return the options of sessions that hide an effect."""
+    return {'grade': 'tactical'} if effect in NOT_SIZED else {}
+
+
+def pattern(effect, seed, n_joints=3):
+    """Return a random value of an effect of magnitude one, and for a warm-up its time constant."""
+    return np.atleast_1d(np.asarray(draw_value(effect, 1.0, n_joints, generator(seed, 'pattern of ' + effect)), float))
+
+
+def threshold_noncentrality(n_parameters, n_questions):
+    """Return the noncentrality at which a chi-square test passes its family-wise threshold half of the time."""
+    limit = chi2.isf(FAMILY_WISE / n_questions, n_parameters)
+    return brentq(lambda value: ncx2.sf(limit, n_parameters, value) - 0.5, 1e-6, 1000.0)
+
+
+class Sizes:
+    """Smallest detectable sizes in one session: 50 % power at family-wise 1 %, the baseline projected out, from a session that hides nothing."""
+
+    def __init__(self, recording):
+        self.attempt = investigate(recording.windows, recording.table, recording.model).attempt
+        evidence, used = self.attempt.evidence, np.array(self.attempt.search.baseline)
+        prior = np.diag(1 / self.attempt.space.prior_sd[used]**2)
+        normal = evidence.total[:-1, :-1]
+        self.information = normal - normal[:, used] @ np.linalg.solve(normal[np.ix_(used, used)] + prior, normal[used])
+
+    def hidden(self, effect, seed, factor):
+        """Return what to hide: an effect of random shape, `factor` times as large as detectable; None for one that has its size by nature."""
+        if effect in NOT_SIZED:
+            return None
+        if effect.endswith('_saturation'):
+            return factor * LEAST_CLIPPED_SHARE
+        value = pattern(effect, seed)
+        direction, n_parameters = np.zeros(self.attempt.space.size), value.size
+        question, shape = self._question(effect, value)
+        direction[list(question.parameters)] = shape
+        strength = direction @ self.information @ direction
+        size = factor * np.sqrt(threshold_noncentrality(n_parameters, len(self.attempt.questions)) / strength)
+        if effect.endswith('_bias_drift'):
+            return np.append(size * value[:3], value[3])
+        if effect.endswith('_bandwidth'):
+            return float(abs(size * value[0]))
+        return (size * value).reshape(np.shape(draw_value(effect, 1.0, 3, generator(seed, effect))) or (1,))
+
+    def _question(self, effect, value):
+        asked = [q for q in self.attempt.questions if q.name == effect]
+        if not effect.endswith('_bias_drift'):
+            return asked[0], value.ravel()
+        nearest = int(np.argmin(np.abs(np.log(self.attempt.constants / value[3]))))
+        return asked[nearest], value[:3]
+
+
+def all_effects():
+    """Return the names of all effects that can be hidden."""
+    return tuple(EFFECTS)
