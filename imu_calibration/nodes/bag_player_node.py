@@ -11,7 +11,7 @@ from rclpy.node import Node
 from imu_calibration.errors import InputError
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.playback import Batch, Pace, Playback
+from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.settings import setting
 from msg_adapters.rosbag2 import Rosbag2
@@ -30,7 +30,6 @@ class PlayerSettings:
     clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
     loop: bool = setting(False, '', 'start again at the end; the stamps then jump back', symptom='the node ends after one round')
     wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start', (0, 100), 'the first messages are missed')
-    acknowledged: bool = setting(False, '', 'wait until reliable subscribers have got the messages, however fast the pace', symptom='losses at high pace')
     stop_at_end: bool = setting(True, '', 'end the node after the last message', symptom='the node does not end')
 
 
@@ -44,7 +43,7 @@ class BagPlayerNode(Node):
         self._topics = self._choose()
         self._players = [self._publisher(name) for name in self._topics]
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
-        pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers, self.settings.acknowledged)
+        pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
         self._playback = Playback(self, self._players, self._batches(first), pace, first, self._players, self._ended)
         self._playback.start()
 
@@ -82,7 +81,7 @@ class BagPlayerNode(Node):
     def _publisher(self, name):
         latched = any(profile.get('durability') == 'transient_local' for profile in self._bag.qos(name))
         # Relative, so that namespaces and remappings move it.
-        return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), latched_qos() if latched else output_qos())
+        return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), latched_qos() if latched else output_qos(DEPTH))
 
     def _batches(self, first_ns):
         """Yield Batch after Batch, round after round."""

@@ -116,11 +116,18 @@ class CalibrationNode(Node):
         return response
 
     def _publish_document(self, text):
-        self._document.publish(String(data=text))
+        self._publish(self._document, String(data=text))
 
     def _publish_residuals(self, residuals):
         for message in rows(encode_imu(residuals)):
-            self._residual.publish(bytes(message))
+            self._publish(self._residual, bytes(message))
+
+    def _publish(self, publisher, message):
+        try:
+            publisher.publish(message)
+        except Exception:
+            if self.context.ok():   # else the node is being shut down while the worker finishes
+                raise
 
     def _complain(self, line):
         self.get_logger().warning(line, throttle_duration_sec=COMPLAINT_PERIOD)

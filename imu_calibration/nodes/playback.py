@@ -14,8 +14,8 @@ AHEAD = 3
 """Batches that are made ahead of their time."""
 SHORTEST_SLEEP = 0.001
 """Seconds; messages that are due by then go out together."""
-UNACKNOWLEDGED = 400
-"""Messages that may be under way when every one is to arrive; below the depth of the outputs."""
+DEPTH = 20_000
+"""Messages that wait for a slow reliable subscriber: some seconds of a fast stream."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,6 @@ class Pace:
     """/clock messages per second; 0: none."""
     subscribers: int = 0
     """Subscribers of each awaited topic to wait for before the start."""
-    acknowledged: bool = False
-    """Whether to wait for reliable subscribers, so that none of them loses anything."""
 
 
 class Playback(threading.Thread):
@@ -138,22 +136,14 @@ class Playback(threading.Thread):
             if self._pace.factor:
                 now = (time.monotonic() - start) * self._pace.factor
                 upto = int(np.searchsorted(batch.time, now, side='right'))
-            if self._pace.acknowledged:
-                upto = min(upto, done + UNACKNOWLEDGED)
             self._tick(float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now)
             for publisher, message in zip(batch.publisher[done:upto], batch.messages[done:upto], strict=True):
                 publisher.publish(bytes(message))
             self.n_published += upto - done
-            if self._pace.acknowledged and upto > done:
-                self._wait_for_acknowledgement()
             done = upto
             if self._pace.factor and done < len(batch.messages):
                 wait = (batch.time[done] - now) / self._pace.factor
                 time.sleep(min(max(wait, SHORTEST_SLEEP), 0.05))
-
-    def _wait_for_acknowledgement(self):
-        for publisher in self._publishers:
-            publisher.wait_for_all_acked(Duration(seconds=5.0))
 
     def _tick(self, now):
         """Publish /clock when it is due."""
@@ -166,5 +156,7 @@ class Playback(threading.Thread):
         self._clock.publish(message)
 
     def _settle(self):
-        self._wait_for_acknowledgement()
+        """Stay until reliable subscribers have got everything; acknowledgements come with heartbeats, every three seconds."""
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=10.0))
         self._ending.wait(0.5)

@@ -21,7 +21,7 @@ from imu_calibration.joint_trajectory import TableMotion
 from imu_calibration.live_simulation import LiveSimulation
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.playback import Batch, Pace, Playback
+from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.noise import GRADES
 from imu_calibration.profiles import make_profile
@@ -61,7 +61,6 @@ class SimulatorSettings:
     clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
     start_time: float = setting(0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day')
     wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start', (0, 100), 'the first messages are missed')
-    acknowledged: bool = setting(False, '', 'wait until reliable subscribers have got the messages, however fast the pace', symptom='losses at high pace')
 
 
 class SimulatorNode(Node):
@@ -78,9 +77,9 @@ class SimulatorNode(Node):
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
         kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [(Imu, 'imu/truth')] * settings.truth
-        publishers = [self.create_publisher(kind, topic, output_qos()) for kind, topic in kinds]
+        publishers = [self.create_publisher(kind, topic, output_qos(DEPTH)) for kind, topic in kinds]
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
-        pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers, settings.acknowledged)
+        pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
         self._playback = Playback(self, publishers, self._batches(), pace, start_ns, publishers[:1], self._ended)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._follow, 10)
         self._playback.start()
