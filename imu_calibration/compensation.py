@@ -13,7 +13,7 @@ from imu_calibration.sensor_model import sensor_output
 ITERATIONS = 12
 """Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
 CONVERGED = 1e-6
-"""Samples whose last step is larger (m/s^2, rad/s) lie where the non-linear effects cannot be undone."""
+"""Samples whose last step is larger (m/s^2, rad/s) lie where the non-linear effects cannot be undone; they become NaN."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,11 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
     model, values = invertible_values(calibration)
     if temperature_c is None and needs_temperature(model):
         raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
-    true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
-    flagged = saturated(calibration, force_s, rate_s) | (left > CONVERGED)
+    with np.errstate(over='ignore', invalid='ignore'):
+        true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
+    beyond = left > CONVERGED
+    true_force[beyond] = true_rate[beyond] = np.nan
+    flagged = saturated(calibration, force_s, rate_s) | beyond
     if transfer is None:
         return Corrected(true_force, true_rate, flagged)
     return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged)
@@ -121,7 +124,8 @@ def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
         if np.max(change, initial=0.0) < 1e-14:
             break
-    return true['accelerometer'], true['gyroscope'], change
+    given = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
+    return true['accelerometer'], true['gyroscope'], np.where(np.isnan(change) & given, np.inf, change)
 
 
 def moved(transfer, force_s, rate_s, alpha_s):

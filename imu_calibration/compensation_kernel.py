@@ -7,12 +7,13 @@ are left out. With bias, matrix and lever arms it is one straight line of produc
 
 import numpy as np
 
-from imu_calibration.compensation import ITERATIONS, invertible_values
+from imu_calibration.compensation import CONVERGED, ITERATIONS, invertible_values
 from imu_calibration.effects import AXES, SENSORS
 from imu_calibration.effects.regressors import CUBES, SQUARES
 from imu_calibration.sensor_model import coefficients_at_point
 
-CONVERGED = 1e-14
+SETTLED = 1e-13
+"""Sum of the changes in one fixed-point step (m/s^2, rad/s) after which there is nothing left to gain."""
 OWN = {'accelerometer': 'force', 'gyroscope': 'rate'}
 LEVER = ('-(yy + zz)', 'xy - gz', 'xz + gy', 'xy + gz', '-(xx + zz)', 'yz - gx', 'xz - gy', 'yz + gx', '-(xx + yy)')
 """Entries of ``[alpha x] + [omega x]^2`` by rows, from products of rates and the angular acceleration g."""
@@ -29,7 +30,7 @@ def make_kernel(calibration, transfer=None):
 
     ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt) -> (fx, fy, fz, wx, wy, wz)`` takes the measured specific force (m/s^2) and
     rate (rad/s), the derivative of the *measured* rate (rad/s^2; it goes through the inverse gyroscope matrix here), and the
-    temperature above the calibration's reference temperature (K).
+    temperature above the calibration's reference temperature (K). Where the non-linear effects cannot be undone it returns NaN.
 
     Parameters
     ----------
@@ -103,8 +104,9 @@ def _iteration(accel, gyro):
         lines += [f'        c{k} = {text}' for k, text in enumerate(columns)]
         lines += [f'        {names}{axis} = {known}{axis} - ({_sum(block[:, i], [f"c{k}" for k in range(len(columns))])})'
                   for i, axis in enumerate(AXES)]
-    change = ', '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
-    return lines + [f'        if max({change}) < {CONVERGED}:', '            break']
+    change = ' + '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
+    return lines + [f'        change = {change}', f'        if change < {SETTLED}:', '            break',
+                    f'    if not change < {CONVERGED}:', "        return (float('nan'),) * 6"]
 
 
 def _columns(group):

@@ -32,7 +32,7 @@ def random_calibration(seed=0, accelerometer=('accel_size_effect',), gyroscope=(
 def _values(effect, matrix_spread, rng):
     if effect.name == 'matrix':
         return (np.eye(3) + rng.normal(0.0, matrix_spread, (3, 3))).ravel()
-    size = SIZE[effect.name] * (0.05 if (effect.sensor, effect.name) == ('gyroscope', 'bias') else 1.0)
+    size = SIZE.get(effect.name, 1.0) * (0.05 if (effect.sensor, effect.name) == ('gyroscope', 'bias') else 1.0)
     return rng.uniform(-1.0, 1.0, effect.size) * size
 
 

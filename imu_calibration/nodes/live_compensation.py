@@ -116,8 +116,10 @@ class LiveCompensation:
             push = self._push
             slope = self._warm_up(seconds * NS + nanoseconds) if push is None else push(seconds * NS + nanoseconds, wx, wy, wz)
         ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt)
-        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt)
         squared = vx * vx + vy * vy + vz * vz
+        if squared != squared:
+            return self._refuse('beyond what can be undone')
+        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt)
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         rate_cov, force_cov = self._rate_cov_out, self._force_cov_out

@@ -1,0 +1,163 @@
+"""
+What the compensator costs against a plain rclpy relay: both between a serialized source and sink, in turns, in one go.
+
+CPU time is that of the whole process with its DDS threads, while messages are sent. Latency is from the source's publish to the sink's
+take; added latency is what is left after that of a direct way from source to sink. Run it alone with
+``python benchmarks/bench_compensator.py [--seconds S]``.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).resolve().parents[1]
+if __name__ == '__main__':
+    sys.path.insert(0, str(ROOT))
+
+import numpy as np   # noqa: E402
+
+from imu_calibration.calibration import Calibration   # noqa: E402
+from imu_calibration.documents import calibration_to_text   # noqa: E402
+from imu_calibration.sensor_model import SensorModel   # noqa: E402
+from imu_calibration.simulation import random_values   # noqa: E402
+
+ENDS = str(ROOT / 'benchmarks' / 'relay_ends.py')
+TURN = 5.0
+"""Seconds that each has its turn."""
+RATES = (2000, 3000, 4000, 5000, 6000, 7000, 8000, 10000)
+TARGETS = {'CPU time per message': 0.4, 'median added latency': 0.5}
+MEANING = {'plain relay': 'rclpy node that publishes each message again', 'compensator': 'bias, matrix and nine lever arms'}
+
+
+def bench_calibration():
+    """Return the text of a calibration with bias, matrix and nine lever arms."""
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
+    values = random_values(model, seed=1)
+    noise = {'accelerometer': {'noise_sd': [0.04] * 3}, 'gyroscope': {'noise_sd': [0.004] * 3}}
+    return calibration_to_text(Calibration(model, values, 1e-8 * np.eye(len(values)), ('determined',) * len(values), 'imu_link', statistics=noise))
+
+
+class Process:
+    """A node under test, on topics of its own."""
+
+    def __init__(self, name, command, environment):
+        self.name, self.topics = name, tuple(f'/bench_{name.replace(" ", "_")}/{end}' for end in ('raw', 'corrected'))
+        remap = ['--ros-args', '-r', f'imu/data_raw:={self.topics[0]}', '-r', f'imu/data_corrected:={self.topics[1]}']
+        with_more = command[:-1] + remap + command[-1]
+        self.process = subprocess.Popen(with_more, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self.cpu, self.messages, self.medians, self.tails, self.lost = 0.0, 0, [], [], 0
+
+    def cpu_seconds(self):
+        """Return the CPU time of all its threads until now."""
+        tasks = Path(f'/proc/{self.process.pid}/task')
+        return sum(int((task / 'schedstat').read_text().split()[0]) for task in tasks.iterdir()) * 1e-9
+
+    def stop(self):
+        """End the process."""
+        self.process.terminate()
+        self.process.wait(timeout=10)
+
+
+def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
+    """Send messages to `raw` and take them from `corrected`; return (source's report, sink's report, CPU seconds used meanwhile)."""
+    sink = subprocess.Popen([sys.executable, ENDS, 'sink', corrected], env=environment, stdout=subprocess.PIPE, text=True)
+    source = _source(raw, rate, seconds, environment) if raw == corrected else None
+    sink.stdout.readline()
+    source = source or _source(raw, rate, seconds, environment)
+    source.stdout.readline()
+    before = cpu_seconds()
+    sent = json.loads(source.stdout.readline())
+    used = cpu_seconds() - before
+    source.communicate(timeout=60)
+    return sent, json.loads(sink.communicate(timeout=60)[0]), used
+
+
+def _source(topic, rate, seconds, environment):
+    return subprocess.Popen([sys.executable, ENDS, 'source', topic, str(rate), str(seconds)], env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def compare(nodes, seconds, environment, rate=1000.0):
+    """Give each node turns of `TURN` at `rate`, and the direct way between them; return the direct median latency, microseconds."""
+    direct = []
+    for _ in range(max(1, round(seconds / TURN))):
+        for node in nodes:
+            sent, came, used = run_once(*node.topics, rate, min(TURN, seconds), environment, node.cpu_seconds)
+            node.cpu += used
+            node.messages += came['came']
+            node.lost += sent['sent'] - came['came']
+            node.medians.append(came['late_us'][50])
+            node.tails.append(came['late_us'][99])
+        direct.append(run_once('/bench_direct', '/bench_direct', rate, min(TURN, seconds), environment)[1]['late_us'][50])
+    return median(direct)
+
+
+def highest_rate(node, environment, seconds):
+    """Return [(rate asked for, rate sent, messages lost)] with rising rates until messages are lost."""
+    rows = []
+    for rate in RATES:
+        sent, came, _ = run_once(*node.topics, rate, seconds, environment)
+        rows.append((rate, sent['rate'], sent['sent'] - came['came']))
+        if rows[-1][2]:
+            break
+    return rows
+
+
+def bench_compensator(seconds=30.0):
+    """Return (figures, ratios): a dict per node, and ratios by name."""
+    environment = os.environ | {'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                                'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', '83')}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'calibration.yaml')
+        path.write_text(bench_calibration())
+        nodes = [Process('plain relay', [sys.executable, ENDS, 'relay', []], environment),
+                 Process('compensator', [sys.executable, '-m', 'imu_calibration.nodes.compensator_node',
+                                         ['-p', f'calibration_file:={path}', '-p', 'reliable:=true']], environment)]
+        try:
+            time.sleep(4.0)
+            direct = compare(nodes, seconds, environment)
+            figures = {node.name: _figures(node, direct) | {'rates': highest_rate(node, environment, min(5.0, seconds))} for node in nodes}
+        finally:
+            for node in nodes:
+                node.stop()
+    relay, ours = figures['plain relay'], figures['compensator']
+    keys = ('CPU time per message', 'median latency', 'median added latency', '99th percentile of latency')
+    return figures | {'direct': direct}, {key: ours[key] / relay[key] for key in keys}
+
+
+def _figures(node, direct):
+    return {'CPU time per message': node.cpu / max(node.messages, 1) * 1e6, 'median latency': median(node.medians),
+            'median added latency': median(node.medians) - direct, '99th percentile of latency': median(node.tails), 'lost': node.lost}
+
+
+def main():
+    """Print the figures; exit code 1 when a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=30.0, help='how long each node is measured at 1 kHz, default 30')
+    options = parser.parse_args()
+    figures, ratios = bench_compensator(options.seconds)
+    print(f'at 1 kHz, reliable, depth 1000; direct way from source to sink {figures["direct"]:.0f} us')
+    for name, text in MEANING.items():
+        shown = ', '.join(f'{key} {figures[name][key]:.0f} us' for key in ratios)
+        print(f'{name:12s} ({text}): {shown}, {figures[name]["lost"]} lost')
+    missed = False
+    for key, ratio in ratios.items():
+        target = TARGETS.get(key)
+        missed |= target is not None and ratio > target
+        print(f'ratio of {key}: {ratio:.2f}' + (f'  (at most {target})' if target else ''))
+    for name in MEANING:
+        rows = figures[name]['rates']
+        held = [sent for _, sent, lost in rows if not lost]
+        print(f'{name}: ' + (f'{max(held):.0f} Hz without loss' if held else 'loss at every rate') +
+              (f', {rows[-1][2]} lost at {rows[-1][1]:.0f} Hz' if rows[-1][2] else ' (the most the source sent)'))
+        missed |= name == 'compensator' and not any(asked >= 6000 and not lost for asked, _, lost in rows)
+    return 1 if missed else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

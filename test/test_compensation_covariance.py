@@ -1,0 +1,69 @@
+"""Covariances of corrected samples agree with the scatter of corrected samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compensation_cases import FURTHER, random_calibration
+
+from imu_calibration.compensation import Transfer
+from imu_calibration.compensation_covariance import Uncertainty
+from imu_calibration.compensation_kernel import make_kernel
+from imu_calibration.differentiation import CausalDerivative
+
+DERIVATIVE = CausalDerivative(5, 0.005)
+FORCE, RATE, SLOPE, DT = np.array([1.0, -2.0, 9.0]), np.array([1.5, -0.8, 2.0]), np.array([4.0, -6.0, 3.0]), 4.0
+FORCE_COV = np.array([[4e-4, 1e-4, 0], [1e-4, 9e-4, -2e-4], [0, -2e-4, 5e-4]])
+RATE_COV = 1e-2 * FORCE_COV[::-1, ::-1]
+TRANSFER = Transfer.from_pose('base', (0.4, -0.3, 0.2), (0.3, 1.0, -2.0))
+EFFECTS = {'usual': (('accel_size_effect',), ()), 'all': (FURTHER['accelerometer'], FURTHER['gyroscope'])}
+N_DRAWS = 4000
+
+
+def agree(sampled, predicted):
+    """Sample covariances of N draws scatter by about sqrt(2 / N) = 2 %; five times that."""
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    assert np.abs((sampled - predicted) / scale).max() < 0.11
+
+
+@pytest.mark.parametrize('transfer', [None, TRANSFER], ids=['in place', 'transfer'])
+@pytest.mark.parametrize('effects', EFFECTS)
+def test_noise_agrees_with_monte_carlo(effects, transfer):
+    calibration = random_calibration(1, *EFFECTS[effects])
+    rng = np.random.default_rng(5)
+    kernel = make_kernel(calibration, transfer)
+    force = FORCE + rng.multivariate_normal(np.zeros(3), FORCE_COV, N_DRAWS)
+    rates = rng.multivariate_normal(np.zeros(3), RATE_COV, (N_DRAWS, DERIVATIVE.taps))   # newest first, as the weights
+    slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
+    rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
+    out = np.array([kernel(*row) for row in rows.tolist()])
+    sensitivity = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, DT)
+    for got, predicted in zip((out[:, :3], out[:, 3:]), sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False)):
+        agree(np.cov(got.T), predicted)
+
+
+@pytest.mark.parametrize('transfer', [None, TRANSFER], ids=['in place', 'transfer'])
+@pytest.mark.parametrize('effects', EFFECTS)
+def test_parameters_agree_with_monte_carlo(effects, transfer):
+    calibration = random_calibration(1, *EFFECTS[effects], sd=1e-5)
+    rng = np.random.default_rng(6)
+    draws = rng.multivariate_normal(calibration.values, calibration.covariance, 600)
+    sample = [*np.concatenate([FORCE, RATE, SLOPE]).tolist(), DT]
+    out = np.array([make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws])
+    predicted = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, DT).parameters
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    # 600 draws: 6 %, five times that; the derivative of the inverse gyroscope matrix in the tangential term is left out.
+    assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35
+
+
+def test_an_ideal_sensor_passes_its_noise_on_unchanged():
+    calibration = random_calibration(0, (), (), sd=0.0, matrix_spread=0.0)
+    force_cov, rate_cov = Uncertainty(calibration).at().covariances(FORCE_COV, RATE_COV)
+    np.testing.assert_allclose(force_cov, FORCE_COV, atol=1e-12)
+    np.testing.assert_allclose(rate_cov, RATE_COV, atol=1e-14)
+
+
+def test_unknown_noise_is_that_of_the_calibration():
+    force, rate = Uncertainty(random_calibration(0)).noise
+    np.testing.assert_allclose(np.sqrt(np.diag(force)), [0.02, 0.022, 0.018])
+    np.testing.assert_allclose(np.sqrt(np.diag(rate)), [0.002, 0.0022, 0.0018])
