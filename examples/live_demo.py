@@ -31,7 +31,7 @@ PATIENCE = 110.0
 class Watcher:
     """A node that collects what the others publish."""
 
-    def __init__(self):
+    def __init__(self, processes):
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from sensor_msgs.msg import Imu
@@ -39,7 +39,7 @@ class Watcher:
 
         from imu_calibration.nodes.qos import input_qos, latched_qos
         from msg_adapters.live import LiveGatherer
-        self._rclpy = rclpy
+        self._rclpy, self._processes = rclpy, processes
         rclpy.init()
         self.node = rclpy.create_node('live_demo')
         self.streams = {topic: LiveGatherer() for topic in ('imu/data_raw', 'imu/data_corrected', 'imu/truth')}
@@ -55,6 +55,9 @@ class Watcher:
     def spin(self, until, deadline):
         """Spin until a condition holds; give up at the deadline."""
         while not until():
+            for process in self._processes.running:
+                if process.poll():
+                    raise SystemExit(f'a node ended with exit code {process.returncode}: {" ".join(process.args[1:4])}')
             if time.monotonic() > deadline:
                 raise SystemExit('the demonstration did not come to an end in time; is the machine very busy?')
             self._rclpy.spin_once(self.node, timeout_sec=0.1)
@@ -100,7 +103,7 @@ def run(domain_id, folder):
         calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'calibration.yaml', 'solve_share': 0.3})
         compensator = processes.start('compensator_node')
         simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': 'quick', 'start_time': START})
-        watcher = Watcher()
+        watcher = Watcher(processes)
         try:
             calibrate(watcher, simulator, deadline)
             answer = watcher.call('/calibration_node/save', deadline)
