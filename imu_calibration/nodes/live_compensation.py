@@ -98,7 +98,7 @@ class LiveCompensation:
     def __call__(self, data):
         """Return the corrected message as bytes, or None when there is nothing to publish; `counts` says why."""
         self.received += 1
-        if len(data) != self._size or data[HEAD_AT:self._body] != self._head_in or data[:2] != self._order_in:
+        if len(data) != self._size or data[HEAD_AT:self._head_end] != self._head_in or data[:2] != self._order_in:
             if not self._open(data):
                 return None
         if data[self._rate_at + 24:self._rate_at + 96] != self._rate_cov_in or data[self._force_at + 24:] != self._force_cov_in:
@@ -150,7 +150,8 @@ class LiveCompensation:
             return False
         order = layout.order
         self._size, self._order_in, self._body = len(data), data[:2], layout.offsets['orientation'][0]
-        self._head_in = data[HEAD_AT:self._body]
+        self._head_end = HEAD_AT + 4 + struct.unpack_from(order + 'I', data, HEAD_AT)[0]   # the padding behind it may hold anything
+        self._head_in = data[HEAD_AT:self._head_end]
         self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
         self._stamp, self._readings = struct.Struct(order + 'iI'), struct.Struct(order + '3d72x3d')
         self._tail = struct.Struct(order + '3d72s3d72s')
@@ -194,8 +195,10 @@ class LiveCompensation:
         if force < force_level and rate < rate_level:
             return rate_cov, force_cov
         self.counts['saturated'] += 1
-        marks = [self._nine.pack(*(np.eye(3) * level**2).ravel().tolist()) for level in (rate_level, force_level)]
-        return marks[0] if rate >= rate_level else rate_cov, marks[1] if force >= force_level else force_cov
+        return (self._mark(rate_level) if rate >= rate_level else rate_cov, self._mark(force_level) if force >= force_level else force_cov)
+
+    def _mark(self, level):
+        return self._nine.pack(*(np.eye(3) * level**2).ravel().tolist())
 
     def _reheaded(self, data, stamp_ns):
         """Return everything before the rate: moved stamp, new frame, turned orientation."""
