@@ -1,6 +1,6 @@
 """Solving the system: one weighted non-linear least-squares problem over all windows, with honest standard deviations."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -8,7 +8,8 @@ import scipy.linalg
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
 from imu_calibration.sensor_model import coefficient_jacobian, coefficients
-from imu_calibration.window_noise import WindowNoise, estimate_offsets, sessions_of, white_noise, whiten
+from imu_calibration.offset_search import estimate_offsets
+from imu_calibration.window_noise import WindowNoise, predict_session_offsets, sessions_of, white_noise, whiten
 from imu_calibration.window_statistics import triangular
 
 HELD_SHARE = 0.5
@@ -35,6 +36,8 @@ class Solution:
     """Information matrix of the data alone, shape (n_params, n_params)."""
     residual_rms: dict
     """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
+    session_biases: dict = field(default_factory=dict)
+    """Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean."""
 
     @property
     def param_names(self):
@@ -136,7 +139,7 @@ def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
         values = problem.minimise(values, noises, _free(model, held))
     covariance, information = problem.covariance(values, noises, held)
     chi2, rms = problem.fit_quality(values, noises)
-    return Solution(model, values, covariance, held, noises, chi2, information, rms)
+    return Solution(model, values, covariance, held, noises, chi2, information, rms, problem.session_biases(values, noises))
 
 
 def _free(model, held):
@@ -209,12 +212,15 @@ class _Problem:
         """Return the variance of the window means by the noise within, shape (n_windows, 3)."""
         return noise.white_variance * noise.inflation / self.counts[:, None]
 
+    def _whitened(self, rows, noise):
+        variance = self.mean_variance(noise) + noise.offset_sd**2
+        return whiten(rows, variance, self.times, self.sessions, noise.wander_sd, noise.wander_time, noise.session_variance)
+
     def systems(self, sensor, noise):
         """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
         p = self.means[sensor].shape[1] - 3
         rows = np.stack([self.means[sensor][:, list(range(p)) + [p + axis]] for axis in range(3)], axis=1)
-        variance = self.mean_variance(noise) + noise.offset_sd**2
-        white, _ = whiten(rows, variance, self.times, self.sessions, noise.wander_sd, noise.wander_time)
+        white = self._whitened(rows, noise)
         factors = []
         for axis in range(3):
             parts = [white[:, axis]]
@@ -310,7 +316,7 @@ class _Problem:
         noise = replace(noise, kind_scale=scale)
         design, information = self._linearised(sensor, values, noise, noises)
         offsets = estimate_offsets(design, self.mean_variance(noise), self.times, self.sessions, information)
-        return replace(noise, offset_sd=offsets[0], wander_sd=offsets[1], wander_time=offsets[2])
+        return replace(noise, **offsets)
 
     def _slow_misfit(self, sensor, kind, values):
         """Return the variance per sample that the slow part of the misfit speaks of: more than the samples' own when it is correlated."""
@@ -341,8 +347,7 @@ class _Problem:
         for sensor in SENSORS:
             noise, quality, moving, count = noises[sensor], {}, 0.0, 0
             misfit = self._misfit(sensor, self.means[sensor], values)
-            variance = self.mean_variance(noise) + noise.offset_sd**2
-            white, _ = whiten(misfit[:, :, None], variance, self.times, self.sessions, noise.wander_sd, noise.wander_time)
+            white = self._whitened(misfit[:, :, None], noise)
             quality['means'] = float((white**2).sum() / max(white.size - self._used(sensor), 1))
             for kind, factor in self.within[sensor].items():
                 squares = (self._misfit(sensor, factor, values)**2).sum(axis=0)
@@ -351,6 +356,17 @@ class _Problem:
             chi2[sensor] = quality
             rms[sensor] = np.array([np.sqrt(moving / count) if count else np.nan, np.sqrt((misfit**2).mean())])
         return chi2, rms
+
+    def session_biases(self, values, noises):
+        """Return the bias of each recording for sensors with a bias of its own per recording: the best linear prediction."""
+        found = {}
+        for sensor in SENSORS:
+            noise = noises[sensor]
+            if noise.session_variance > 0:
+                misfit = self._misfit(sensor, self.means[sensor], values)
+                found[sensor] = values[self.model.slices[sensor, 'bias']] + predict_session_offsets(
+                    misfit, self.mean_variance(noise) + noise.offset_sd**2, self.times, self.sessions, noise)
+        return found
 
     def _used(self, sensor):
         """Return how many parameters the means determine: those of bias and matrix, at most half the data."""

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.optimize import minimize
+from scipy.linalg import lapack
 
 
 @dataclass(frozen=True, eq=False)
@@ -13,7 +12,7 @@ class WindowNoise:
     Noise of one sensor.
 
     The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the
-    same recording, the covariance ``wander_sd^2 exp(-|t_k - t_l| / wander_time)``.
+    same recording, the covariance ``wander_sd^2 exp(-|t_k - t_l| / wander_time) + session_variance``.
     """
 
     white_variance: np.ndarray
@@ -28,6 +27,10 @@ class WindowNoise:
     """Correlation time of the wander, s."""
     kind_scale: dict = field(default_factory=dict)
     """Kind -> factor on the variance of the centred rows, shape (3,): what moving windows scatter beyond the noise at rest."""
+    session_sd: float = 0.0
+    """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
+    session_variance: float = 0.0
+    """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
 
     def sample_sd(self):
         """Return the standard deviation of single samples, shape (3,)."""
@@ -69,12 +72,13 @@ def sessions_of(rows):
     return [np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')] for number in np.unique(numbers)]
 
 
-def whiten(values, variance, times, sessions, wander_sd, wander_time):
+def whiten(values, variance, times, sessions, wander_sd, wander_time, session_variance=0.0):
     """
     Turn rows with correlated offsets into independent rows of unit variance.
 
-    Innovations of a scalar Kalman filter, row after row: the same as multiplying with the inverse Cholesky factor of
-    ``diag(variance) + wander_sd^2 exp(-|dt| / wander_time)``, in linear time.
+    Innovations of a scalar Kalman filter: the same as multiplying with the inverse Cholesky factor of
+    ``diag(variance) + wander_sd^2 exp(-|dt| / wander_time)``, in linear time. An offset of each session is taken out afterwards, with
+    ``(I + s^2 u u')^(-1/2)`` and u the whitened ones of the session.
 
     Parameters
     ----------
@@ -82,30 +86,63 @@ def whiten(values, variance, times, sessions, wander_sd, wander_time):
         Rows for each axis.
     variance : ndarray, shape (n, n_axes)
         Independent part of the variance.
+    sessions : list of ndarray
+        Indices of each session's rows in order of time.
+    session_variance : float
+        Variance of an offset that all rows of a session share.
 
     Returns
     -------
-    ndarray, ndarray
-        Whitened rows, and the log of the innovation variances, shape (n, n_axes).
+    ndarray, shape (n, n_axes, q)
 
     """
-    if wander_sd == 0:
-        return values / np.sqrt(variance)[:, :, None], np.log(variance)
-    white, logs = np.empty_like(values), np.empty_like(variance)
+    white = np.empty_like(values)
     for index in sessions:
-        state, spread = np.zeros(values.shape[1:]), np.full(variance.shape[1], wander_sd**2)
-        steps = np.exp(-np.diff(times[index], prepend=times[index[0]]) / wander_time)
-        for k, decay in zip(index, steps):
-            state = decay * state
-            spread = decay**2 * spread + (1 - decay**2) * wander_sd**2
-            total = spread + variance[k]
-            innovation = values[k] - state
-            gain = spread / total
-            white[k] = innovation / np.sqrt(total)[:, None]
-            logs[k] = np.log(total)
-            state = state + gain[:, None] * innovation
-            spread = spread * (1 - gain)
-    return white, logs
+        white[index] = _whiten_session(values[index], variance[index], times[index], wander_sd, wander_time)
+        if session_variance > 0:
+            ones = _whiten_session(np.ones((len(index), values.shape[1], 1)), variance[index], times[index], wander_sd, wander_time)[:, :, 0]
+            square = (ones**2).sum(axis=0)
+            shrink = (1 - 1 / np.sqrt(1 + session_variance * square)) / square
+            white[index] -= (shrink * ones)[:, :, None] * np.einsum('ka,kaq->aq', ones, white[index])
+    return white
+
+
+def _whiten_session(values, variance, times, wander_sd, wander_time):
+    """Return the innovations of one session: gains step by step, states by a bidiagonal system ``s_k - c_k s_(k-1) = d_k g_k v_k``."""
+    if wander_sd == 0:
+        return values / np.sqrt(variance)[:, :, None]
+    n_axes, decay = variance.shape[1], np.exp(-np.diff(times) / wander_time)
+    total, gain = np.empty_like(variance), np.empty_like(variance)
+    spread = np.full(n_axes, wander_sd**2)
+    fresh = np.append((1 - decay**2) * wander_sd**2, 0.0)
+    for k, square in enumerate(np.append(decay**2, 0.0)):
+        total[k] = spread + variance[k]
+        gain[k] = spread / total[k]
+        spread = square * spread * (1 - gain[k]) + fresh[k]
+    innovation = values.copy()
+    for axis in range(n_axes if len(values) > 1 else 0):
+        bands = np.stack([np.ones(len(decay)), np.append(-decay[1:] * (1 - gain[1:-1, axis]), 0.0)])
+        driven = np.asfortranarray((decay * gain[:-1, axis])[:, None] * values[:-1, axis])
+        innovation[1:, axis] -= lapack.dtbtrs(bands, driven, uplo='L', diag='U')[0]
+    return innovation / np.sqrt(total)[:, :, None]
+
+
+def predict_session_offsets(misfit, variance, times, sessions, noise):
+    """
+    Return the offset of each session, shape (n_sessions, 3): the mean of its residuals, weighted, drawn towards zero by the noise of that mean.
+
+    Parameters
+    ----------
+    misfit, variance : ndarray, shape (n, 3)
+        Residuals of the window means and the independent part of their variance.
+
+    """
+    offsets = []
+    for index in sessions:
+        rows = np.stack([np.ones((len(index), 3)), misfit[index]], axis=2)
+        ones, rest = np.moveaxis(_whiten_session(rows, variance[index], times[index], noise.wander_sd, noise.wander_time), 2, 0)
+        offsets.append((ones * rest).sum(axis=0) / ((ones**2).sum(axis=0) + 1 / noise.session_variance))
+    return np.array(offsets)
 
 
 class OffsetLikelihood:
@@ -113,122 +150,66 @@ class OffsetLikelihood:
     Minus twice the restricted log likelihood of mean rows ``[design | residual]`` as a function of the offsets' variances.
 
     With ``V = D + s^2 K``, K exponential in time, ``V^-1 = D^-1 - D^-1 (D^-1 + K^-1 / s^2)^-1 D^-1``, and K^-1 is tridiagonal: linear
-    time.
+    time. An offset per session adds a matrix of rank one to each session's block.
     """
 
     def __init__(self, rows, white, times, sessions, information):
         order = np.concatenate(sessions)
-        self.rows, self.white, self.information = rows[order], white[order], information
-        steps = np.diff(times[order])
-        steps[np.cumsum([len(index) for index in sessions])[:-1] - 1] = np.inf
-        self.steps = steps
+        self._columns = np.ascontiguousarray(rows[order].transpose(1, 2, 0))
+        self.white, self.information = np.ascontiguousarray(white[order].T), information
+        ends = np.cumsum([len(index) for index in sessions])
+        self._starts = ends - [len(index) for index in sessions]
+        self.steps = np.diff(times[order])
+        self.steps[ends[:-1] - 1] = np.inf
 
-    def __call__(self, offset, wander=0.0, time=100.0):
-        """Return the value for an offset sd, a wander sd and its correlation time."""
-        logs, gram = self.whitened(offset, wander, time)
+    def __call__(self, offset, wander=0.0, time=100.0, session=0.0):
+        """Return the value for an offset sd, a wander sd and its correlation time, and an sd from session to session."""
+        logs, gram = self.whitened(offset, wander, time, session)
         return logs + _profile(gram)
 
-    def whitened(self, offset, wander=0.0, time=100.0):
+    def whitened(self, offset, wander=0.0, time=100.0, session=0.0):
         """Return log|V| and the Gram matrix of ``[design | residual]`` weighted with V^-1, `information` included."""
         variance = self.white + offset**2
         logs, gram = np.log(variance).sum(), self.information.copy()
-        scaled = self.rows / np.sqrt(variance)[:, :, None]
-        flat = scaled.reshape(-1, self.rows.shape[2])
-        gram += flat.T @ flat
         if wander > 0:
-            decay = np.exp(-self.steps / time)
-            rest = -np.expm1(-2 * self.steps / time)
-            logs += 3 * (len(self.rows) * 2 * np.log(wander) + np.log(rest).sum())
-            bands = self._inverse_kernel(decay, rest, wander)
-            for axis in range(3):
-                logs += self._take_wander(gram, bands, self.rows[:, axis], variance[:, axis])
+            decay, rest = np.exp(-self.steps / time), -np.expm1(-2 * self.steps / time)
+            logs += 3 * (self.white.shape[1] * 2 * np.log(wander) + np.log(rest).sum())
+            kernel = _inverse_kernel(decay, rest, wander)
+        for columns, spread in zip(self._columns, variance):
+            weighted = columns / spread
+            gram += weighted @ columns.T
+            ones = 1 / spread
+            if wander > 0:
+                diagonal, beside, info = lapack.dpttrf(kernel[0] + 1 / spread, kernel[1])
+                if info:
+                    raise FloatingPointError('the covariance of the window means must be positive definite; variances are not finite')
+                logs += np.log(diagonal).sum()
+                gram -= weighted @ lapack.dpttrs(diagonal, beside, weighted.T)[0]
+                if session > 0:
+                    ones = (1 - lapack.dpttrs(diagonal, beside, ones[:, None])[0][:, 0]) / spread
+            if session > 0:
+                logs += self._take_session(gram, columns, ones, session)
         return logs, gram
 
-    def _inverse_kernel(self, decay, rest, wander):
-        """Return K^-1 / s^2 of the wander as lower bands, shape (2, n)."""
-        bands = np.zeros((2, len(self.rows)))
-        bands[0] = 1.0
-        bands[0, :-1] += decay**2 / rest
-        bands[0, 1:] += decay**2 / rest
-        bands[1, :-1] = -decay / rest
-        return bands / wander**2
+    def _take_session(self, gram, columns, ones, session):
+        """Subtract what session offsets explain from the Gram matrix in place; return the log determinant that goes with it."""
+        square = 1 + session**2 * np.add.reduceat(ones, self._starts)
+        sums = np.add.reduceat(columns * ones, self._starts, axis=1)
+        gram -= session**2 * (sums / square) @ sums.T
+        return np.log(square).sum()
 
-    def _take_wander(self, gram, bands, rows, variance):
-        """Subtract the wander's part from the Gram matrix in place; return the log determinant that goes with it."""
-        banded = bands.copy()
-        banded[0] += 1 / variance
-        factor = cholesky_banded(banded, lower=True, check_finite=False)
-        weighted = rows / variance[:, None]
-        gram -= weighted.T @ cho_solve_banded((factor, True), weighted, check_finite=False)
-        return 2 * np.log(factor[0]).sum()
+
+def _inverse_kernel(decay, rest, wander):
+    """Return K^-1 / s^2 of the wander: its diagonal and the one beside it."""
+    diagonal = np.ones(len(decay) + 1)
+    diagonal[:-1] += decay**2 / rest
+    diagonal[1:] += decay**2 / rest
+    return diagonal / wander**2, -decay / rest / wander**2
 
 
 def _profile(gram):
     """Return log|A| + (y' y - b' A^-1 b) for the Gram matrix [[A, b], [b', y' y]]."""
     scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-300))
     factor = np.linalg.cholesky(gram[:-1, :-1] / np.outer(scale, scale) + 1e-12 * np.eye(len(scale)))
-    solved = np.linalg.solve(factor, gram[:-1, -1] / scale)
+    solved = lapack.dtrtrs(factor, gram[:-1, -1] / scale, lower=1)[0]
     return 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() + gram[-1, -1] - solved @ solved
-
-
-TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
-"""Correlation times of MEMS biases: around 100 s, log-normal; a short session cannot tell them (field catalogue, section 6)."""
-CLEAR_GAIN = 30.0
-"""Fall of minus twice the log likelihood beyond which a wander's size is plain and its best estimate is taken."""
-OFFSET_GRID = np.array([0.0, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0])
-WANDER_GRID = np.array([0.0, 0.15, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5, 4.0, 6.3, 10.0, 25.0, 60.0])
-TIME_GRID = np.array([40.0, 100.0, 250.0])
-"""Offset and wander in units of the typical noise of a window mean; correlation times in s."""
-
-
-def estimate_offsets(rows, white, times, sessions, information):
-    """
-    Return (offset_sd, wander_sd, wander_time) from the restricted likelihood.
-
-    A short session leaves open how large a wander is, and a bias is only as certain as its wander is small. So the
-    variances are averaged over the likelihood (posterior means on a grid); only a wander that is plain gets its best value.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (n, 3, q + 1)
-        Mean rows ``[design | residual]`` of the linearised model, one layer per axis.
-    white : ndarray, shape (n, 3)
-        Variance of the means by the noise within windows.
-
-    """
-    typical = float(np.sqrt(np.median(white)))
-    likelihood = OffsetLikelihood(rows, white, times, sessions, information)
-
-    def cost(offset, wander=0.0, time=TYPICAL_TIME):
-        return likelihood(offset, wander, time) + (np.log(time / TYPICAL_TIME) / TIME_SPREAD)**2
-
-    alone = np.array([cost(ratio * typical) for ratio in OFFSET_GRID])
-    offsets = OFFSET_GRID[alone < alone.min() + 20.0]
-    offsets = np.unique(np.concatenate([[0.0], offsets])) * typical
-    wanders = WANDER_GRID[WANDER_GRID > 0] * typical if len(rows) >= 12 else WANDER_GRID[:0]
-    trials = [(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID * typical]
-    trials += [(offset, wander, time) for wander in wanders for time in TIME_GRID for offset in offsets]
-    costs = np.concatenate([alone, [cost(*trial) for trial in trials[len(alone):]]])
-    best = int(np.argmin(costs))
-    if alone.min() - costs[best] > CLEAR_GAIN:
-        return _best_wander(cost, trials[best], typical)
-    return _posterior_mean(np.array(trials), costs - costs[best])
-
-
-def _posterior_mean(trials, costs):
-    """Return the roots of the mean variances, and the mean logarithm of the correlation time, over the likelihood."""
-    weight = np.exp(-0.5 * costs) * np.where(trials[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
-    weight /= weight.sum()
-    offset, wander = np.sqrt(weight @ trials[:, :2]**2)
-    wandering = weight * trials[:, 1]**2
-    if wandering.sum() <= 0:
-        return float(offset), 0.0, TYPICAL_TIME
-    return float(offset), float(wander), float(np.exp(wandering @ np.log(trials[:, 2]) / wandering.sum()))
-
-
-def _best_wander(cost, start, typical):
-    """Return the best values near a grid point."""
-    found = minimize(lambda x: cost(np.exp(x[0]), np.exp(x[1]), np.exp(np.clip(x[2], 1.6, 8.0))), np.log([max(start[0], 0.1 * typical), *start[1:]]),
-                     method='Nelder-Mead', options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03})
-    offset_sd, wander_sd, wander_time = np.exp(np.append(found.x[:2], np.clip(found.x[2], 1.6, 8.0)))
-    return float(offset_sd), float(wander_sd), float(wander_time)
