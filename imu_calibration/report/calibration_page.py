@@ -3,8 +3,8 @@
 from imu_calibration.calibration import DETERMINED
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
-from imu_calibration.report.navigation_section import navigation_section, rest_growth
-from imu_calibration.report.numbers import in_unit, text
+from imu_calibration.report.navigation_section import navigation_section
+from imu_calibration.report.numbers import in_unit
 from imu_calibration.report.observability_section import observability_section
 from imu_calibration.report.origin import origin_section, recording_facts
 from imu_calibration.report.page import render
@@ -29,23 +29,28 @@ def calibration_report(result):
     """
     errors = window_errors(result)
     at_rest, moving = reading_tables(result, errors)
+    navigation = navigation_section(result, errors)
     return render('calibration.html', title='IMU calibration', verdict=judge(result.calibration, result.tolerances), facts=recording_facts(result),
-                  tiles=tiles(result, errors), groups=parameter_groups(result), sample=worked_sample(result), derived=derived_section(result),
+                  tiles=tiles(result, errors, navigation), groups=parameter_groups(result), sample=worked_sample(result), derived=derived_section(result),
                   residuals=residual_section(result, errors), observability=observability_section(result), levers=lever_section(result),
-                  navigation=navigation_section(result, errors), at_rest=at_rest, moving=moving, budget=budget_section(result), origin=origin_section(result),
+                  navigation=navigation, at_rest=at_rest, moving=moving, budget=budget_section(result), origin=origin_section(result),
                   by_hand=result.table is None)
 
 
-def tiles(result, errors):
+def tiles(result, errors, navigation):
     """Return the figures that matter most: what was determined, and the errors before and after."""
     names = [name for name in result.calibration.param_names if requested(name)]
     done = sum(status == DETERMINED for name, status in zip(result.calibration.param_names, result.calibration.status) if requested(name))
-    found = [{'what': 'parameters determined', 'after': f'{done} of {len(names)}', 'before': None, 'note': 'to their tolerances'}]
+    found = [_tile('parameters determined', f'{done} of {len(names)}', None, 'to their tolerances')]
     for sensor in ('accelerometer', 'gyroscope'):
-        found.append({'what': f'{sensor} error', 'before': in_unit(errors.rms(sensor, 'before'), UNIT[sensor]), 'after': in_unit(errors.rms(sensor, 'after'), UNIT[sensor]),
-                      'note': f'rms of {len(errors.time)} window means'})
-    runs = rest_growth(result, errors)
-    if runs:
-        before, after = (run.last()[1] for run in runs)
-        found.append({'what': 'position after 50 s at rest', 'before': f'{text(before)} m', 'after': f'{text(after)} m', 'note': 'dead reckoning, median over poses'})
+        after, before = (in_unit(errors.rms(sensor, which), UNIT[sensor]) for which in ('after', 'before'))
+        found.append(_tile(f'{sensor} error', after, before, f'rms of {len(errors.time)} window means'))
+    if navigation['rest']:
+        after, before = navigation['rest']['position'][::-1]
+        found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m', f"of it, from the calibration: {navigation['rest']['parts'][0][2]} m"))
     return found
+
+
+def _tile(what, after, before, note):
+    number, _, unit = after.partition(' ')
+    return {'what': what, 'number': number, 'unit': unit, 'before': before, 'note': note}

@@ -63,4 +63,5 @@ class _Arms:
         angle = np.linspace(0, 2 * np.pi, 61)
         ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
         axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
-        axes.annotate('xyz'[element], (x, y), (5, 5), textcoords='offset points', color=colour, fontsize=10, fontweight='bold')
+        away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
+        axes.annotate('xyz'[element], (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center', va='center')

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.compensation import compensate
+from imu_calibration.compensation_covariance import Uncertainty
 from imu_calibration.navigation import strapdown
 from imu_calibration.observability import _attitudes
 from imu_calibration.reference import Reference, lever_matrix
-from imu_calibration.report.figures import AFTER, BEFORE, draw
+from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw
 from imu_calibration.report.numbers import text
 from imu_calibration.turntable import reference_motion
 
@@ -38,21 +39,26 @@ class Growth:
 
 def navigation_section(result, errors):
     """Return figures and end values of dead reckoning at rest and in motion."""
-    at_rest, moving = rest_growth(result, errors), motion_growth(result)
-    return {'rest': _shown('rest', at_rest) if at_rest else None, 'moving': _shown('moving', moving) if moving else None}
+    before, moving = rest_growth(errors), motion_growth(result)
+    found = {'rest': None, 'moving': None}
+    if before is not None:
+        after, parts = expected_growth(result, errors)
+        found['rest'] = _shown('rest', before, after, parts) | {'parts': [(name, *(text(v) for v in part.last())) for name, part in parts.items()]}
+    if moving is not None:
+        found['moving'] = _shown('moving', *moving)
+    return found
 
 
-def _shown(name, pair):
-    before, after = pair
+def _shown(name, before, after, parts=None):
     (velocity_before, position_before), (velocity_after, position_after) = before.last(), after.last()
-    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after), 'Growth of velocity and position errors, before and after calibration'),
+    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after, parts or {}), 'Growth of velocity and position errors, before and after calibration'),
             'seconds': text(before.time[-1]), 'runs': len(before.velocity), 'velocity': (text(velocity_before), text(velocity_after)),
-            'position': (text(position_before), text(position_after)), 'gain': text(position_before / position_after, 2) if position_after > 0 else '–'}
+            'position': (text(position_before), text(position_after))}
 
 
-def rest_growth(result, errors):
+def rest_growth(errors):
     """
-    Return (before, after) Growth of runs of 50 s at rest, one per pose of the recording; None without poses.
+    Return the Growth of uncalibrated runs of 50 s at rest, one per pose of the recording; None without poses.
 
     Each run starts from the true attitude and feels the mean error that its window showed, as a constant.
     """
@@ -60,11 +66,8 @@ def rest_growth(result, errors):
     if not len(static):
         return None
     time = np.linspace(0.0, SECONDS, STEPS)
-    growths = []
-    for which in (errors.before, errors.after):
-        runs = [_rest_run(time, errors.true['accelerometer'][k], which['accelerometer'][k], which['gyroscope'][k]) for k in static]
-        growths.append(_growth(time, runs))
-    return tuple(growths)
+    before = errors.before
+    return _growth(time, [_rest_run(time, errors.true['accelerometer'][k], before['accelerometer'][k], before['gyroscope'][k]) for k in static])
 
 
 def _rest_run(time, force, force_error, rate_error):
@@ -72,6 +75,51 @@ def _rest_run(time, force, force_error, rate_error):
     attitude = _attitudes(force[None] / gravity)[0].T
     count = len(time)
     return strapdown(time, np.tile(force + force_error, (count, 1)), np.tile(rate_error, (count, 1)), gravity, attitude)
+
+
+def expected_growth(result, errors):
+    """
+    Return the expected Growth (rms) at rest after calibration, and its parts: parameters, instability, noise.
+
+    The mean of a short window shows its noise more than the calibration's errors, so that the errors are predicted: a constant
+    error d of the specific force gives ``d t``, ``d t^2 / 2``, one w of the rate across the vertical ``g w t^2 / 2``, ``g w t^3 / 6``;
+    white noise of density N gives ``N t^(1/2)``, ``N t^(3/2) / 3^(1/2)`` and ``g N t^(3/2) / 3^(1/2)``, ``g N t^(5/2) / 20^(1/2)``.
+    """
+    static = np.flatnonzero(errors.kind == 'static')[:MOST_POSES]
+    time = np.linspace(0.0, SECONDS, STEPS)
+    forces = errors.true['accelerometer'][static]
+    gravity = float(np.median(np.linalg.norm(forces, axis=1)))
+    uncertainty = Uncertainty(result.calibration)
+    constants = np.array([_constant_variances(uncertainty, force) for force in forces])
+    scatter = [float(np.max(result.calibration.noise(sensor)[1])) for sensor in ('accelerometer', 'gyroscope')]
+    unstable = np.tile([3 * scatter[0]**2, 2 * scatter[1]**2], (len(static), 1))
+    density = [d * np.sqrt(n) for d, n in zip(noise_densities(result), (3, 2))]
+    parts = {'parameters': _constant_growth(time, constants, gravity), 'instability of the biases': _constant_growth(time, unstable, gravity),
+             'noise': Growth(time, np.hypot(density[0] * time**0.5, gravity * density[1] * time**1.5 / np.sqrt(3))[None],
+                             np.hypot(density[0] * time**1.5 / np.sqrt(3), gravity * density[1] * time**2.5 / np.sqrt(20))[None])}
+    total = Growth(time, *(np.sqrt(sum(getattr(part, name)**2 for part in parts.values())) for name in ('velocity', 'position')))
+    return total, parts
+
+
+def _constant_variances(uncertainty, force):
+    """Return the variance of the specific-force error, all axes, and of the rate error across the vertical, from the parameters."""
+    covariance, up = uncertainty.at(force).parameters, force / np.linalg.norm(force)
+    return np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:]) - up @ covariance[3:, 3:] @ up
+
+
+def _constant_growth(time, variances, gravity):
+    force, rate = np.sqrt(np.maximum(variances, 0)).T[:, :, None]
+    return Growth(time, np.hypot(force * time, gravity * rate * time**2 / 2), np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6))
+
+
+def noise_densities(result):
+    """Return the densities of accelerometer and gyroscope noise at low frequency, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
+    if result.table is None:
+        period = float(result.solution.statistics['period'])
+    else:
+        period = float(np.median([row.duration / max(row.count - 1, 1) for row in result.gathered.accumulator.rows]))
+    found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
+    return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * period)) for f in found]
 
 
 def _growth(time, runs):
@@ -121,20 +169,23 @@ def _at_origin(calibration, ref):
 
 
 class _Growths:
-    """Velocity and position, each with median and the range of the runs."""
+    """Velocity and position, each with median and the range of the runs; parts of the expected error as thin lines."""
 
-    def __init__(self, before, after):
-        self.pair = (before, after)
+    def __init__(self, before, after, parts):
+        self.pair, self.parts = (before, after), parts
 
     def __call__(self, figure):
         for axes, name, unit in zip(figure.subplots(1, 2), ('velocity', 'position'), ('m/s', 'm')):
             for growth, colour, label in zip(self.pair, (BEFORE, AFTER), ('before', 'after')):
-                values = np.maximum(getattr(growth, name)[:, 1:], 1e-12)
-                low, middle, high = np.quantile(values, (0.1, 0.5, 0.9), axis=0)
+                low, middle, high = np.quantile(np.maximum(getattr(growth, name)[:, 1:], 1e-12), (0.1, 0.5, 0.9), axis=0)
                 axes.fill_between(growth.time[1:], low, high, color=colour, alpha=0.16, lw=0)
                 axes.plot(growth.time[1:], middle, color=colour, label=label)
+            for (label, part), dash in zip(self.parts.items(), ('-', '--', ':')):
+                values = np.median(getattr(part, name)[:, 1:], axis=0)
+                if values[-1] > 0:
+                    axes.plot(part.time[1:], values, color=GREY, lw=1.0, ls=dash, label=label)
             axes.set_yscale('log')
             axes.set_title(f'{name} error, {unit}')
             axes.set_xlabel('time, s')
             axes.set_xlim(0, self.pair[0].time[-1])
-        figure.axes[0].legend(loc='lower right')
+        figure.axes[0].legend(loc='lower right', fontsize=8)

@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from imu_calibration.estimation import make_prior
 from imu_calibration.observability import tolerance_scaled_singular_values
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw
 from imu_calibration.report.numbers import text
 
-SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro', 'reference': 'table'}
+SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
 ROW = 0.155
 """Height of one bar, inches."""
 
@@ -18,9 +19,16 @@ def observability_section(result):
     figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live), 'Standard deviation over tolerance of every parameter'),
                'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), 'Correlation between the parameters')}
     if result.table is not None:
-        singular = tolerance_scaled_singular_values(result.solution.information, result.tolerances)
+        singular = singular_values(result)
         figures['singular'] = draw('singular', (8.6, 2.5), _Singular(singular), 'Singular values of the design in units of the tolerances')
     return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
+
+
+def singular_values(result):
+    """Return the tolerance-scaled singular values of the design; directions that the gauge fixes by convention are left out."""
+    convention = make_prior(result.solution.model).root[len(result.tolerances):]
+    values = tolerance_scaled_singular_values(result.solution.information + convention.T @ convention, result.tolerances)
+    return values[len(convention):]
 
 
 def directions(calibration):
@@ -45,7 +53,8 @@ def _correlation(calibration, live):
 def short_name(name):
     """Return a parameter or effect name that fits a figure."""
     sensor, _, rest = name.partition('.')
-    return f'{SHORT[sensor]} {rest.replace("accel_", "").replace("gyro_", "").replace("_", " ").replace(".", " ")}'
+    rest = rest.removeprefix('accel_').removeprefix('gyro_').replace('_', ' ').replace('.', ' ')
+    return rest if sensor == 'reference' else f'{SHORT[sensor]} {rest}'
 
 
 class _Bars:

@@ -32,8 +32,13 @@ def _row(result, index, unit, component, needs):
     shown = people(value, sd, unit)
     share = sd / tolerance
     return {'name': calibration.param_names[index], 'component': component, 'value': shown[0], 'sd': shown[1], 'unit': shown[2],
-            'si': ' ± '.join(pair(value, sd)) + ('' if unit == '1' else f' {unit}'), 'tolerance': in_unit(tolerance, unit, 2),
+            'si': '' if unit == '1' else ' ± '.join(pair(value, sd)) + f' {printed(unit)}', 'tolerance': in_unit(tolerance, unit, 2),
             'share': text(share, 2), 'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
+
+
+def printed(unit):
+    """Return an SI unit with raised powers."""
+    return unit.replace('^-1', '⁻¹').replace('^-2', '⁻²').replace('^2', '²')
 
 
 def _bar(share):
@@ -46,7 +51,7 @@ def _why(calibration, index, share, needs):
     if calibration.sd[index] == 0:
         return 'fixed by the choice of axes'
     if status == DETERMINED:
-        return f'sd is {text(100 * share, 2)} % of the tolerance'
+        return ''
     motion = needs.get(name, '')
     wanted = f'; needs: {motion}' if motion else ''
     if status == HELD:

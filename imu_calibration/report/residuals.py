@@ -11,6 +11,7 @@ from imu_calibration.units import for_people
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 LAG_SECONDS = 2.0
 """Longest lag that is drawn."""
+MOST_WINDOWS = 60
 KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins', 'dynamic': 'within dynamic stretches'}
 
 
@@ -61,11 +62,13 @@ def autocorrelation(result):
     Each window's residual is taken about its own mean; windows are weighted by their length.
     """
     model, values, table = result.solution.model, result.solution.values, result.table
-    windows = [w for w in result.gathered.kept if len(w) >= 100][:60]
+    windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:
         return {}
+    typical = np.median([len(w) for w in windows])
+    windows = [w for w in windows if len(w) >= typical][:MOST_WINDOWS]
     period = float(np.median([w.period for w in windows]))
-    n_lags = max(2, min(int(LAG_SECONDS / period), min(len(w) for w in windows) // 2))
+    n_lags = max(2, min(int(LAG_SECONDS / period), int(typical) // 2))
     sums = {sensor: np.zeros((n_lags, 3)) for sensor in SENSORS}
     for window in windows:
         for sensor, measured, predicted in zip(SENSORS, (window.force_s, window.rate_s), predict(model, values, table, window.motion, window.temperature_c)):
@@ -109,7 +112,8 @@ def noise_rows(calibration):
         found, unit = calibration.statistics.get(sensor, {}), UNIT[sensor]
         white = np.asarray(found.get('noise_sd', [np.nan] * 3), float)
         wander = found.get('wander_sd') or 0.0
-        rows.append({'sensor': sensor, 'noise': [in_unit(v, unit) for v in white], 'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
+        factor, name = for_people(unit)
+        rows.append({'sensor': sensor, 'noise': ', '.join(text(v * factor) for v in white) + f' {name}', 'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
                      'between': in_unit(found.get('between_window_sd', 0.0), unit, 2) if found.get('between_window_sd') else 'none seen',
                      'wander': f'{in_unit(wander, unit, 2)} over {text(found.get("wander_time_s"), 2)} s' if wander else 'none seen',
                      'moving': in_unit(found['residual_rms_moving'], unit) if found.get('residual_rms_moving') is not None else '–'})
