@@ -10,6 +10,7 @@ from imu_calibration.diagnosis.extended import extended_solution
 from imu_calibration.diagnosis.gain import Gain, heldout_gain, residual_traces
 from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import sentence
+from imu_calibration.diagnosis.search import FAMILY_WISE
 from imu_calibration.diagnosis.separation import separating_motion
 from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
 from imu_calibration.diagnosis.stories import Explained, sensors_of
@@ -183,7 +184,7 @@ def _verdict(name, alone, beside, found, mates):
         return 'found'
     if name in mates:
         return f'as good as {mates[name]}'
-    if not alone.allowed and alone.gain > 0:
+    if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
         return 'refused: its size would be impossible'
     if beside is not None and beside.significant:
         return 'refused: it leaves most of the unexplained where it was'

@@ -110,7 +110,7 @@ def _start(baseline, effects):
 
 def _at_baseline(lifted, baseline, used):
     """Move the residual to the baseline's own solution."""
-    for _ in range(2):
+    for _ in range(2 if baseline.has_arms else 1):
         space = parameter_space(lifted, baseline)
         change = solve_normal(normal_matrix(space, first_noise(space)), space.prior_sd, space.prior_mean, np.array(used))
         lifted = rebased(lifted, lifted.values + change[:len(lifted.values)])

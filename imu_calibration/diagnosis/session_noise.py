@@ -141,10 +141,10 @@ def saturated_noise(space, smooth):
 
     """
     noise = first_noise(space)
-    for _ in range(2):
+    for last in (False, True):
         normal = normal_matrix(space, noise)
         values = solve_normal(normal, space.prior_sd, space.prior_mean)
-        noise = {sensor: _with_factors(space, sensor, noise[sensor], values) for sensor in SENSORS}
+        noise = {sensor: _with_factors(space, sensor, noise[sensor], values, last) for sensor in SENSORS}
     return {sensor: with_wander(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
 
 
@@ -218,7 +218,7 @@ def _first(space, sensor):
     return SensorNoise(*found, within={name: np.ones(3) for name in KINDS})
 
 
-def _with_factors(space, sensor, noise, values):
+def _with_factors(space, sensor, noise, values, look_along):
     """Return the noise with factors within windows: the residual's variance, and more where it lies along the columns."""
     factors, bends = {}, {}
     for name in KINDS:
@@ -232,7 +232,7 @@ def _with_factors(space, sensor, noise, values):
             squares = np.einsum('kij,i,j->k', products, reduced, reduced)
             dof = (space.lifted.count[rows] - 1).sum()
             factor[axis] = squares.sum() / dof / noise.white[axis]
-        bends[name] = float(np.clip(np.mean(_bend(space, sensor, rows, values) / (factor * noise.white)), 1.0, None))
+        bends[name] = float(np.clip(np.mean(_bend(space, sensor, rows, values) / (factor * noise.white)), 1.0, None)) if look_along else 1.0
         factors[name] = np.maximum(factor, 0.9) * bends[name]
     return replace(noise, within=factors, bend=bends)
 

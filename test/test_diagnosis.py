@@ -1,0 +1,115 @@
+"""Diagnosis: hidden effects are found, empty sessions stay empty, stories are refused, and what is handed back holds together."""
+
+import json
+
+import numpy as np
+import pytest
+from hiding import Sizes, record
+from scipy.stats import chi2
+
+from imu_calibration.diagnosis import diagnose, to_mapping
+from imu_calibration.diagnosis.diagnose import investigate
+from imu_calibration.errors import NotObservableError
+
+SEED = 3
+
+
+@pytest.fixture(scope='module')
+def empty():
+    """Return a session that hides nothing."""
+    return record(SEED, None, 'white', through_bag=False)
+
+
+@pytest.fixture(scope='module')
+def sizes(empty):
+    """Return the smallest detectable sizes in that session."""
+    return Sizes(empty)
+
+
+def seek(effect, sizes, factor=5.0, noise='white'):
+    """Return (recording, diagnosis) of the session with one effect hidden."""
+    recording = record(SEED, {effect: sizes.hidden(effect, SEED, factor)}, noise, through_bag=effect == 'gyro_g_sensitivity')
+    return recording, diagnose(recording.windows, recording.table, recording.model)
+
+
+def test_nothing_is_found_where_nothing_is_hidden(sizes):
+    search = sizes.attempt.search
+    assert search.run() == []
+    assert [s.question.label for s in search.history[0] if s.significant] == []
+
+
+@pytest.mark.parametrize('effect', ['accel_quadratic', 'gyro_g_sensitivity', 'accel_bias_drift', 'gyro_saturation', 'gyro_bandwidth', 'encoder_harmonic'])
+def test_hidden_effect_is_the_first_finding_with_honest_parameters(effect, sizes):
+    recording, diagnosis = seek(effect, sizes)
+    first = diagnosis.findings[0]
+    assert effect in (first.effect,) + first.indistinguishable_from
+    assert len(diagnosis.findings) == 1
+    assert not any(rest.significant for rest in diagnosis.unexplained.values())
+    if first.effect == effect:
+        true = np.ravel(recording.truth[effect])
+        values, sds, _ = zip(*first.parameters.values())
+        # four standard deviations, and a limit to within 1 %
+        assert np.all(np.abs(values - true) < np.maximum(4 * np.array(sds), 0.01 * np.abs(true) * effect.endswith('saturation')))
+
+
+def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
+    recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False)
+    diagnosis = diagnose(recording.windows, recording.table, recording.model)
+    assert diagnosis.findings == ()
+    assert diagnosis.unexplained['accelerometer'].significant
+    assert not diagnosis.unexplained['gyroscope'].significant
+    # 2 mg times a direction times a product of sines, of which turning windows average much away
+    assert 0.15 < diagnosis.unexplained['accelerometer'].rms / (2 * 9.80665e-3 / np.sqrt(3) / 2) < 1.2
+
+
+def test_earlier_choice_is_replaced_by_the_simpler_effect_that_does_as_well(sizes):
+    recording = record(SEED, {'lever_arm': sizes.hidden('lever_arm', SEED, 5.0)}, 'white', through_bag=False)
+    search = investigate(recording.windows, recording.table, recording.model).attempt.search
+    nine_arms = next(q for q in search.questions if q.name == 'accel_size_effect')
+    assert [q.name for q in search.reconsidered([nine_arms])] == ['lever_arm']
+
+
+def test_document_holds_what_the_contract_asks_for(sizes):
+    recording, diagnosis = seek('accel_quadratic', sizes)
+    document = json.loads(json.dumps(to_mapping(diagnosis)))
+    assert document['format'] == 'imu_calibration/diagnosis/1'
+    finding = document['findings'][0]
+    assert set(finding) >= {'effect', 'sensor', 'explanation', 'parameters', 'p_value', 'gain', 'indistinguishable_from', 'separating_motion'}
+    assert set(finding['gain']) >= {'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95'}
+    assert document['baseline']['accelerometer']['effects'] == ['bias', 'matrix']
+    assert [entry['effect'] for entry in document['not_testable']] == ['earth_rate']
+    assert set(document['unexplained']['gyroscope']) >= {'significant', 'rms', 'correlates_with'}
+    # The extended model is a model like any other: its residual is noise.
+    assert ('accelerometer', 'accel_quadratic') in diagnosis.model.slices
+    assert 0.8 < diagnosis.solution.chi2_per_dof['accelerometer']['means'] < 1.3
+
+
+def test_gain_is_measured_on_windows_that_took_no_part(sizes):
+    _, diagnosis = seek('accel_quadratic', sizes)
+    gain = diagnosis.gain
+    assert gain.windows == diagnosis.locked
+    assert 0.2 < diagnosis.locked / diagnosis.windows < 0.3
+    assert gain.ci95[0] < gain.reduction < gain.ci95[1]
+    assert gain.ci95[0] > 0
+
+
+def test_effects_without_their_data_are_not_testable():
+    recording = record(SEED, None, 'white', through_bag=False, profile='static_only', temperature=None)
+    document = to_mapping(diagnose(recording.windows, recording.table, recording.model))
+    lacking = {entry['effect']: entry for entry in document['not_testable']}
+    assert {'accel_thermal_bias', 'gyro_thermal_scale'} <= set(lacking)
+    assert all(entry['why'] and entry['needs'] for entry in lacking.values())
+    assert document['findings'] == []
+
+
+def test_too_few_windows_are_refused(empty):
+    with pytest.raises(NotObservableError, match='at least 8 windows'):
+        diagnose(empty.windows[:4], empty.table, empty.model)
+
+
+def test_falls_of_the_loss_are_chi_square_where_nothing_is_hidden(sizes):
+    search = sizes.attempt.search
+    falls = np.array([[search.evidence.loss(search.used([])) - search.evidence.loss(search.used([q])), len(q.parameters)]
+                      for q in search.questions if '@' not in q.label])
+    # 25 effects, partly dependent: their sum stays near its expectation
+    assert 1e-3 < chi2.sf(falls[:, 0].sum(), falls[:, 1].sum()) < 1 - 1e-3
