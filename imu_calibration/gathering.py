@@ -168,7 +168,7 @@ def merge(parts):
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
         total.windows = (total.windows + part.windows)[:KEPT_STATISTICS]
-        total.kept, total.poses = total.kept + part.kept, total.poses + part.poses
+        total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
@@ -179,6 +179,12 @@ def merge(parts):
             total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
             total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
     return total
+
+
+def _within_reach(windows):
+    """Return the windows up to KEPT_SAMPLES samples."""
+    ends = np.cumsum([len(window.time) for window in windows])
+    return windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
 
 
 def _added(a, b):

@@ -11,9 +11,10 @@ from imu_calibration.by_hand_document import calibrate_recording_by_hand
 from imu_calibration.calibration import DETERMINED, Calibration, statuses, tolerances_of
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior, solve
-from imu_calibration.gathering import Gathered, gather, merge, restrict
+from imu_calibration.gathering import Gathered, restrict
 from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
 from imu_calibration.settings import WindowSettings
+from imu_calibration.several import GatherStep, join
 from imu_calibration.verdict import judge, requested
 
 SENSORS = ('accelerometer', 'gyroscope')
@@ -91,7 +92,7 @@ def settle_model(model, options, gathered):
     return model
 
 
-def calibrate(sources, table, options=CalibrationOptions(), provenance=None, progress=None, mapper=map):
+def calibrate(sources, table, options=CalibrationOptions(), provenance=None, progress=None, mapper=map, names=None):
     """
     Calibrate from one or several recordings of the same IMU on a table.
 
@@ -108,35 +109,29 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
         Called with the number of IMU samples read.
     mapper : callable
         Applies the map step to the recordings; `map`, or that of a pool.
+    names : sequence of str, optional
+        Names of the recordings for messages.
 
     Returns
     -------
     CalibrationResult
 
+    Raises
+    ------
+    InputError
+        When a recording cannot be used or is of another frame, with its name when there are several.
+
     """
+    names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model = choose_model(options, table, _first_temperature(sources, options))
     for _ in range(PASSES):
-        gathered = merge(mapper(_Gather(table, model, options, progress), enumerate(sources)))
-        check_units(gathered, model)
+        step = GatherStep(table, model, options.windows, options.nominal, names, progress)
+        gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model))
         result = finish(gathered, model, table, options, provenance)
         if not _needs_another_pass(model, result.solution):
             break
         model = model.at(_values_in(model, result.solution))
     return result
-
-
-@dataclass
-class _Gather:
-    """The map step with its arguments bound, so that it can be sent to another process."""
-
-    table: object
-    model: object
-    options: CalibrationOptions
-    progress: object
-
-    def __call__(self, numbered):
-        session, source = numbered
-        return gather(source(), self.table, self.model, self.options.windows, self.options.nominal, session, progress=self.progress)
 
 
 def _first_temperature(sources, options):
@@ -246,6 +241,8 @@ def statistics(solution, gathered):
             'noise_sd': noise.sample_sd(), 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd, 'wander_sd': noise.wander_sd,
             'wander_time_s': noise.wander_time if noise.wander_sd else None, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
+        if sensor in solution.session_biases:
+            result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
     accumulator = gathered.accumulator
     result['windows'] = dict(sorted(accumulator.windows.items()))
     result['samples_used'] = dict(sorted(accumulator.samples.items()))

@@ -1,7 +1,11 @@
 """``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
 
+from pathlib import Path
+
 from imu_calibration import documents, workflow
 from imu_calibration.cli import files, recordings
+from imu_calibration.cli.fleet_pool import jobs_for, process_mapper
+from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import show_calibration
 
 NAME = 'calibrate'
@@ -15,7 +19,7 @@ def add_arguments(parser):
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
     parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for calibration by hand, default 9.80665')
     parser.add_argument('--no-report', action='store_true', help='write calibration.yaml only')
-    parser.add_argument('--jobs', type=int, default=1, help='recordings read side by side')
+    parser.add_argument('--jobs', type=int, help='recordings read side by side, default one per processor')
     recordings.add_topic_arguments(parser)
     recordings.add_model_arguments(parser)
 
@@ -25,15 +29,16 @@ def run(options):
     settings = recordings.calibration_options(options)
     table = files.read_table(options.table) if options.table else None
     names = None if table is None else table.joint_names
+    jobs = jobs_for(options.jobs, len(options.bags))
     for bag in options.bags:
         recordings.open_bag(bag, options, want_joints=table is not None).close()
     folder = files.make_folder(options.output)
-    sources = [recordings.source_of(bag, options, names, table is not None) for bag in options.bags]
+    sources = [recordings.source_of(bag, options, names, table is not None, quiet=jobs > 1) for bag in options.bags]
     provenance = recordings.provenance_of(options.bags, options)
     if table is None:
         result = workflow.calibrate_without_table(sources, settings, options.gravity, provenance)
     else:
-        result = workflow.calibrate(sources, table, settings, provenance, mapper=mapper(options.jobs))
+        result = _on_table(sources, table, settings, provenance, options.bags, jobs)
     text = documents.calibration_to_text(result.calibration)
     if not options.no_report:
         from imu_calibration.report import calibration_report
@@ -43,13 +48,10 @@ def run(options):
     return workflow.exit_code(result)
 
 
-def mapper(jobs):
-    """Return a map that runs in as many processes as asked."""
-    if jobs <= 1:
-        return map
-
-    def parallel(function, items):
-        from concurrent.futures import ProcessPoolExecutor
-        with ProcessPoolExecutor(jobs) as pool:
-            return list(pool.map(function, items))
-    return parallel
+def _on_table(sources, table, settings, provenance, bags, jobs):
+    """Calibrate with the table, recordings side by side; with several processes one bar counts the recordings."""
+    names = [Path(bag).name for bag in bags]
+    names = [name if names.count(name) == 1 else str(bag) for name, bag in zip(names, bags, strict=True)]
+    with progress_bar('recordings', len(bags) if jobs > 1 else 0, 'recordings') as advance:
+        mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
+        return workflow.calibrate(sources, table, settings, provenance, mapper=mapper, names=names)

@@ -75,10 +75,10 @@ def open_bag(path, options, want_joints=True, imu_topic=None):
                           want_joints=want_joints)
 
 
-def read_blocks(path, topics, joint_names, want_joints, label):
-    """Yield the blocks of a recording with a progress bar; a plain function, so that another process can run it."""
+def read_blocks(path, topics, joint_names, want_joints, label, quiet=False):
+    """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
     recording = open_recording(path, *topics, want_joints=want_joints)
-    with recording, progress_bar(label, recording.message_counts.get(recording.imu_topic, 0)) as advance:
+    with recording, progress_bar(label, 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)) as advance:
         for block in recording.blocks(joint_names) if want_joints else recording.blocks():
             if block.imu is not None:
                 advance(len(block.imu))
@@ -93,10 +93,10 @@ def lost_block(recording):
         yield SampleBlock(dropped=recording.lost)
 
 
-def source_of(path, options, joint_names=None, want_joints=True, imu_topic=None):
+def source_of(path, options, joint_names=None, want_joints=True, imu_topic=None, quiet=False):
     """Return a callable that yields the blocks of a recording, each time anew."""
     topics = (imu_topic or options.imu_topic, getattr(options, 'joint_topic', None), getattr(options, 'temperature_topic', None))
-    return partial(read_blocks, str(path), topics, joint_names, want_joints, Path(path).name)
+    return partial(read_blocks, str(path), topics, joint_names, want_joints, Path(path).name, quiet)
 
 
 

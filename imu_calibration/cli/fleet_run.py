@@ -1,0 +1,104 @@
+"""The fleet's work: units out to the workers, results back into files and tables."""
+
+import csv
+import io
+import math
+from argparse import Namespace
+
+from imu_calibration.cli import files
+from imu_calibration.cli.fleet_pool import cluster_mapper, jobs_for, process_mapper
+from imu_calibration.cli.fleet_units import find_units, unit_of
+from imu_calibration.cli.progress import progress_bar
+from imu_calibration.cli.show import console
+from imu_calibration.fleet import FleetStep, fleet_exit_code, summarise
+from imu_calibration.units import for_people, significant, with_sd
+
+HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest', 'highest_unit')
+
+
+def run_fleet(options, table, settings):
+    """Calibrate every unit of a folder; return the exit code."""
+    found = find_units(options.folder, options.output)
+    plain = Namespace(**{name: value for name, value in vars(options).items() if name != 'run'})
+    units = [unit_of(name, paths, plain, table.joint_names) for name, paths in found]
+    folder = files.make_folder(options.output)
+    with progress_bar('units', len(units), 'units') as advance:
+        mapper = _mapper(options, len(units), lambda result: advance(1))
+        results = mapper(FleetStep(table, settings, with_report=not options.no_report), units)
+    spreads = summarise(results)
+    for result in results:
+        for name, text in (result.files or {}).items():
+            files.write_text(files.make_folder(folder / result.name) / name, text)
+    files.write_text(folder / 'summary.csv', parameters_csv(spreads))
+    files.write_text(folder / 'units.csv', units_csv(results))
+    files.write_text(folder / 'summary.html', summary_html(results, spreads))
+    show_fleet(results, spreads, folder)
+    return fleet_exit_code(results)
+
+
+def _mapper(options, n_units, done):
+    if options.scheduler:
+        return cluster_mapper(options.scheduler, done)
+    return process_mapper(jobs_for(options.jobs, n_units), done)
+
+
+def parameters_csv(spreads):
+    """Return the summary: one row per parameter, SI."""
+    rows = [(s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest) for s in spreads]
+    return _csv([HEADINGS, *rows])
+
+
+def units_csv(results):
+    """Return one row per unit: verdict, exit code, why it was refused, samples lost, and each parameter with its sd, SI."""
+    names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
+    rows = [['name', 'verdict', 'exit_code', 'error', 'dropped'] + [heading for name in names for heading in (name, f'{name}.sd')]]
+    for result in results:
+        known, dropped = {}, ''
+        if result.calibration is not None:
+            known = dict(zip(result.calibration.param_names, zip(result.calibration.values, result.calibration.sd)))
+            dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
+        row = [result.name, result.verdict, result.exit_code, result.error, dropped]
+        rows.append(row + [number for name in names for number in known.get(name, ('', ''))])
+    return _csv(rows)
+
+
+def _csv(rows):
+    text = io.StringIO()
+    csv.writer(text, lineterminator='\n').writerows([['' if isinstance(v, float) and math.isnan(v) else v for v in row] for row in rows])
+    return text.getvalue()
+
+
+def shown(spread):
+    """Return the cells of a parameter for people: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
+    factor, unit = for_people(spread.unit)
+    if not spread.count:
+        return spread.name, 'held', '', '', unit, '', ''
+    mean, sd = with_sd(spread.mean * factor, spread.typical_sd * factor)
+    if spread.count == 1:
+        return spread.name, mean, '', sd, unit, '', spread.lowest[1]
+    return (spread.name, mean, significant(spread.spread * factor), sd, unit, significant(spread.ratio), f'{spread.lowest[1]} .. {spread.highest[1]}')
+
+
+COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
+
+
+def show_fleet(results, spreads, folder):
+    """Print the spread of each parameter, the units, and where the files are."""
+    from rich.table import Table
+    out, table = console(), Table(box=None, pad_edge=False)
+    for heading in COLUMNS:
+        table.add_column(heading, justify='left' if heading in (COLUMNS[0], COLUMNS[4], COLUMNS[6]) else 'right')
+    for spread in spreads:
+        table.add_row(*shown(spread))
+    out.print(table)
+    for result in results:
+        out.print(f'{result.name}: {result.error or result.verdict}', soft_wrap=True, markup=False)
+    calibrated = sum(result.calibration is not None for result in results)
+    out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}', soft_wrap=True)
+
+
+def summary_html(results, spreads):
+    """Return the summary as one page."""
+    from jinja2 import Environment, PackageLoader
+    template = Environment(loader=PackageLoader('imu_calibration'), autoescape=True).get_template('fleet.html')
+    return template.render(results=results, columns=COLUMNS, rows=[shown(spread) for spread in spreads])

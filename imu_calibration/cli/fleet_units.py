@@ -1,0 +1,58 @@
+"""Which recordings in a folder belong to which unit."""
+
+from functools import partial
+from pathlib import Path
+
+from imu_calibration.cli import recordings
+from imu_calibration.errors import InputError
+from imu_calibration.fleet import Unit
+
+STORAGE = ('.db3', '.mcap', '.bag')
+
+
+def find_units(folder, output):
+    """
+    Return (name, paths of recordings) for each unit: a bag, or a sub-folder that holds bags, which are joined.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder of units.
+    output : path-like
+        Folder of results, left out when it lies in `folder`.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist or holds no unit.
+
+    """
+    folder, output = Path(folder), Path(output).resolve()
+    if not folder.is_dir():
+        raise InputError(f'the folder of units {folder} must exist, there is none; correct the path')
+    members = [path for path in sorted(folder.iterdir()) if not path.name.startswith('.') and path.resolve() != output]
+    units = [(path.name if path.is_dir() else path.stem, bags_of(path)) for path in members if path.is_dir() or is_bag(path)]
+    units = [(name, bags or [folder / name]) for name, bags in units]
+    names = [name for name, _ in units]
+    units = [(name if names.count(name) == 1 else bags[0].name, bags) for name, bags in units]
+    if not units:
+        raise InputError(f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give the folder above the bags')
+    return units
+
+
+def bags_of(path):
+    """Return the recordings of a unit in order of name."""
+    return [path] if is_bag(path) else [inner for inner in sorted(path.iterdir()) if is_bag(inner)]
+
+
+def is_bag(path):
+    """Tell whether a path looks like a recording."""
+    if not path.is_dir():
+        return path.suffix in STORAGE
+    return (path / 'metadata.yaml').exists() or any(inner.suffix in STORAGE[:2] for inner in path.iterdir())
+
+
+def unit_of(name, paths, options, joint_names):
+    """Return the Unit whose sources read the bags, without progress bars of their own."""
+    sources = tuple(recordings.source_of(path.resolve(), options, joint_names, quiet=True) for path in paths)
+    return Unit(name, sources, tuple(path.name for path in paths), partial(recordings.provenance_of, [path.resolve() for path in paths], options))
