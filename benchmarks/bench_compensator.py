@@ -40,7 +40,8 @@ def bench_calibration():
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
     values = random_values(model, seed=1)
     noise = {'accelerometer': {'noise_sd': [0.04] * 3}, 'gyroscope': {'noise_sd': [0.004] * 3}}
-    return calibration_to_text(Calibration(model, values, 1e-8 * np.eye(len(values)), ('determined',) * len(values), 'imu_link', statistics=noise))
+    covariance, status = 1e-8 * np.eye(len(values)), ('determined',) * len(values)
+    return calibration_to_text(Calibration(model, values, covariance, status, 'imu_link', statistics=noise))
 
 
 class Process:
@@ -79,7 +80,8 @@ def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0
 
 
 def _source(topic, rate, seconds, environment):
-    return subprocess.Popen([sys.executable, ENDS, 'source', topic, str(rate), str(seconds)], env=environment, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, ENDS, 'source', topic, str(rate), str(seconds)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def compare(nodes, seconds, environment, rate=1000.0):

@@ -1,4 +1,4 @@
-"""The ends of a relay benchmark, each a process of its own: a source of serialized Imu messages, a sink, and the plain relay to compare with."""
+"""Parts of a relay benchmark, each a process of its own: a source and a sink of serialized messages, and the plain relay to compare with."""
 
 import json
 import struct
@@ -78,7 +78,8 @@ def sink(topic):
         numbers.append(number)
         late.append(now - seconds * 10**9 - nanoseconds)
 
-    subscription = node.create_subscription(Imu, topic, record, input_qos(reliable=True), raw=True, callback_group=relay_loop.OutsideExecutor())
+    group = relay_loop.OutsideExecutor()
+    subscription = node.create_subscription(Imu, topic, record, input_qos(reliable=True), raw=True, callback_group=group)
     nowhere = node.create_publisher(Imu, topic + '/nowhere', output_qos())
     deadline = time.monotonic() + 20.0
     while subscription.get_publisher_count() < 1 and time.monotonic() < deadline:
@@ -107,7 +108,11 @@ def main():
     split = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
     rclpy.init(args=arguments[split:])
     try:
-        {'source': lambda topic, rate, seconds: source(topic, float(rate), float(seconds)), 'sink': sink, 'relay': plain_relay}[part](*arguments[:split])
+        if part == 'source':
+            topic, rate, seconds = arguments[:split]
+            source(topic, float(rate), float(seconds))
+        else:
+            {'sink': sink, 'relay': plain_relay}[part](*arguments[:split])
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass
     rclpy.try_shutdown()

@@ -41,11 +41,13 @@ def field(data, name):
 def big_endian(data):
     body = len(data) - 8 * N_DOUBLES
     words = struct.unpack_from('<iII', data, 4)
-    return b'\0\0' + data[2:4] + struct.pack('>iII', *words) + data[16:body] + struct.pack(f'>{N_DOUBLES}d', *struct.unpack_from(f'<{N_DOUBLES}d', data, body))
+    doubles = struct.unpack_from(f'<{N_DOUBLES}d', data, body)
+    return b'\0\0' + data[2:4] + struct.pack('>iII', *words) + data[16:body] + struct.pack(f'>{N_DOUBLES}d', *doubles)
 
 
 @pytest.mark.parametrize('transfer', [None, TRANSFER], ids=['in place', 'transfer'])
-@pytest.mark.parametrize('effects', [((), ()), (('accel_size_effect',), ()), (('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity',))])
+@pytest.mark.parametrize('effects', [((), ()), (('accel_size_effect',), ()),
+                                     (('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity',))])
 def test_messages_come_out_as_blocks_do_offline(effects, transfer):
     calibration, imu = random_calibration(2, *effects), imu_samples()
     live = LiveCompensation(calibration, transfer)

@@ -10,6 +10,10 @@ from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublis
 
 SERIOUS = ('frame_id', 'not an Imu message')
 """Beginnings of the reasons for which a stream as a whole cannot be corrected."""
+KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
+         'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
+         'not finite': 'readings are not finite: these messages are not published',
+         'beyond what can be undone': 'readings are too large for the non-linear effects to be undone: these messages are not published'}
 
 
 class CompensatorDiagnostics:
@@ -61,9 +65,7 @@ class CompensatorDiagnostics:
     def _line(self, reason, count, compensation):
         if reason.startswith('frame_id'):
             return f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they are not corrected"
-        return {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
-                'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
-                'not finite': 'readings are not finite: these messages are not published'}.get(reason, f'{reason}: these messages are not published')
+        return KNOWN.get(reason, f'{reason}: these messages are not published')
 
     def _outside(self, compensation):
         fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0
@@ -73,7 +75,8 @@ class CompensatorDiagnostics:
 
     def _values(self, compensation):
         node = self._node
-        values = {'calibration': node.version or 'none', 'source': node.source, 'loop': 'wait set' if node.by_wait_set else 'public executor',
+        values = {'calibration': node.version or 'none', 'source': node.source,
+                  'loop': 'wait set' if node.by_wait_set else 'public executor',
                   'passed or held back without calibration': node.uncorrected}
         if compensation is None:
             return values

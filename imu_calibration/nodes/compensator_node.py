@@ -118,9 +118,11 @@ class CompensatorNode(Node):
         except ImuCalibrationError as error:
             return self._refuse(source, str(error))
         chosen = self.settings
-        compensation = LiveCompensation(calibration, self._transfer, chosen.check_frame_id, chosen.parameter_covariance, chosen.correct_stamps)
+        compensation = LiveCompensation(calibration, self._transfer, chosen.check_frame_id, chosen.parameter_covariance,
+                                        chosen.correct_stamps)
         if compensation.needs_temperature and self._temperature is None:
-            self._temperature = self.create_subscription(Temperature, 'imu/temperature', self._on_temperature, input_qos(chosen.reliable, 10))
+            self._temperature = self.create_subscription(Temperature, 'imu/temperature', self._on_temperature,
+                                                         input_qos(chosen.reliable, 10))
         before = self._wanted
         if before is not None:
             compensation.prepare(before)

@@ -55,7 +55,7 @@ class LiveCompensation:
         self.needs_slope = bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
         self._kernel = make_kernel(calibration, transfer)
         self._zero = {s: calibration.value(s, 'bias').tolist() for s in ('accelerometer', 'gyroscope')}
-        self._levels = tuple(_level(calibration, s, n) for s, n in (('accelerometer', 'accel_saturation'), ('gyroscope', 'gyro_saturation')))
+        self._levels = _level(calibration, 'accelerometer', 'accel_saturation'), _level(calibration, 'gyroscope', 'gyro_saturation')
         self._can_saturate = any(np.isfinite(self._levels))
         moves = correct_stamps and calibration.has('reference', 'time_offset')
         self._late_ns = round(float(calibration.value('reference', 'time_offset')) * NS) if moves else 0
@@ -170,7 +170,8 @@ class LiveCompensation:
         given = [np.array(self._nine.unpack(raw)).reshape(3, 3) for raw in (force_bytes, rate_bytes)]
         self._no_force, self._no_rate = (cov[0, 0] == ABSENT for cov in given)
         self._absent = bool(self._no_force or self._no_rate)
-        known = [np.zeros((3, 3)) if cov[0, 0] == ABSENT else cov if cov.any() else noise for cov, noise in zip(given, self._uncertainty.noise)]
+        known = [np.zeros((3, 3)) if cov[0, 0] == ABSENT else cov if cov.any() else noise
+                 for cov, noise in zip(given, self._uncertainty.noise)]
         force_cov, rate_cov = self._sensitivity.covariances(*known, self.with_parameters)
         self._force_cov_out = force_bytes if self._no_force else self._nine.pack(*force_cov.ravel().tolist())
         self._rate_cov_out = rate_bytes if self._no_rate else self._nine.pack(*rate_cov.ravel().tolist())

@@ -1,6 +1,7 @@
 """ROS parameters made from the settings that the package declares once."""
 
 import math
+import sys
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -44,15 +45,18 @@ def parameter_descriptor(name, default, unit, text, bounds, symptom, read_only=T
     descriptor.additional_constraints = f'When wrong: {symptom}' if symptom else ''
     if isinstance(default, bool) or bounds == (None, None):
         return descriptor
-    low, high = bounds
     if isinstance(default, int):
-        largest = 2**63 - 1
-        descriptor.integer_range = [IntegerRange(from_value=-largest if low is None else int(low), to_value=largest if high is None else int(high))]
+        low, high = _limits(bounds, 2**63 - 1)
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     elif isinstance(default, float):
-        largest = 1.7976931348623157e308
-        descriptor.floating_point_range = [FloatingPointRange(from_value=-largest if low is None else float(low),
-                                                              to_value=largest if high is None else float(high))]
+        low, high = _limits(bounds, sys.float_info.max)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
+
+
+def _limits(bounds, largest):
+    low, high = bounds
+    return -largest if low is None else low, largest if high is None else high
 
 
 def _to_ros(default):

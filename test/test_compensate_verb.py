@@ -1,0 +1,101 @@
+"""``imu_calibration compensate``: from a bag of a known sensor to a bag of true readings."""
+
+import numpy as np
+import pytest
+from compensation_cases import FURTHER, random_calibration
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.cli import main
+from imu_calibration.compensation_covariance import Uncertainty
+from imu_calibration.documents import calibration_to_text
+from imu_calibration.reference import Reference, lever_matrix
+from imu_calibration.samples import ImuSamples, TemperatureSamples
+from imu_calibration.sensor_model import sensor_output
+from msg_adapters.bag import open_recording
+from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.write import write_session
+from test_adapters_copy import raw_messages
+
+PERIOD_NS = 2_000_000
+N = 3000
+EFFECTS = {'usual': (('accel_size_effect',), ()), 'all': (FURTHER['accelerometer'], FURTHER['gyroscope'])}
+
+
+def true_motion():
+    """Return (stamps, force, rate, alpha, temperature) of a smooth motion that starts and ends at rest."""
+    time = PERIOD_NS * 1e-9 * np.arange(N)
+    phase, w = np.array([0.0, 1.0, 2.0]), np.array([2.0, 1.5, 3.0])
+    rate = np.sin(np.outer(time, w) + phase)
+    alpha = w * np.cos(np.outer(time, w) + phase)
+    force = 9.8 * np.stack([np.sin(0.5 * time), np.zeros(N), np.cos(0.5 * time)], axis=1)
+    return 10**18 + PERIOD_NS * np.arange(N), force, rate, alpha, np.linspace(20.0, 35.0, N)
+
+
+def write_case(folder, effects):
+    """Write a bag of what a sensor with these effects reads, and its calibration; return the calibration."""
+    calibration = random_calibration(7, *EFFECTS[effects], sd=1e-5)
+    stamps, force, rate, alpha, temperature = true_motion()
+    ref = Reference(np.zeros(N), np.broadcast_to(np.eye(3), (N, 3, 3)), force, rate, alpha, 9.8, temperature)
+    readings = [sensor_output(calibration.model, sensor, calibration.values, ref) for sensor in ('accelerometer', 'gyroscope')]
+    thermometer = TemperatureSamples(stamps[::100], temperature[::100])
+    write_session(folder / 'bag', ImuSamples(stamps, *readings, 'imu_link'), temperature=thermometer)
+    folder.joinpath('calibration.yaml').write_text(calibration_to_text(calibration))
+    return calibration
+
+
+def compensate(folder, *more):
+    return main(['compensate', str(folder / 'bag'), '--calibration', str(folder / 'calibration.yaml'), '--output', str(folder / 'out'), *more])
+
+
+@pytest.mark.parametrize('effects', EFFECTS)
+def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
+    calibration = write_case(tmp_path, effects)
+    assert compensate(tmp_path) == 0
+    assert '/imu/data_corrected (3000 samples)' in capsys.readouterr().out
+    stamps, force, rate, _, _ = true_motion()
+    with open_recording(tmp_path / 'out', '/imu/data_corrected', want_joints=False) as recording:
+        imu = ImuSamples.concatenate([block.imu for block in recording.blocks() if block.imu is not None])
+    np.testing.assert_array_equal(imu.stamp_ns, stamps)
+    # Temperature between its stamps is linear in the bag as in the truth; only the delay of the derivative, 20 ms at most, and
+    # g-sensitivity that sees it are left: 9 rad/s^3 x 0.02 s x 0.035 m.
+    late = 9.0 * 0.02 * 0.035
+    assert np.abs(imu.force_s - force)[100:-100].max() < late
+    assert np.abs(imu.rate_s - rate)[100:-100].max() < (1e-3 * late * 10 if effects == 'all' else 1e-12)
+    message = parse_imu(raw_messages(tmp_path / 'out', '/imu/data_corrected')[0][1])
+    cov = np.array(message.doubles[FIELDS['rate_cov']]).reshape(3, 3)
+    expected = Uncertainty(calibration).at().covariances(*Uncertainty(calibration).noise)[1]
+    assert np.diag(cov) == pytest.approx(np.diag(expected), rel=0.05)   # was unknown, so it is the calibration's noise
+
+
+def test_readings_at_another_point_and_frame_of_the_body(tmp_path):
+    write_case(tmp_path, 'usual')
+    assert compensate(tmp_path, '--target-frame', 'base_link', '--target-xyz', '0.2', '-0.1', '0.3', '--target-rpy', '0.1', '0.2', '-1.5') == 0
+    _, force, rate, alpha, _ = true_motion()
+    mat_ts = Rotation.from_euler('xyz', [0.1, 0.2, -1.5]).as_matrix()
+    rate_t, alpha_t = rate @ mat_ts.T, alpha @ mat_ts.T
+    expected = force @ mat_ts.T - lever_matrix(rate_t, alpha_t) @ np.array([0.2, -0.1, 0.3])
+    parsed = [parse_imu(data) for _, data in raw_messages(tmp_path / 'out', '/imu/data_corrected')]
+    assert {message.frame_id for message in parsed} == {'base_link'}
+    got = np.array([message.doubles for message in parsed])[100:-100]
+    # The window of the derivative is up to 40 ms long at an arm of 0.37 m: 9 rad/s^3 x 0.02 s x 0.4 m.
+    assert np.abs(got[:, FIELDS['force_s']] - expected[100:-100]).max() < 9.0 * 0.021 * 0.4
+    np.testing.assert_allclose(got[:, FIELDS['rate_s']], rate_t[100:-100], atol=1e-12)
+    without_arm = np.abs(got[:, FIELDS['force_s']] - (force @ mat_ts.T)[100:-100]).max()
+    assert without_arm > 0.5
+
+
+@pytest.mark.parametrize(('more', 'words'), [
+    (('--imu-topic', '/imu/data_corrected'), '/imu/data_corrected'), (('--target-xyz', '1', '0', '0'), 'needs the name of that frame'),
+])
+def test_what_cannot_be_done_is_refused_in_one_line(tmp_path, capsys, more, words):
+    write_case(tmp_path, 'usual')
+    if '--imu-topic' in more:
+        compensate(tmp_path)
+        (tmp_path / 'out').rename(tmp_path / 'twice')
+        arguments = ['compensate', str(tmp_path / 'twice'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]
+        code = main([*arguments, *more, '--corrected-topic', '/again'])
+    else:
+        code = compensate(tmp_path, *more)
+    error = capsys.readouterr().err
+    assert code == 1 and words in error and error.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
