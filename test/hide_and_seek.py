@@ -1,8 +1,9 @@
 """
 Hide and seek: effects are hidden in sessions made by physics, and `diagnose` has to find them.
 
-Run as ``python test/hide_and_seek.py`` (or ``make hide-and-seek``): about an hour on two cores. Prints a confusion matrix and the figures and
-draws them into docs/. ``--seeds 3 --fast`` and ``--parts effects,none`` run less; what was run stands beside every figure.
+Run as ``python test/hide_and_seek.py`` (or ``make hide-and-seek``): about an hour on two free cores. Prints a confusion matrix and the
+figures and draws them into docs/. ``--seeds 3``, ``--minutes 20``, ``--fast`` and ``--parts effects,none`` run less; what was run stands
+beside every figure.
 """
 
 import argparse
@@ -10,7 +11,7 @@ import json
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
@@ -32,13 +33,15 @@ FIRST_SEED = 5000
 PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power')
 DEG = np.pi / 180
 TRAPS = {
-    'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0}, 'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG}, 'two_seconds_lost': {'dropped': 'both'},
-    'knock_on_table': {'knock': True}, 'wrong_covariance': {'wrong_covariance': True}, 'wander': {'noise': 'realistic'},
-    'mounted_at_45_deg': {'mount_rpy_deg': (45.0, 0.0, 0.0)}, 'two_axis_table': {'table': 'two_axis'}, 'only_at_rest': {'profile': 'static_only'},
+    'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0}, 'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG},
+    'two_seconds_lost': {'dropped': 'both'}, 'knock_on_table': {'knock': True}, 'wrong_covariance': {'wrong_covariance': True},
+    'wander': {'noise': 'realistic'},
+    'mounted_at_45_deg': {'mount_rpy_deg': (45.0, 0.0, 0.0)}, 'two_axis_table': {'table': 'two_axis'},
+    'only_at_rest': {'profile': 'static_only'},
 }
 """What must not produce a finding."""
-SEPARATED = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'accel_size_effect', 'lever_arm', 'gyro_quadratic', 'gyro_scale_asymmetry',
-             'accel_bandwidth', 'gyro_bandwidth', 'time_offset', 'accel_thermal_bias', 'accel_bias_drift')
+SEPARATED = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'accel_size_effect', 'lever_arm', 'gyro_quadratic',
+             'gyro_scale_asymmetry', 'accel_bandwidth', 'gyro_bandwidth', 'time_offset', 'accel_thermal_bias', 'accel_bias_drift')
 """Effects with near relatives, sought again in sessions made to separate them."""
 POWER = ('accel_quadratic', 'gyro_g_sensitivity', 'time_offset', 'gyro_thermal_bias', 'table_tilt')
 POWER_SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
@@ -72,15 +75,16 @@ def oracle(recording, effect):
     best = min(told, key=lambda q: search.evidence.loss(search.used([q])))
     sensors = sensors_of(best.effect)
     pair = [heldout_gain(found.attempt, [], choice, sensors) for choice in (found.named, [best])]
-    return pair[0].heldout_rms_after / pair[1].heldout_rms_after if pair[0].measure == pair[1].measure and pair[0].sensor == pair[1].sensor else None
+    alike = (pair[0].measure, pair[0].sensor) == (pair[1].measure, pair[1].sensor)
+    return pair[0].heldout_rms_after / pair[1].heldout_rms_after if alike else None
 
 
 def effects_of_seed(seed, noise, effects, factor=5.0, profile='random', table='three_axis', part='effects'):
-    """Hide each effect in one session; the empty session gives the sizes."""
+    """Hide each effect in one session; the session that hides nothing gives the sizes."""
     options = {'profile': profile, 'table': table}
     empty = record(seed, None, noise, **options)
     sizes = Sizes(empty)
-    rows = [seek(empty, None, part='none' if part == 'effects' else 'none ' + part, seed=seed, noise=noise)]
+    rows = []
     for effect in effects:
         hidden = {effect: sizes.hidden(effect, seed, factor)}
         recording = record(seed, hidden, noise, **options, **options_of(effect))
@@ -136,26 +140,26 @@ def power_of_seed(seed, noise, effects, factors):
     return rows
 
 
+EFFECTS_PER_TASK = 7
+
+
 def tasks_of(options):
-    """Return (function, arguments) of everything that is to run, the most important first."""
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    effects = options.effects.split(',') if options.effects else all_effects()
-    tasks = []
-    if 'effects' in options.parts:
-        tasks += [(effects_of_seed, (seed, noise, effects)) for seed in seeds for noise in options.noise]
-    if 'none' in options.parts:
-        tasks += [(none_of_seed, (seed, noise)) for seed in range(options.first_seed + 100, options.first_seed + 100 + 2 * options.seeds) for noise in options.noise]
-    if 'outside' in options.parts:
-        tasks += [(outside_of_seed, (seed, 'realistic', tuple(OUTSIDE))) for seed in seeds[:max(options.seeds // 2, 1)]]
-    if 'pairs' in options.parts:
-        tasks += [(pair_of_seed, (seed, 'white')) for seed in range(options.first_seed + 200, options.first_seed + 200 + options.seeds)]
-    if 'traps' in options.parts:
-        tasks += [(traps_of_seed, (seed, tuple(TRAPS))) for seed in seeds[:max(options.seeds // 5, 1)]]
-    if 'separating' in options.parts:
-        tasks += [(separating_of_seed, (seed, 'white', SEPARATED)) for seed in seeds[:max(options.seeds // 5, 1)]]
-    if 'power' in options.parts:
-        tasks += [(power_of_seed, (seed, 'white', POWER, POWER_SIZES)) for seed in range(options.first_seed + 300, options.first_seed + 300 + max(options.seeds // 3, 1))]
-    return tasks
+    """Return (function, arguments) of everything that is to run; parts take turns, so that a run cut short has some of each."""
+    names = tuple(options.effects.split(',')) if options.effects else all_effects()
+    bundles = [names[k:k + EFFECTS_PER_TASK] for k in range(0, len(names), EFFECTS_PER_TASK)]
+    n_seeds, first = options.seeds, options.first_seed
+    seeds = range(first, first + n_seeds)
+    some = {
+        'effects': [(effects_of_seed, (seed, noise, bundle)) for seed in seeds for noise in options.noise for bundle in bundles],
+        'none': [(none_of_seed, (seed, noise)) for seed in range(first + 100, first + 100 + 3 * n_seeds) for noise in options.noise],
+        'outside': [(outside_of_seed, (seed, 'realistic', tuple(OUTSIDE))) for seed in seeds[:max(n_seeds // 2, 1)]],
+        'pairs': [(pair_of_seed, (seed, 'white')) for seed in range(first + 200, first + 200 + n_seeds)],
+        'traps': [(traps_of_seed, (seed, tuple(TRAPS))) for seed in seeds[:max(n_seeds // 5, 1)]],
+        'separating': [(separating_of_seed, (seed, 'white', SEPARATED)) for seed in seeds[:max(n_seeds // 5, 1)]],
+        'power': [(power_of_seed, (seed, 'white', POWER, POWER_SIZES)) for seed in range(first + 300, first + 300 + max(n_seeds // 3, 1))],
+    }
+    placed = [(k / len(some[part]), task) for part in PARTS if part in options.parts for k, task in enumerate(some[part])]
+    return [task for _, task in sorted(placed, key=lambda pair: pair[0])]
 
 
 def run(task):
@@ -176,6 +180,7 @@ def main(arguments=None):
     parser.add_argument('--parts', default=','.join(PARTS), type=lambda text: text.split(','))
     parser.add_argument('--noise', default='white,realistic', type=lambda text: text.split(','))
     parser.add_argument('--processes', type=int, default=2)
+    parser.add_argument('--minutes', type=float, help='start nothing new after this time')
     parser.add_argument('--fast', action='store_true', help='one seed, white noise')
     parser.add_argument('--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session')
     parser.add_argument('--docs', type=Path, default=Path(__file__).parent.parent / 'docs', help='where pictures go')
@@ -194,13 +199,23 @@ def main(arguments=None):
 
 def _work(tasks, options):
     options.record.parent.mkdir(parents=True, exist_ok=True)
-    rows, start = [], time.time()
+    rows, start, done = [], time.time(), 0
     with options.record.open('w') as record_file, ProcessPoolExecutor(options.processes) as pool:
-        for done, new in enumerate(pool.map(run, tasks), start=1):
-            rows += new
-            record_file.writelines(json.dumps(row) + '\n' for row in new)
+        waiting, running = list(tasks), set()
+        while waiting or running:
+            in_time = options.minutes is None or time.time() - start < 60 * options.minutes
+            while waiting and in_time and len(running) < options.processes:
+                running.add(pool.submit(run, waiting.pop(0)))
+            if not running:
+                break
+            ready, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in ready:
+                new, done = future.result(), done + 1
+                rows += new
+                record_file.writelines(json.dumps(row) + '\n' for row in new)
             record_file.flush()
-            print(f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {(time.time() - start) / 60:.1f} min', end='', file=sys.stderr, flush=True)
+            minutes = (time.time() - start) / 60
+            print(f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {minutes:.1f} min', end='', file=sys.stderr, flush=True)
     print(file=sys.stderr)
     return rows
 

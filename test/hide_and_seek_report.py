@@ -75,7 +75,8 @@ def _parameters(rows):
     errors = [error for row in rows for values in row['errors_in_sd'].values() for error in values]
     if errors:
         errors = np.abs(errors)
-        print(f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {np.sqrt(np.mean(np.minimum(errors, 10)**2)):.2f}')
+        rms = np.sqrt(np.mean(np.minimum(errors, 10)**2))
+        print(f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {rms:.2f}')
     levels = [row['level_error'] for row in rows if 'level_error' in row]
     if levels:
         print(f'saturation level within 1 %: {_share(level < 0.01 for level in levels)}')
@@ -92,7 +93,8 @@ def _separating(rows):
 def _nothing(rows, what):
     for noise in sorted({row['noise'] for row in rows}):
         some = [row for row in rows if row['noise'] == noise]
-        print(f'\n{what}, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)} {[row["found"] for row in some if row["found"]]}; '
+        named = [row['found'] for row in some if row['found']]
+        print(f'\n{what}, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)} {named}; '
               f'significant rest in {_share(row["unexplained"] for row in some)}')
 
 
@@ -103,8 +105,8 @@ def _outside(rows):
           f'{_share(not row["found"] for row in rows)}')
     for name in sorted({row['hidden'][0] for row in rows}):
         some = [row for row in rows if row['hidden'][0] == name]
-        print(f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named {_share(not row["found"] for row in some)} '
-              f'{[row["found"] for row in some if row["found"]]}')
+        print(f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named '
+              f'{_share(not row["found"] for row in some)} {[row["found"] for row in some if row["found"]]}')
 
 
 def both_found(row):
@@ -132,7 +134,8 @@ def _traps(rows):
 def _oracle(rows):
     ratios = [row['oracle_ratio'] for row in rows if row.get('oracle_ratio') is not None]
     if ratios:
-        print(f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} ({len(ratios)} sessions)')
+        print(f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} '
+              f'({len(ratios)} sessions)')
 
 
 def _seconds(rows):
@@ -154,14 +157,15 @@ def draw_confusion(rows, path):
     axes.imshow(table / np.maximum(table.sum(axis=1, keepdims=True), 1), cmap='Blues', vmin=0, vmax=1)
     for (i, j), count in np.ndenumerate(table):
         if count:
-            axes.text(j, i, f'{count:.0f}', ha='center', va='center', fontsize=7, color='white' if count > 0.6 * table[i].sum() else 'black')
+            colour = 'white' if count > 0.6 * table[i].sum() else 'black'
+            axes.text(j, i, f'{count:.0f}', ha='center', va='center', fontsize=7, color=colour)
     axes.set_xticks(range(len(found)), found, rotation=90, fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_xlabel('first finding')
     axes.set_ylabel('hidden')
     right = np.mean([first_is_right(row) for row in rows])
-    axes.set_title(f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right or in the declared class',
-                   fontsize=10)
+    axes.set_title(f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right '
+                   'or in the declared class', fontsize=10)
     figure.savefig(path, dpi=110)
 
 

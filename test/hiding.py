@@ -72,7 +72,7 @@ def threshold_noncentrality(n_parameters, n_questions):
 
 
 class Sizes:
-    """Smallest detectable sizes in one session: 50 % power at family-wise 1 %, the baseline projected out, from a session that hides nothing."""
+    """Smallest detectable sizes: 50 % power at family-wise 1 %, the baseline projected out, from the session that hides nothing."""
 
     def __init__(self, recording):
         self.attempt = investigate(recording.windows, recording.table, recording.model).attempt
@@ -82,7 +82,7 @@ class Sizes:
         self.information = normal - normal[:, used] @ np.linalg.solve(normal[np.ix_(used, used)] + prior, normal[used])
 
     def hidden(self, effect, seed, factor):
-        """Return what to hide: an effect of random shape, `factor` times as large as detectable; None for one that has its size by nature."""
+        """Return what to hide: of random shape, `factor` times as large as detectable; None where nature gives the size."""
         if effect in NOT_SIZED:
             return None
         if effect.endswith('_saturation'):

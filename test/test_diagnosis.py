@@ -38,7 +38,8 @@ def test_nothing_is_found_where_nothing_is_hidden(sizes):
     assert [s.question.label for s in search.history[0] if s.significant] == []
 
 
-@pytest.mark.parametrize('effect', ['accel_quadratic', 'gyro_g_sensitivity', 'accel_bias_drift', 'gyro_saturation', 'gyro_bandwidth', 'encoder_harmonic'])
+@pytest.mark.parametrize('effect', ['accel_quadratic', 'gyro_g_sensitivity', 'accel_bias_drift', 'gyro_saturation', 'gyro_bandwidth',
+                                    'encoder_harmonic'])
 def test_hidden_effect_is_the_first_finding_with_honest_parameters(effect, sizes):
     recording, diagnosis = seek(effect, sizes)
     first = diagnosis.findings[0]
@@ -74,7 +75,8 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     document = json.loads(json.dumps(to_mapping(diagnosis)))
     assert document['format'] == 'imu_calibration/diagnosis/1'
     finding = document['findings'][0]
-    assert set(finding) >= {'effect', 'sensor', 'explanation', 'parameters', 'p_value', 'gain', 'indistinguishable_from', 'separating_motion'}
+    assert set(finding) >= {'effect', 'sensor', 'explanation', 'parameters', 'p_value', 'gain', 'indistinguishable_from',
+                            'separating_motion'}
     assert set(finding['gain']) >= {'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95'}
     assert document['baseline']['accelerometer']['effects'] == ['bias', 'matrix']
     assert [entry['effect'] for entry in document['not_testable']] == ['earth_rate']

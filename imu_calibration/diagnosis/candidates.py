@@ -86,7 +86,8 @@ def _why_not(effect, have, table, kinds, span):
     if effect.name == 'lever_arm' and ('accelerometer', 'accel_size_effect') in have:
         return 'the size effect of the model contains it', 'leave the size effect out of the model'
     if effect.name == 'earth_rate' and table.latitude is not None and table.azimuth_deg is not None:
-        return 'the reference holds the rotation of the Earth already, from latitude and azimuth', 'leave the azimuth out of the table description'
+        return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
+                'leave the azimuth out of the table description')
     return None
 
 
@@ -97,13 +98,11 @@ def time_constants(duration):
 
 def extended_model(model, effects):
     """Return the model with all these effects, but for those that are asked otherwise (warm-ups, saturation)."""
-    added = {sensor: tuple(e.name for e in effects if e.sensor == sensor and e.warp is None and not special(e)) for sensor in SENSORS + ('reference',)}
-    for effect in effects:
-        if effect.warp is not None:
-            added[effect.sensor] += (effect.name,)
+    kept = [e for e in effects if e.warp is not None or not special(e)]
+    added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SENSORS + ('reference',)}
     return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
 
 
 def special(effect):
-    """Return whether an effect is not asked about by columns of its own: saturation is censoring, a warm-up has a bank of time constants."""
+    """Return whether an effect has no columns of its own here: saturation is censoring, a warm-up has a bank of time constants."""
     return effect.name.endswith('_saturation') or effect.name.endswith('_bias_drift')

@@ -74,7 +74,8 @@ def simple_fit(windows, table, model):
     for sensor in SENSORS:
         motion, temperature = joined_motion(picked)
         design = columns(model, sensor, table, motion, temperature)
-        output = np.concatenate([measured(w, sensor) if w.kind != 'static' else measured(w, sensor).mean(axis=0, keepdims=True) for w in picked])
+        outputs = [measured(w, sensor) for w in picked]
+        output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
         base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
         weight = 1 / noise_at_rest(windows, sensor)**2
         for axis in range(3):
@@ -163,5 +164,5 @@ def without_clipped(windows, predicted, levels, noise_sd):
 
 def _selected(window, index):
     temperature = None if window.temperature_c is None else window.temperature_c[index]
-    return replace(window, stamp_ns=window.stamp_ns[index], time=window.time[index], force_s=window.force_s[index], rate_s=window.rate_s[index],
-                   motion=window.motion.select(index), temperature_c=temperature)
+    return replace(window, stamp_ns=window.stamp_ns[index], time=window.time[index], force_s=window.force_s[index],
+                   rate_s=window.rate_s[index], motion=window.motion.select(index), temperature_c=temperature)

@@ -83,8 +83,8 @@ def investigate(windows, table, model, progress=None):
     """Return the `Investigation` of a recording: the search itself, arguments as in `diagnose`."""
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < LEAST_WINDOWS:
-        raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, {len(used)} were found; '
-                                 'rest in more poses, or spin and swing the table')
+        raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
+                                 f'{len(used)} were found; rest in more poses, or spin and swing the table')
     report = progress or (lambda share: None)
     model = with_joints_of(model, table)
     used, limits = _without_clipping(used, table, model)
@@ -97,6 +97,8 @@ def investigate(windows, table, model, progress=None):
             break
         attempt = Attempt(used, table, model, asked, attempt.point(chosen), lambda share: report(0.5 + 0.2 * share))
         chosen = attempt.search.run()
+    # A warm-up of the bank that appears this late has no columns of its own for the final solution.
+    chosen = [question for question in chosen if '@' not in question.label]
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
     return Investigation(used, attempt, explained, explained.pruned(chosen), limits, not_testable)
@@ -136,9 +138,9 @@ def _assembled(windows, table, found):
     for place in range(len(named)):
         findings.append(_finding(attempt, found.explained, named, place, solution, table))
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), _candidates(attempt, named), tuple(found.not_testable), baseline,
-                     solution, heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution), len(found.used),
-                     int(attempt.locked.sum()))
+    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), _candidates(attempt, named), tuple(found.not_testable),
+                     baseline, solution, heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution),
+                     len(found.used), int(attempt.locked.sum()))
 
 
 def _finding(attempt, explained, named, place, solution, table):
@@ -158,8 +160,8 @@ def _clipping(limit, solution):
     effect = find_effect(limit.sensor, f'{short}_saturation')
     parameters = parameters_of(solution, limit.sensor, effect.name)
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
-    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value, limit.n_expected, 1.0, gain,
-                   (), '')
+    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value,
+                   limit.n_expected, 1.0, gain, (), '')
 
 
 def _candidates(attempt, named):
@@ -174,8 +176,8 @@ def _candidates(attempt, named):
         if question.name in rows and rows[question.name].gain_alone >= alone.gain:
             continue
         beside = None if question.name in found else attempt.search.score(named, question)
-        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain, beside and beside.p_value,
-                                        _verdict(question.name, alone, beside, found, mates))
+        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain,
+                                        beside and beside.p_value, _verdict(question.name, alone, beside, found, mates))
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 

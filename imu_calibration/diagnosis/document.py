@@ -17,28 +17,34 @@ def to_mapping(diagnosis):
         'dead_reckoning': diagnosis.traces.dead_reckoning,
         'unexplained': {sensor: _rest(diagnosis.unexplained[sensor]) for sensor in SENSORS},
         'not_testable': list(diagnosis.not_testable),
-        'candidates': [{'effect': c.effect, 'sensor': c.sensor, 'verdict': c.verdict, 'heldout_log_likelihood_gain': c.gain_alone,
-                        'p_value': c.p_value_alone, 'beside_findings': {'heldout_log_likelihood_gain': c.gain_beside, 'p_value': c.p_value_beside}}
-                       for c in diagnosis.candidates],
+        'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
         'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
+
+
+def _candidate(candidate):
+    beside = {'heldout_log_likelihood_gain': candidate.gain_beside, 'p_value': candidate.p_value_beside}
+    return {'effect': candidate.effect, 'sensor': candidate.sensor, 'verdict': candidate.verdict,
+            'heldout_log_likelihood_gain': candidate.gain_alone, 'p_value': candidate.p_value_alone, 'beside_findings': beside}
 
 
 def _baseline(solution, sensor):
     model = solution.model
-    return {'effects': list(getattr(model, sensor)), 'reference_effects': list(model.reference), 'residual_rms': solution.residual_rms[sensor][0],
-            'window_mean_rms': solution.residual_rms[sensor][1], 'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance))}
+    return {'effects': list(getattr(model, sensor)), 'reference_effects': list(model.reference),
+            'residual_rms': solution.residual_rms[sensor][0], 'window_mean_rms': solution.residual_rms[sensor][1],
+            'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance))}
 
 
 def _finding(finding):
     return {'effect': finding.effect, 'sensor': finding.sensor, 'explanation': finding.explanation,
             'parameters': {name: {'value': value, 'sd': sd, 'unit': unit} for name, (value, sd, unit) in finding.parameters.items()},
             'p_value': finding.p_value, 'heldout_log_likelihood_gain': finding.heldout_gain, 'share_of_unexplained': finding.share,
-            'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from), 'separating_motion': finding.separating_motion}
+            'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from),
+            'separating_motion': finding.separating_motion}
 
 
 def _gain(gain):
-    return {'sensor': gain.sensor, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before, 'heldout_rms_after': gain.heldout_rms_after,
-            'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
+    return {'sensor': gain.sensor, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before,
+            'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
 
 
 def _rest(rest):

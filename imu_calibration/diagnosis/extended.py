@@ -93,5 +93,6 @@ def _with_limit(solution, limit):
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
         matrix[place, place] = corner
         return matrix
-    return replace(solution, model=model, values=np.insert(solution.values, place, limit.level), held=np.insert(solution.held, place, False),
-                   covariance=grown(solution.covariance, limit.level_sd**2), information=grown(solution.information, limit.level_sd**-2))
+    return replace(solution, model=model, values=np.insert(solution.values, place, limit.level),
+                   held=np.insert(solution.held, place, False), covariance=grown(solution.covariance, limit.level_sd**2),
+                   information=grown(solution.information, limit.level_sd**-2))

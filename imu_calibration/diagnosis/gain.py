@@ -152,7 +152,8 @@ def residual_traces(windows, table, before, after):
     def mean(values):
         return _block_mean(np.asarray(values, float)[known], block, number)
     first = references[0]
-    return Traces(mean(time), np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known][np.searchsorted(block, np.arange(len(number)))],
+    kind = np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known]
+    return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))],
                   mean(motion.position[rows]), mean(first['accelerometer'].force_s[rows]), mean(first['gyroscope'].rate_s[rows]),
                   None if temperature is None else mean(temperature[rows]), {s: mean(errors[0][s]) for s in SENSORS},
                   {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
@@ -163,7 +164,8 @@ def _all_samples(windows):
     motion = JointMotion(*(np.concatenate([getattr(w.motion, name) for w in windows]) for name in MOTION))
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
-    rows = np.concatenate([np.full(len(w.time), s) if n != len(w.time) else np.arange(s, s + n) for w, s, n in zip(windows, starts, lengths)])
+    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
+                           for w, s, n in zip(windows, starts, lengths)])
     if any(w.temperature_c is None for w in windows):
         return motion, None, rows
     parts = [w.temperature_c if n == len(w.time) else np.full(n, w.temperature_c.mean()) for w, n in zip(windows, lengths)]

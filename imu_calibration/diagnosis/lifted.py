@@ -100,7 +100,8 @@ def lift(windows, table, model, values, constants, progress=None):
             progress(done / len(windows))
     fields = {name: np.array([d[name] for d in describe]) for name in describe[0]}
     return Lifted(model, values, np.asarray(constants), np.array([w.kind for w in windows]), fields['time'],
-                  np.array([len(w.time) for w in windows], float), np.array([w.time[-1] - w.time[0] for w in windows]), np.zeros(len(windows), int),
+                  np.array([len(w.time) for w in windows], float), np.array([w.time[-1] - w.time[0] for w in windows]),
+                  np.zeros(len(windows), int),
                   {s: np.array(means[s]) for s in SENSORS}, {s: np.array(grams[s]) for s in SENSORS},
                   {s: (np.array([n[0] for n in noise[s]]), np.array([n[1] for n in noise[s]])) for s in SENSORS}, fields)
 
@@ -142,8 +143,9 @@ def _reduce(static, design, residual):
 
 def _describe(window):
     motion = window.motion
-    found = {'time': float(window.time.mean()), 'temperature': np.nan if window.temperature_c is None else float(window.temperature_c.mean()),
-             'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))), 'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean()))}
+    found = {'time': float(window.time.mean()), 'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
+             'temperature': np.nan if window.temperature_c is None else float(window.temperature_c.mean()),
+             'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean()))}
     for joint in range(motion.position.shape[1]):
         found[f'angle{joint}'] = float(motion.position[:, joint].mean())
         found[f'span{joint}'] = float(np.ptp(motion.position[:, joint]))
@@ -176,7 +178,8 @@ def _columns(windows, table, model, constants, arm):
     for sensor in SENSORS:
         ref, point = references.at(sensor), model.full_point()
         warps = {'warp:' + e.name: e for e in model.concerning(sensor) if e.warp is not None}
-        parts = [references.derivative(sensor, warps[name]) if name in warps else GROUPS[name](ref, point) for name, _ in own_groups(model, sensor)]
+        parts = [references.derivative(sensor, warps[name]) if name in warps else GROUPS[name](ref, point)
+                 for name, _ in own_groups(model, sensor)]
         blocks[sensor] = np.concatenate(parts + [bank], axis=1)
     return blocks
 

@@ -3,9 +3,11 @@
 import numpy as np
 
 DEG = np.pi / 180
-READABLE = {'m/s^2': (9.80665e-3, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'), 'm': (1e-3, 'mm'), '1': (1e-6, 'ppm'),
-            'm/s^2/K': (9.80665e-3, 'mg/K'), 'rad/s/K': (DEG, 'deg/s/K'), '1/K': (1e-6, 'ppm/K'), '(m/s^2)^-1': (1e-3 / 9.80665, 'mg/g^2'),
-            '(m/s^2)^-2': (1e-3 / 9.80665**2, 'mg/g^3'), '(rad/s)^-1': (1e-6 / DEG, 'ppm per deg/s'), '(rad/s)/(m/s^2)': (DEG / 9.80665, 'deg/s/g')}
+READABLE = {'m/s^2': (9.80665e-3, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'), 'm': (1e-3, 'mm'),
+            '1': (1e-6, 'ppm'), 'm/s^2/K': (9.80665e-3, 'mg/K'), 'rad/s/K': (DEG, 'deg/s/K'), '1/K': (1e-6, 'ppm/K'),
+            '(m/s^2)^-1': (1e-3 / 9.80665, 'mg/g^2'),
+            '(m/s^2)^-2': (1e-3 / 9.80665**2, 'mg/g^3'), '(rad/s)^-1': (1e-6 / DEG, 'ppm per deg/s'),
+            '(rad/s)/(m/s^2)': (DEG / 9.80665, 'deg/s/g')}
 """SI unit -> (size of the readable unit in SI, its name)."""
 
 
@@ -27,7 +29,8 @@ def sentence(effect, parameters, gain, n_clipped=None):
     label, value, sd, unit = max((v for v in values if v[0] != 'time_constant' or len(values) == 1), key=lambda v: abs(v[1]))
     size = _size(value, sd, unit)
     if n_clipped is not None:
-        return f'{effect.explanation} The limit is {readable(value, unit)}; {n_clipped} samples sit on it and were left out, with those close to it.'
+        return (f'{effect.explanation} The limit is {readable(value, unit)}; {n_clipped} samples sit on it and were left out, with those '
+                'close to it.')
     which = '' if len(values) == 1 else f' (largest: {label})'
     text = f'{effect.explanation} Its size is {size}{which}.'
     if gain is not None and gain.reduction > 0:

@@ -113,4 +113,5 @@ def questions(space, effects):
 
 def smooth_parameters(asked):
     """Return sensor -> list of the parameters of effects that are smooth in time: thermal bias and warm-ups."""
-    return {sensor: [q.parameters for q in asked if q.sensor == sensor and q.name.endswith(('_thermal_bias', '_bias_drift'))] for sensor in SENSORS}
+    smooth = [q for q in asked if q.name.endswith(('_thermal_bias', '_bias_drift'))]
+    return {sensor: [q.parameters for q in smooth if q.sensor == sensor] for sensor in SENSORS}

@@ -9,6 +9,8 @@ from imu_calibration.effects.base import SENSORS
 
 SIGNIFICANT = 5.0
 """Standard deviations above noise from which a rest is significant."""
+WITHIN_SHARE = 0.02
+"""Least excess of the variance within windows that counts."""
 ALPHA = 1e-4
 """Significance that a correlation must have."""
 
@@ -49,7 +51,9 @@ def _rest(attempt, explained, sensor, excess, values):
     residual = np.stack([space.mean[sensor][axis] @ values[np.r_[space.index[sensor][axis], space.size]] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
     noise_sd = np.sqrt(floor.mean_variance(lifted.kind, lifted.count) + floor.wander_sd**2)
-    sigma = max(excess[0] / np.sqrt(2 * explained.n_means), excess[1] / np.sqrt(2 * explained.n_within) if excess[1] > 0.02 * explained.n_within else 0.0)
+    sigma = excess[0] / np.sqrt(2 * explained.n_means)
+    if excess[1] > WITHIN_SHARE * explained.n_within:
+        sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT)
     if not significant:
