@@ -156,14 +156,13 @@ class CalibrationWorker(threading.Thread):
             self._complain(str(error))
 
     def _publish_solution(self, pending):
-        start, cpu = time.monotonic(), time.thread_time()
+        start = time.monotonic()
         result = self.live.solve(pending, {'mode': 'live', 'solution': self._n_solutions + 1})
         self._n_solutions += 1
-        self._trouble = ''
+        self._trouble, self._new_windows, self._closed = '', False, pending
         text = calibration_to_text(result.calibration)
         self.on_calibration(text)
         self._pacer.note(start, time.monotonic())
-        self._cpu = time.thread_time() - cpu
         return text
 
     def _solve(self):

@@ -1,0 +1,47 @@
+"""Short sessions for the tests of the nodes: enough motion for an answer in a few seconds of processing."""
+
+import numpy as np
+
+from imu_calibration import documents, workflow
+from imu_calibration.profiles import make_profile
+from imu_calibration.samples import SampleBlock
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table
+from live_station import TABLE as TABLE_FILE
+
+TABLE = Table.from_mapping(documents.from_text(TABLE_FILE.read_text()))
+TOLERANCES = documents.from_text((TABLE_FILE.parent / 'tolerances.yaml').read_text())
+OPTIONS = workflow.CalibrationOptions(tolerances=TOLERANCES)
+
+
+def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='quick'):
+    """Return (imu, joints, true values, model) of a simulated session, or of its first seconds."""
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=TABLE.joint_names)
+    values = random_values(model, 'industrial', seed)
+    imu, joints, _ = simulate(model, values, TABLE, make_profile(profile, 1, TABLE), SimulationOptions(rate, joint_rate or rate), seed)
+    if seconds is not None:
+        end = imu.stamp_ns[0] + int(seconds * 1e9)
+        imu, joints = imu.select(imu.stamp_ns < end), joints.select(joints.stamp_ns < end)
+    return imu, joints, values, model
+
+
+def offline(*sessions):
+    """Return the offline answer for (imu, joints) as they were sent."""
+    return workflow.calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS).calibration
+
+
+def assert_same(live, expected, share=1e-6):
+    """Assert that a live calibration is the offline one, to a share of the standard deviations."""
+    assert live.param_names == expected.param_names and live.status == expected.status
+    assert np.max(np.abs(live.values - expected.values) / expected.sd) < share
+
+
+def errors_in_sd(calibration, model, values):
+    """Return the errors of the IMU's own parameters in standard deviations (true values of `model`)."""
+    found = []
+    for effect in model.effects:
+        if (effect.sensor, effect.name) in calibration.model.slices:
+            part = calibration.model.slices[effect.sensor, effect.name]
+            found.append((calibration.values[part] - values[model.slices[effect.sensor, effect.name]]) / calibration.sd[part])
+    return np.concatenate(found)

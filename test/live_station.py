@@ -1,0 +1,186 @@
+"""What the tests over DDS share: a domain of their own, nodes as processes, and a node that watches them."""
+
+import fcntl
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from imu_calibration.nodes.processes import NodeProcesses
+from msg_adapters.live import LiveGatherer
+
+ROOT = Path(__file__).resolve().parents[1]
+TABLE = ROOT / 'config' / 'table_three_axis.yaml'
+PATIENCE = 90.0
+"""Seconds after which a test gives up; a busy machine needs some of them."""
+STAY_LOCAL = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+
+def free_domain():
+    """Return (domain id, lock): no other test of this host has it while the lock is open."""
+    for number in range(100):
+        domain_id = 1 + (os.getpid() + number) % 100
+        lock = open(Path(tempfile.gettempdir(), f'imu_calibration_test_domain_{domain_id}'), 'w')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return domain_id, lock
+        except OSError:
+            lock.close()
+    raise RuntimeError('no free ROS_DOMAIN_ID')
+
+
+class Station:
+    """
+    Nodes of one DDS domain and a node of the test's own among them.
+
+    Parameters
+    ----------
+    output : path-like, optional
+        File for what the nodes print.
+
+    """
+
+    def __init__(self, output=None):
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        os.environ |= STAY_LOCAL
+        domain_id, self._lock = free_domain()
+        self.processes = NodeProcesses(domain_id)
+        self.output = open(output, 'wb') if output else None
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain_id)
+        self.node = rclpy.create_node('station', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.status, self.history, self.subscriptions = {}, [], []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.processes.__exit__(*exception)
+        self.executor.shutdown(timeout_sec=2.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        if self.output:
+            self.output.close()
+        self._lock.close()
+
+    def start(self, name, parameters=None, **options):
+        """Start a node as a process."""
+        return self.processes.start(name, parameters, output=self.output, **options)
+
+    def calibration_node(self, folder, **parameters):
+        """Start calibration_node with a place to save in `folder`."""
+        options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
+        return self.start('calibration_node', {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 1.0, **parameters},
+                          **options)
+
+    def play(self, bag, rate, subscribers=1, **parameters):
+        """Start bag_player_node."""
+        options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
+        return self.start('bag_player_node', {'bag': bag, 'rate': float(rate), 'wait_for_subscribers': subscribers, **parameters}, **options)
+
+    def publisher(self, message_type, topic, reliable=True, depth=1000):
+        """Return a publisher of the station's node."""
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        return self.node.create_publisher(message_type, topic, QoSProfile(depth=depth, reliability=reliability))
+
+    def watch_imu(self, topic):
+        """Gather the Imu messages of a topic; returns the LiveGatherer."""
+        from sensor_msgs.msg import Imu
+
+        from imu_calibration.nodes.batches import BatchSubscription
+        from imu_calibration.nodes.qos import input_qos
+        gatherer = LiveGatherer()
+        self.subscriptions.append(BatchSubscription(self.node, Imu, topic, gatherer.add_imu, input_qos(True, 20_000)))
+        return gatherer
+
+    def watch_documents(self, topic='imu/calibration'):
+        """Return the list that calibration documents of a topic go to."""
+        from std_msgs.msg import String
+
+        from imu_calibration.nodes.qos import latched_qos
+        documents = []
+        self.subscriptions.append(self.node.create_subscription(String, topic, lambda message: documents.append(message.data), latched_qos()))
+        return documents
+
+    def watch_diagnostics(self):
+        """Keep the last status by name in `status`, and every (name, level, message) that was new in `history`."""
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        def note(message):
+            for status in message.status:
+                known = self.status.get(status.name)
+                if known is None or (known.level, known.message) != (status.level, status.message):
+                    self.history.append((status.name, status.level[0], status.message))
+                self.status[status.name] = status
+        self.subscriptions.append(self.node.create_subscription(DiagnosticArray, '/diagnostics', note, 100))
+
+    def figure(self, key, name='calibration_node: calibration'):
+        """Return a figure of a diagnostic status as int; 0 while it is not there."""
+        status = self.status.get(name)
+        return next((int(float(value.value)) for value in status.values if value.key == key), 0) if status else 0
+
+    def until(self, condition, what, patience=PATIENCE):
+        """Spin until a condition holds; fail with `what` when it does not in time or a node has died."""
+        deadline = time.monotonic() + patience
+        while not condition():
+            for process in self.processes.running:
+                assert process.poll() in (None, 0), f'a node ended with {process.returncode} while waiting for {what}: {process.args[2]}'
+            assert time.monotonic() < deadline, f'waited in vain for {what}; last diagnostics: { {n: s.message for n, s in self.status.items()} }'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def spin_for(self, seconds):
+        """Spin for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def call(self, service):
+        """Call a Trigger service and return its response."""
+        from std_srvs.srv import Trigger
+        client = self.node.create_client(Trigger, service)
+        try:
+            self.until(client.service_is_ready, f'service {service}')
+            future = client.call_async(Trigger.Request())
+            self.until(future.done, f'the answer of {service}')
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+
+class Publisher:
+    """Publishes samples of one IMU and its joints from the station, faster than they were taken."""
+
+    def __init__(self, station, imu_topic='imu/data_raw', joint_topic='joint_states', reliable=True):
+        from sensor_msgs.msg import Imu, JointState
+        self.station = station
+        self.imu, self.joints = (station.publisher(kind, topic, reliable, 20_000) for kind, topic in ((Imu, imu_topic), (JointState, joint_topic)))
+
+    def wait(self, subscribers=1):
+        """Wait until both topics have subscribers."""
+        self.station.until(lambda: min(p.get_subscription_count() for p in (self.imu, self.joints)) >= subscribers, 'subscribers')
+        self.station.spin_for(0.3)
+
+    def send(self, imu, joints, per_second=4000):
+        """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
+        from msg_adapters.encode import encode_imu, encode_joints, rows
+        queue = [(k / max(len(imu), 1), self.imu, message) for k, message in enumerate(rows(encode_imu(imu)) if len(imu) else [])]
+        queue += [(k / max(len(joints), 1), self.joints, message) for k, message in enumerate(rows(encode_joints(joints)) if len(joints) else [])]
+        queue.sort(key=lambda entry: entry[0])
+        step = max(per_second // 50, 1)
+        for start in range(0, len(queue), step):
+            for _, publisher, message in queue[start:start + step]:
+                publisher.publish(bytes(message))
+            self.station.spin_for(0.02)
+
+
+def taken(gatherer):
+    """Return the ImuSamples that were gathered, in the order of their stamps, each once."""
+    samples = gatherer.flush().imu
+    return samples.select(np.unique(samples.stamp_ns, return_index=True)[1])

@@ -1,0 +1,204 @@
+"""What goes wrong on a robot, over real DDS: losses, disorder, clocks, silence, kills, signals, other QoS, two IMUs at once."""
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.documents import calibration_from_text
+from imu_calibration.samples import ImuSamples
+from live_sessions import assert_same, errors_in_sd, make_session, offline
+from msg_adapters.write import write_session
+
+pytest.importorskip('rclpy')
+from live_station import Publisher, Station  # noqa: E402
+
+pytestmark = pytest.mark.dds
+SIGMA = 5.0
+"""Errors of some thirty parameters stay below so many reported standard deviations."""
+
+
+@pytest.fixture(scope='module')
+def session():
+    """IMU, joints, true values, model at 50 Hz."""
+    return make_session(3, 50.0)
+
+
+@pytest.fixture
+def station(tmp_path):
+    """A domain of its own."""
+    with Station(tmp_path / 'nodes.txt') as made:
+        made.watch_diagnostics()
+        yield made
+
+
+def disturbed(samples, rng):
+    """Lose 5 %, send 5 % twice, let 5 % overtake their neighbour."""
+    index = np.flatnonzero(rng.random(len(samples)) > 0.05)
+    index = np.sort(np.concatenate([index, rng.choice(index, len(index) // 20, replace=False)]))
+    early = rng.choice(len(index) - 1, len(index) // 20, replace=False)
+    for k in early:
+        index[k], index[k + 1] = index[k + 1], index[k]
+    return samples.select(index)
+
+
+def with_nan_burst(imu, start, seconds=2.0):
+    """Readings that are NaN for a while."""
+    force = imu.force_s.copy()
+    inside = (imu.stamp_ns >= imu.stamp_ns[0] + int(start * 1e9)) & (imu.stamp_ns < imu.stamp_ns[0] + int((start + seconds) * 1e9))
+    force[inside] = np.nan
+    return replace(imu, force_s=force)
+
+
+def received(station):
+    """Imu and JointState messages that calibration_node has used or dropped."""
+    return [station.figure(f'{name} messages', 'calibration_node: streams') for name in ('imu', 'joints')]
+
+
+def send_all(station, publisher, imu, joints):
+    """Publish, and wait until the node has everything."""
+    before = received(station)
+    publisher.send(imu, joints)
+    station.until(lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)], 'every message to arrive')
+
+
+def answer_of(station, folder):
+    """Ask the node to save, and return the calibration."""
+    answer = station.call('/calibration_node/save')
+    assert answer.success, answer.message
+    return calibration_from_text((folder / 'calibration.yaml').read_text())
+
+
+def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, session, tmp_path):
+    imu, joints, values, model = session
+    rng = np.random.default_rng(5)
+    node = station.calibration_node(tmp_path, reliable=True)
+    publisher = Publisher(station)
+    publisher.wait()
+
+    sent = disturbed(imu, rng), disturbed(joints, rng)
+    send_all(station, publisher, *sent)
+    live = answer_of(station, tmp_path)
+    assert_same(live, offline(sent))
+    assert live.statistics['dropped'].get('imu repeated stamp', 0) > 0.02 * len(imu)
+    assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
+
+    assert station.call('/calibration_node/reset').success
+    check_bursts_and_foreign_frames(station, publisher, session, tmp_path)
+
+    assert station.call('/calibration_node/reset').success
+    check_clock_jump_and_silence(station, publisher, session, tmp_path)
+    assert station.processes.end(node, signal.SIGTERM) == 0
+
+
+def check_bursts_and_foreign_frames(station, publisher, session, folder):
+    """NaN and messages of another frame are dropped, counted and told; the rest gives the answer."""
+    imu, joints, values, model = session
+    burst = with_nan_burst(imu, 30.0)
+    foreign = replace(imu.select(slice(2000, 2200)), force_s=imu.force_s[2000:2200] + 5.0, frame_id='other_link')
+    before = received(station)
+    parts = [burst.select(slice(0, 2200)), foreign, burst.select(slice(2200, None))]
+    cuts = [0, 2200, 2200, len(joints)]
+    for part, (first, last) in zip(parts, zip(cuts, cuts[1:])):
+        publisher.send(part, joints.select(slice(first, last)))
+    station.until(lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)], 'every message of the frame')
+    live = answer_of(station, folder)
+    assert live.statistics['dropped']["Imu message of another frame than 'imu_link'"] == len(foreign)
+    assert live.statistics['dropped']['imu not finite'] == 100
+    assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
+    station.until(lambda: any('another frame' in message for _, level, message in station.history if level == 1), 'a warning')
+
+
+def check_clock_jump_and_silence(station, publisher, session, folder):
+    """A clock set back and joint states that stop are told, and cost no more than the samples concerned."""
+    imu, joints, values, model = session
+    half = imu.stamp_ns[len(imu) // 2]
+    back = int(3600e9)
+    halves = [[s.select(s.stamp_ns < half) for s in (imu, joints)], [s.select(s.stamp_ns >= half) for s in (imu, joints)]]
+    halves[1] = [replace(s, stamp_ns=s.stamp_ns - back) for s in halves[1]]
+    send_all(station, publisher, *halves[0])
+    send_all(station, publisher, *halves[1])
+    last = halves[1][0].stamp_ns[-1]
+    alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), np.repeat(imu.force_s[-1:], 250, 0), np.repeat(imu.rate_s[-1:], 250, 0), 'imu_link')
+    publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
+    station.until(lambda: any('JointState messages do not come' in message for _, _, message in station.history), 'a warning')
+    live = answer_of(station, folder)
+    assert live.statistics['stream']['imu clock reset'] == 1 or live.statistics['dropped'].get('imu clock reset') == 1
+    used = sum(live.statistics['samples_used'].values())
+    assert used > 0.9 * sum(offline((imu, joints)).statistics['samples_used'].values())
+    assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
+
+
+def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, tmp_path):
+    imu, joints, values, model = session
+    half = imu.stamp_ns[0] + int(75e9)
+    first = station.calibration_node(tmp_path, reliable=True, autosave_period=0.3)
+    publisher = Publisher(station)
+    publisher.wait()
+    send_all(station, publisher, *(s.select(s.stamp_ns < half) for s in (imu, joints)))
+    saved = tmp_path / 'calibration.accumulator.npz'
+    station.until(lambda: station.figure('windows') > 8 and saved.is_file(), 'windows to be saved')
+    station.spin_for(1.0)
+    n_saved = station.figure('windows')
+    assert station.processes.end(first, signal.SIGKILL) == -signal.SIGKILL
+
+    second = station.calibration_node(tmp_path, reliable=True, resume=True)
+    station.status.clear()
+    station.until(lambda: station.figure('windows') == n_saved, 'the saved windows')
+    publisher.wait()
+    send_all(station, publisher, *(s.select(s.stamp_ns >= half) for s in (imu, joints)))
+    live = answer_of(station, tmp_path)
+    assert sum(live.statistics['windows'].values()) > n_saved + 10
+    assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
+    assert station.processes.end(second) == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
+def test_a_signal_in_mid_session_leaves_whole_files_and_exit_code_zero(station, session, tmp_path, number):
+    imu, joints, _, _ = session
+    part = [s.select(s.stamp_ns < imu.stamp_ns[0] + int(50e9)) for s in (imu, joints)]
+    folder = tmp_path / 'saved'
+    node = station.calibration_node(folder, reliable=True, autosave_period=0.1)
+    compensator = station.start('compensator_node')
+    publisher = Publisher(station)
+    publisher.wait(2 if number == signal.SIGINT else 1)
+    publisher.send(*part)
+    station.until(lambda: station.figure('windows') > 0, 'windows')
+    assert station.processes.end(node, number) == 0
+    assert station.processes.end(compensator, number) == 0
+    assert {path.name for path in folder.iterdir()} <= {'calibration.accumulator.npz', 'calibration.yaml'}
+
+
+def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp_path):
+    other = make_session(4, 50.0)
+    sessions = {'left': session, 'right': other}
+    sent, documents = {}, {}
+    for side, (imu, joints, _, _) in sessions.items():
+        station.calibration_node(tmp_path / side, namespace=f'/{side}')
+        documents[side] = station.watch_documents(f'/{side}/imu/calibration')
+        sent[side] = Publisher(station, f'/{side}/imu/data_raw', f'/{side}/joint_states', reliable=False)
+    for publisher in sent.values():
+        publisher.wait()
+    for part in range(30):
+        for side, (imu, joints, _, _) in sessions.items():
+            sent[side].send(*(s.select(slice(part * len(s) // 30, (part + 1) * len(s) // 30)) for s in (imu, joints)))
+    for side, (_, _, values, model) in sessions.items():
+        answer = station.call(f'/{side}/calibration_node/solve')
+        assert answer.success, answer.message
+        station.until(lambda: documents[side], 'the document')
+        live = calibration_from_text(documents[side][-1])
+        errors, others = (errors_in_sd(live, model, v) for v in (values, sessions['left' if side == 'right' else 'right'][2]))
+        assert np.max(np.abs(errors)) < SIGMA < 0.1 * np.max(np.abs(others))
+
+
+def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
+    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=26.0)
+    write_session(tmp_path / 'fast', imu, joints)
+    node = station.calibration_node(tmp_path, reliable=True)
+    station.until(lambda: station.status, 'the node')
+    player = station.play(tmp_path / 'fast', 1.0, subscribers=1)
+    station.until(lambda: player.poll() is not None, 'the end of the recording')
+    station.until(lambda: received(station) == [len(imu), len(joints)], 'every message to arrive', patience=20.0)
+    assert station.figure('windows') > 0
+    assert station.processes.end(node) == 0
