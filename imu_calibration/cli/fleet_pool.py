@@ -72,7 +72,7 @@ def cluster_mapper(address, done=lambda item: None):
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(f'--scheduler must be the address of a dask scheduler that answers, got {address}: '
                              f'{" ".join(str(error).split())}; start one with dask scheduler') from error
-        with client:
+        with client, client.as_current():
             futures = client.map(function, list(items), pure=False)
             for future in distributed.as_completed(futures):
                 done(future.result())

@@ -1,0 +1,168 @@
+"""Many units: one result each whatever happens to the others, the spread over them, and the same work on a cluster."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration.calibration import Calibration
+from imu_calibration.cli import main
+from imu_calibration.errors import InputError
+from imu_calibration.fleet import UnitResult, summarise
+from imu_calibration.profiles import make_profile
+from imu_calibration.resources import config_file
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table
+from msg_adapters.write import write_session
+
+TABLE_FILE = config_file('table_three_axis.yaml')
+TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
+MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
+
+
+def session(seed, values):
+    """Return (imu, joints) of a short session."""
+    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile('quick', seed, TABLE), SimulationOptions(100.0, 100.0), seed)
+    return imu, joints
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    """Two units, one of them with two recordings, and a file that is no bag; the values of each unit."""
+    folder = tmp_path_factory.mktemp('fleet')
+    truth = {name: random_values(MODEL, 'industrial', seed) for seed, name in enumerate(('unit_a', 'unit_b'))}
+    write_session(folder / 'unit_a', *session(0, truth['unit_a']), storage='sqlite3')
+    for part in (1, 2):
+        write_session(folder / 'unit_b' / f'part_{part}', *session(part, truth['unit_b']), storage='mcap')
+    (folder / 'unit_c.mcap').write_bytes(b'no bag' * 100)
+    return folder, truth
+
+
+def run_fleet(folder, output, *more):
+    """Run the verb without reports."""
+    return main(['fleet', str(folder), '--table', str(TABLE_FILE), '--output', str(output), '--no-report', *more])
+
+
+def read_csv(path):
+    """Return the rows of a table as dicts."""
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+@pytest.fixture(scope='module')
+def result(recordings, tmp_path_factory):
+    """Exit code and folder of a fleet run in this process."""
+    output = tmp_path_factory.mktemp('result')
+    return run_fleet(recordings[0], output, '--jobs', '1'), output
+
+
+def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
+    """Good units have results, the bad one has its reason in one line, and the exit code says that something is missing."""
+    code, output = result
+    assert code == 3
+    units = {row['name']: row for row in read_csv(output / 'units.csv')}
+    assert list(units) == ['unit_a', 'unit_b', 'unit_c']
+    assert units['unit_c']['verdict'] == 'refused'
+    assert 'unit_c.mcap' in units['unit_c']['error']
+    assert '\n' not in units['unit_c']['error']
+    assert not (output / 'unit_c').exists()
+    assert 'unit_c' in (output / 'summary.html').read_text()
+    assert capsys.readouterr().err == ''
+
+
+def test_each_unit_has_its_own_values(recordings, result):
+    """Biases and matrices are within 4.5 reported sd of what the unit was simulated with (43 values)."""
+    units = {row['name']: row for row in read_csv(result[1] / 'units.csv')}
+    for name, truth in recordings[1].items():
+        for index, parameter in enumerate(MODEL.param_names):
+            if '.bias.' in parameter or '.matrix.' in parameter:
+                value, sd = float(units[name][parameter]), float(units[name][f'{parameter}.sd'])
+                assert abs(value - truth[index]) < 4.5 * sd, (name, parameter)
+        document = yaml.safe_load((result[1] / name / 'calibration.yaml').read_text())
+        assert len(document['provenance']['bags']) == (2 if name == 'unit_b' else 1)
+
+
+def test_the_summary_is_that_of_the_units(result):
+    """Mean and spread of the printed table follow from the values of the units."""
+    units = [row for row in read_csv(result[1] / 'units.csv') if row['verdict'] != 'refused']
+    summary = {row['parameter']: row for row in read_csv(result[1] / 'summary.csv')}
+    values = np.array([float(row['gyroscope.matrix.zz']) for row in units])
+    found = summary['gyroscope.matrix.zz']
+    np.testing.assert_allclose([float(found['mean']), float(found['spread'])], [values.mean(), values.std(ddof=1)], rtol=1e-12)
+    assert found['highest_unit'] == units[int(np.argmax(values))]['name']
+    assert float(found['spread_over_sd']) > 10, 'units of one grade differ by far more than a calibration is uncertain'
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_bytes(recordings, result, tmp_path):
+    """Two units at a time write what one after the other writes."""
+    assert run_fleet(recordings[0], tmp_path, '--jobs', '2') == result[0]
+    assert_same_files(tmp_path, result[1])
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_bytes(recordings, result, tmp_path):
+    """A scheduler with two workers does the same work."""
+    distributed = pytest.importorskip('dask.distributed', reason='the extra dask is not installed')
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host='127.0.0.1') as cluster:
+        assert run_fleet(recordings[0], tmp_path, '--scheduler', cluster.scheduler_address) == result[0]
+    assert_same_files(tmp_path, result[1])
+
+
+def assert_same_files(first, second):
+    """Compare two folders file by file."""
+    names = sorted(path.relative_to(second) for path in second.rglob('*') if path.is_file())
+    assert sorted(path.relative_to(first) for path in first.rglob('*') if path.is_file()) == names
+    for name in names:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def test_folders_without_units_are_refused(tmp_path, capsys):
+    """One line says what must be in the folder, or that no unit could be used; nothing is written."""
+    (tmp_path / 'empty').mkdir()
+    for folder, expected in (('missing', 'must exist'), ('empty', 'must hold one bag')):
+        assert run_fleet(tmp_path / folder, tmp_path / 'out') == 1
+        assert expected in capsys.readouterr().err
+    (tmp_path / 'empty' / 'unit.mcap').write_bytes(b'nothing')
+    assert run_fleet(tmp_path / 'empty', tmp_path / 'out') == 1
+    error = capsys.readouterr().err
+    assert 'none of 1 was' in error and 'unit.mcap' in error and error.count('\n') == 1
+    assert not any(path.is_file() for path in (tmp_path / 'out').rglob('*'))
+
+
+def test_several_recordings_that_do_not_belong_together_are_refused(recordings, tmp_path, capsys):
+    """Another frame, another table, or a file that is no bag: one line with the name of the recording at fault."""
+    folder, truth = recordings
+    imu, joints = session(3, truth['unit_a'])
+    write_session(tmp_path / 'other_frame', replace(imu, frame_id='second_imu'), joints, storage='mcap')
+    write_session(tmp_path / 'other_table', imu, replace(joints, names=('a', 'b', 'c')), storage='mcap')
+    for bad, expected in ((tmp_path / 'other_frame', "'second_imu'"), (tmp_path / 'other_table', 'a, b, c'), (folder / 'unit_c.mcap', 'readable bag')):
+        code = main(['calibrate', str(folder / 'unit_a'), str(bad), '--table', str(TABLE_FILE), '--output', str(tmp_path / 'out'), '--no-report', '--jobs', '1'])
+        error = capsys.readouterr().err
+        assert code == 1 and bad.name in error and expected in error and error.count('\n') == 1
+    assert not (tmp_path / 'out' / 'calibration.yaml').exists()
+
+
+def unit(name, bias, status='determined'):
+    """Return the result of a unit with one bias and an sd of 2."""
+    model = SensorModel()
+    values = model.start()
+    values[0] = bias
+    statuses = (status,) + ('held',) * (len(values) - 1)
+    return UnitResult(name, Calibration(model, values, 4.0 * np.eye(len(values)), statuses), 'good', 0)
+
+
+def test_spread_leaves_out_what_is_held():
+    """Units that know nothing of a parameter do not enter its mean; refused units enter nothing."""
+    first, second = summarise([unit('a', 1.0), unit('b', 5.0), unit('c', 100.0, 'held'), UnitResult('d', error='broken')])[:2]
+    assert (first.count, first.mean, first.typical_sd, first.lowest, first.highest) == (2, 3.0, 2.0, (1.0, 'a'), (5.0, 'b'))
+    np.testing.assert_allclose([first.spread, first.ratio], [np.sqrt(8), np.sqrt(2)])
+    assert second.count == 0 and np.isnan(second.mean)
+
+
+def test_no_unit_at_all_is_refused():
+    """The first reason is told."""
+    with pytest.raises(InputError, match='none of 1 was; the first, d: broken'):
+        summarise([UnitResult('d', error='broken')])
