@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.calibration import DETERMINED, HELD, WEAK, implausible
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.noise import STANDARD_GRAVITY
 from imu_calibration.units import for_people, significant
 
 GOOD, BAD, NOTE = 'good', 'bad', 'note'
@@ -15,6 +16,9 @@ LOOSE = 2.0
 """From this factor on the misfit is worth a note."""
 LOST_SHARE = 0.05
 """Losing more than this share of the samples is worth a look at the recording."""
+SCALES = tuple(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz')
+HAND_AXES = 'accelerometer_lower_triangular'
+"""The axes of a calibration by hand."""
 SHOWN_NAMES = 6
 """Names listed one by one; of more, the groups are named."""
 
@@ -116,9 +120,17 @@ def _undetermined(calibration):
     reasons = []
     for status, text in ((WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
         names = [n for n, s in zip(calibration.param_names, calibration.status) if s == status and requested(n)]
+        if status == WEAK and _gravity_unknown(calibration, names):
+            scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
+            reasons.append(Reason(WEAK, f'{listed(scale)}: the local gravity was not given, which scales them together', 'give it with --gravity'))
         for next_step, members in _by_need(calibration, names).items():
             reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step))
     return reasons
+
+
+def _gravity_unknown(calibration, names):
+    by_hand = calibration.gauge.get('axes') == HAND_AXES
+    return by_hand and calibration.conditions.get('gravity') == STANDARD_GRAVITY and set(SCALES) <= set(names)
 
 
 def _by_need(calibration, names):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from imu_calibration.error_budget import error_budget
-from imu_calibration.report.figures import INK, draw
+from imu_calibration.report.figures import INK, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.report.observability_section import short_name
 from imu_calibration.units import for_people
@@ -54,7 +54,7 @@ class _Dots:
         total = np.array([np.max(self.budget.total[part] / self.result.tolerances[part]) for _, part in effects])
         axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
         axes.axvline(1.0, color=INK, lw=1.0)
-        axes.set_xscale('log')
+        log_axis(axes.xaxis)
         axes.set_xlim(LOWEST, 3 * highest)
         axes.set_ylim(-0.7, len(effects) - 0.3)
         axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])

@@ -1,6 +1,7 @@
 """How every figure looks, and how it becomes SVG inside the page: no screen, no dates, the same input gives the same bytes."""
 
 import io
+import math
 import re
 
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
@@ -43,20 +44,46 @@ def draw(name, size, paint, label):
         matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
         paint(figure)
+        _lay_out(figure)
         text = io.StringIO()
         figure.savefig(text, format='svg', metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
     return Markup(_inside(text.getvalue(), str(escape(label))))
+
+
+def _lay_out(figure):
+    """Place the axes once; saving would do it twice more."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    FigureCanvasSVG(figure)
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine('none')
 
 
 def _inside(svg, label):
     """Return the svg element alone: without prologue, metadata and the identifiers that repeat from figure to figure."""
     svg = svg[svg.index('<svg'):]
     svg = re.sub(r'<metadata>.*?</metadata>', '', svg, flags=re.S)
-    svg = re.sub(r'<g id="[a-zA-Z0-9]+_[0-9]+">', '<g>', svg)
+    svg = re.sub(r' id="[A-Za-z0-9.]+_[0-9]+"', '', svg)
     svg = re.sub(r'<svg [^>]*viewBox="([^"]+)"[^>]*>', rf'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="\1" role="img" aria-label="{label}">',
                  svg, count=1)
     svg = re.sub(r'\n\s*', '\n', svg)
     return re.sub(r"font: ([0-9.]+)px[^;\"]*", r'font-size: \1px', svg)
+
+
+def log_axis(axis):
+    """Make an axis logarithmic with decades only, written as plain text (mathtext takes most of the time of a page)."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    axis.axes.set(**{f'{axis.axis_name}scale': 'log'})
+    axis.set_major_locator(LogLocator(numticks=8))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: decade(value)))
+
+
+def decade(value):
+    """Return a power of ten as text: plain from 0.001 to 1000, with a raised exponent beyond."""
+    exponent = round(math.log10(value))
+    if -3 <= exponent <= 3:
+        return f'{10.0**exponent:g}'
+    return '10' + str(exponent).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 
 def axis_legend(axes, where='upper right', **more):

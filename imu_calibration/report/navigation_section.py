@@ -9,7 +9,7 @@ from imu_calibration.compensation_covariance import Uncertainty
 from imu_calibration.navigation import strapdown
 from imu_calibration.observability import _attitudes
 from imu_calibration.reference import Reference, lever_matrix
-from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw
+from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.turntable import reference_motion
 
@@ -184,7 +184,7 @@ class _Growths:
                 values = np.median(getattr(part, name)[:, 1:], axis=0)
                 if values[-1] > 0:
                     axes.plot(part.time[1:], values, color=GREY, lw=1.0, ls=dash, label=label)
-            axes.set_yscale('log')
+            log_axis(axes.yaxis)
             axes.set_title(f'{name} error, {unit}')
             axes.set_xlabel('time, s')
             axes.set_xlim(0, self.pair[0].time[-1])

@@ -22,7 +22,9 @@ def _raised(power):
 
 def fixed(value, places):
     """Return a number with so many decimals and a real minus sign."""
-    return '–' if value is None or not np.isfinite(value) else f'{value:.{places}f}'.replace('-', '−')
+    if value is None or not np.isfinite(value):
+        return '–'
+    return f'{round(value, places) + 0.0:.{places}f}'.replace('-', '−')
 
 
 def pair(value, sd):

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.estimation import make_prior
 from imu_calibration.observability import tolerance_scaled_singular_values
-from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw
+from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text
 
 SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
@@ -74,7 +74,7 @@ class _Bars:
         axes.barh(place, share - low, left=low, height=0.68, color=colours)
         axes.axvline(1.0, color=INK, lw=1.0)
         axes.annotate('tolerance', (1.0, len(names) - 0.2), ha='center', va='bottom', fontsize=8.5, color=INK, annotation_clip=False)
-        axes.set_xscale('log')
+        log_axis(axes.xaxis)
         axes.set_xlim(low, max(10.0, 2 * float(share.max())))
         axes.set_ylim(-0.8, len(names) - 0.2)
         axes.set_yticks(place, [short_name(name) for name in names], fontsize=8)
@@ -96,7 +96,7 @@ class _Singular:
         axes.vlines(place, min(0.3, self.values.min() / 2), self.values, colors=colours, lw=2.2)
         axes.scatter(place, self.values, s=14, c=colours, zorder=3)
         axes.axhline(1.0, color=INK, lw=1.0)
-        axes.set_yscale('log')
+        log_axis(axes.yaxis)
         axes.set_xlim(0, len(place) + 1)
         axes.set_ylim(bottom=min(0.3, self.values.min() / 2))
         axes.grid(axis='x', visible=False)

@@ -17,15 +17,12 @@ def worked_sample(result):
     force, rate, alpha = (getattr(sample, name) for name in ('force', 'rate', 'alpha'))
     corrected = compensate(calibration, force[None], rate[None], alpha[None], sample.temperature)
     inverses = {s: np.linalg.inv(calibration.value(s, 'matrix')) for s in ('accelerometer', 'gyroscope')}
-    linear_force = inverses['accelerometer'] @ (force - calibration.value('accelerometer', 'bias'))
-    plain = not further_effects(calibration)
     arms = arms_of(calibration)
-    turning = lever_matrix(corrected.rate, alpha[None])[0]
     return {
         'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.value(s, 'bias')], 'unit': unit, 'inverse': [[fixed(v, 7) for v in row] for row in inverses[s]]}
                      for name, s, unit in (('Accelerometer', 'accelerometer', 'm/s²'), ('Gyroscope', 'gyroscope', 'rad/s'))],
         'arms': [[fixed(v * 1e3, 3) for v in row] for row in arms] if np.any(arms) else None, 'further': further_effects(calibration), 'where': sample.where,
-        'steps': _steps(sample, linear_force, inverses['gyroscope'] @ (rate - calibration.value('gyroscope', 'bias')), turning, arms, corrected, plain),
+        'steps': _steps(result, sample, corrected),
         'reference_known': sample.true_force is not None}
 
 
@@ -34,15 +31,19 @@ def further_effects(calibration):
     return [e.name for e in invertible(calibration.model).effects if e.name not in ('bias', 'matrix', 'accel_size_effect')]
 
 
-def _steps(sample, linear_force, linear_rate, turning, arms, corrected, plain):
-    steps = [('raw rate', 'rad/s', sample.rate, ''), ('corrected rate', 'rad/s', linear_rate if plain else corrected.rate[0], 'M⁻¹ (raw − b), gyroscope'),
-             ('raw specific force', 'm/s²', sample.force, ''), ('bias and matrix taken out', 'm/s²', linear_force, 'M⁻¹ (raw − b), accelerometer')]
+def _steps(result, sample, corrected):
+    calibration, arms = result.calibration, arms_of(result.calibration)
+    turning = lever_matrix(corrected.rate, sample.alpha[None])[0]
+    felt = np.einsum('ij,jk,ik->i', calibration.value('accelerometer', 'matrix'), turning, arms)
+    plain = not further_effects(calibration)
+    steps = [('raw rate', 'rad/s', sample.rate, ''), ('corrected rate', 'rad/s', corrected.rate[0], 'M⁻¹ (raw − b), gyroscope' if plain else ''),
+             ('raw specific force', 'm/s²', sample.force, '')]
     if np.any(arms):
-        felt = np.array([turning[i] @ arms[i] for i in range(3)])
-        steps.append(('lever-arm terms', 'm/s²', felt, 'row i: (α × rᵢ + ω × (ω × rᵢ))ᵢ'))
-    steps.append(('corrected specific force', 'm/s²', corrected.force[0], 'the line above taken off' if np.any(arms) and plain else ''))
+        steps.append(('lever-arm terms u', 'm/s²', felt, 'uᵢ = row i of M · (α × rᵢ + ω × (ω × rᵢ))'))
+    how = 'M⁻¹ (raw − b − u), accelerometer' if np.any(arms) else 'M⁻¹ (raw − b), accelerometer'
+    steps.append(('corrected specific force', 'm/s²', corrected.force[0], how if plain else ''))
     if sample.true_force is not None:
-        steps += [('the table says: force', 'm/s²', sample.true_force, 'noise of one sample remains'), ('the table says: rate', 'rad/s', sample.true_rate, '')]
+        steps += [('the table says: rate', 'rad/s', sample.true_rate, 'the noise of one sample remains'), ('the table says: force', 'm/s²', sample.true_force, '')]
     return [{'what': what, 'unit': unit, 'values': [fixed(v, 5) for v in values], 'how': how, 'mark': what.startswith('corrected')}
             for what, unit, values, how in steps]
 

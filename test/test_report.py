@@ -1,0 +1,245 @@
+"""The report: true to the calibration, complete without a network, the same bytes each time, and fit for a browser."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from imu_calibration import navigation
+from imu_calibration.noise import GRADES
+from imu_calibration.profiles import make_profile
+from imu_calibration.report import calibration_report
+from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
+from imu_calibration.report.numbers import fixed, text
+from imu_calibration.report.readings import reading_tables
+from imu_calibration.report.residuals import autocorrelation
+from imu_calibration.report.window_errors import window_errors
+from imu_calibration.report.worked_sample import worked_sample
+from imu_calibration.samples import SampleBlock
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table
+from imu_calibration.units import with_sd
+from imu_calibration.workflow import CalibrationOptions, calibrate, calibrate_without_table
+
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+                            'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
+MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
+PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}
+SECTIONS = ('parameters', 'apply', 'derived', 'residuals', 'observability', 'navigation', 'readings', 'budget', 'origin')
+VOID = {'meta', 'link', 'br', 'img', 'hr', 'input'}
+
+
+def session(profile, seed=6):
+    """Simulate one recording."""
+    values = random_values(MODEL, 'industrial', seed)
+    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile(profile, seed, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), seed)
+    return SampleBlock(imu, joints)
+
+
+@pytest.fixture(scope='module')
+def quick():
+    """The recording of a short full session."""
+    return session('quick')
+
+
+@pytest.fixture(scope='module')
+def on_table(quick):
+    """Its calibration on the table."""
+    return calibrate([lambda: iter([quick])], TABLE, provenance=PROVENANCE)
+
+
+@pytest.fixture(scope='module')
+def by_hand(quick):
+    """The same recording calibrated by hand."""
+    return calibrate_without_table([lambda: iter([SampleBlock(quick.imu)])], provenance=PROVENANCE)
+
+
+@pytest.fixture(scope='module')
+def demanding(quick):
+    """The recording judged by tolerances on the arms that it does not meet."""
+    return calibrate([lambda: iter([quick])], TABLE, CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}), PROVENANCE)
+
+
+@pytest.fixture(scope='module')
+def pages(on_table, by_hand, demanding):
+    """The three reports."""
+    return {'on_table': calibration_report(on_table), 'by_hand': calibration_report(by_hand), 'demanding': calibration_report(demanding)}
+
+
+class Balance(HTMLParser):
+    """Counts tags that do not close, and collects addresses."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.wrong, self.addresses = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        """Open a tag."""
+        self.addresses += [value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        """Note the addresses of a tag that closes itself."""
+        self.addresses += [value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value]
+
+    def handle_endtag(self, tag):
+        """Close a tag."""
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+@pytest.mark.parametrize('name', ('on_table', 'by_hand', 'demanding'))
+def test_the_page_is_whole_and_needs_nothing_else(pages, name):
+    page = pages[name]
+    parser = Balance()
+    parser.feed(page)
+    assert (parser.wrong, parser.open) == ([], [])
+    assert [a for a in parser.addresses if not a.startswith(('#', 'data:'))] == []
+    assert not re.search(r'<script|@import|url\((?!#)', page)
+    assert [s for s in SECTIONS if f'<section id="{s}">' not in page] == []
+    assert 'session &lt;1&gt;' in page and 'session <1>' not in page
+    assert not re.search(r'\bnan\b|\binf\b|None|Undefined', re.sub(r'<svg.*?</svg>|<style>.*?</style>', '', page, flags=re.S).replace('None: in every', ''))
+
+
+def test_the_same_calibration_gives_the_same_bytes(on_table, pages):
+    assert calibration_report(on_table) == pages['on_table']
+
+
+def test_identifiers_of_different_figures_do_not_meet(pages):
+    found = [set(re.findall(r' id="([^"]+)"', svg)) for svg in re.findall(r'<svg.*?</svg>', pages['on_table'], flags=re.S)]
+    assert len(found) > 8
+    assert sum(map(len, found)) == len(set().union(*found))
+
+
+def test_every_parameter_is_there_with_the_digits_that_it_deserves(on_table, pages):
+    calibration = on_table.calibration
+    for name, value, sd in zip(calibration.param_names, calibration.values, calibration.sd):
+        assert f'title="{name}"' in pages['on_table']
+        if '.matrix.' in name:
+            shown, spread = with_sd(value, sd)
+            assert f'>{shown.replace("-", "−")}</td><td class="n quiet">{spread}<' in pages['on_table']
+
+
+@pytest.mark.parametrize(('name', 'word', 'next_step'), (
+    ('on_table', 'Good', 'compensate'), ('by_hand', 'Weak', 'give it with --gravity'), ('demanding', 'Weak', 'accelerometer.accel_size_effect')))
+def test_the_verdict_comes_first_with_its_next_step(pages, name, word, next_step):
+    head = pages[name][:pages[name].index('<nav>')]
+    assert f'<p class="word">{word}</p>' in head
+    assert next_step.lower() in head.lower()
+
+
+def test_the_worked_sample_can_be_followed_with_the_printed_numbers(on_table):
+    section = worked_sample(on_table)
+    number = lambda texts: np.array([float(t.replace('−', '-')) for t in texts])
+    steps = {step['what']: number(step['values']) for step in section['steps']}
+    lever = {'raw specific force': steps['lever-arm terms u'], 'raw rate': 0.0}
+    for matrix, raw, corrected in zip(section['matrices'], lever, ('corrected specific force', 'corrected rate')):
+        by_reader = np.array([number(row) for row in matrix['inverse']]) @ (steps[raw] - number(matrix['bias']) - lever[raw])
+        assert by_reader == pytest.approx(steps[corrected], abs=3e-5)
+    noise = on_table.solution.noise
+    assert np.all(np.abs(steps['corrected specific force'] - steps['the table says: force']) < 5 * noise['accelerometer'].sample_sd())
+    assert np.all(np.abs(steps['corrected rate'] - steps['the table says: rate']) < 5 * noise['gyroscope'].sample_sd())
+
+
+def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_hand):
+    for result in (on_table, by_hand):
+        errors = window_errors(result)
+        for sensor in ('accelerometer', 'gyroscope'):
+            ratio = np.sqrt(np.mean((errors.after[sensor] / errors.floor[sensor])**2))
+            assert 0.3 < ratio < 1.3  # by hand two of three components of each pose are fitted
+            assert errors.rms(sensor, 'before') > 8 * errors.rms(sensor, 'after')
+
+
+def test_readings_at_one_g_are_zhangs_tables(on_table):
+    at_rest, moving = reading_tables(on_table, window_errors(on_table))
+    assert [line['position'] for line in at_rest] == ['+x', '+y', '+z', '−x', '−y', '−z']
+    for line in at_rest:
+        assert all(float(cell['error_after']) < 0.6 for cell in line['cells'])  # mg; noise of a mean over 2 s is below 0.1
+        assert max(float(cell['error_before']) for cell in line['cells']) > 1.0
+    assert all(float(line['rate']) > 0 for line in moving)
+
+
+def test_expected_drift_at_rest_is_that_of_simulated_runs(on_table):
+    """Noise and constant errors, integrated by the strapdown equations themselves."""
+    errors = window_errors(on_table)
+    _, parts = expected_growth(on_table, errors)
+    rng, period, seconds = np.random.default_rng(3), 0.05, 50.0
+    time = np.arange(0.0, seconds + period / 2, period)
+    densities = noise_densities(on_table)
+    assert densities == pytest.approx([GRADES['industrial'].noise.accel_density, GRADES['industrial'].noise.gyro_density], rel=0.1)
+    ends = []
+    for _ in range(150):
+        force, rate = (rng.normal(0, d / np.sqrt(period), (len(time), 3)) for d in densities)
+        run = navigation.strapdown(time, force + [0, 0, 9.81], rate, 9.81)
+        ends.append([np.linalg.norm(run.velocity_n[-1]), np.linalg.norm(run.position_n[-1])])
+    rms = np.sqrt(np.mean(np.square(ends), axis=0))
+    assert rms == pytest.approx([parts['noise'].velocity[0, -1], parts['noise'].position[0, -1]], rel=0.2)  # 150 runs: 4 % each
+
+
+def test_drift_in_motion_falls_by_the_calibration(on_table):
+    before, after = motion_growth(on_table)
+    assert np.all(before.velocity[:, 0] == 0) and before.time[-1] >= 5.0
+    assert np.all(after.position[:, -1] < 0.2 * before.position[:, -1])
+
+
+def test_white_residuals_show_no_autocorrelation_and_a_wrong_model_does(on_table):
+    for lags, values, bound in autocorrelation(on_table).values():
+        assert values[0] == pytest.approx(1.0)
+        assert np.mean(np.abs(values[1:]) < bound) > 0.85
+    wrong = on_table.solution.values.copy()
+    wrong[on_table.solution.model.slices['gyroscope', 'matrix']] += 0.01
+    _, values, bound = autocorrelation(replace(on_table, solution=replace(on_table.solution, values=wrong)))['gyroscope']
+    assert np.max(np.abs(values[1:])) > 10 * bound
+
+
+def test_a_recording_with_an_unmodelled_effect_is_called_bad(quick):
+    """A lag of 20 ms in the gyroscope leaves far more than noise in motion."""
+    late = replace(quick.imu, rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]))
+    result = calibrate([lambda: iter([SampleBlock(late, quick.joints)])], TABLE)
+    page = calibration_report(result)
+    assert '<p class="word">Bad</p>' in page
+    assert 'imu_calibration diagnose' in page
+
+
+def test_numbers_are_printed_for_people():
+    assert text(0.00012345) == '0.000123'
+    assert text(-4.5e-7, 2) == '−4.5·10⁻⁷'
+    assert text(float('nan')) == '–'
+    assert fixed(-0.0000001, 3) == '0.000'
+
+
+def chromium():
+    """Return the browser, or skip."""
+    for name in ('chromium', 'chromium-browser', 'google-chrome'):
+        if shutil.which(name):
+            return shutil.which(name)
+    pytest.skip('no chromium here; install it to have the report opened in a browser')
+
+
+WATCH = '''<script>window.addEventListener('load', () => { const wide = document.documentElement.scrollWidth - window.innerWidth;
+const flat = [...document.querySelectorAll('svg')].filter(s => s.getBoundingClientRect().height < 50).length;
+document.title = `wide ${wide} flat ${flat} figures ${document.querySelectorAll('svg').length}`; });</script></body>'''
+
+
+@pytest.mark.parametrize(('name', 'width'), (('on_table', 1200), ('on_table', 500), ('by_hand', 500)))
+def test_a_browser_shows_it_without_errors_and_without_overflow(pages, tmp_path, name, width):
+    browser = chromium()
+    file = tmp_path / 'report.html'
+    file.write_text(pages[name].replace('</body>', WATCH))
+    flags = ['--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--disable-background-networking',
+             '--disable-component-update', '--disable-sync', '--disable-dev-shm-usage', '--enable-logging=stderr', f'--user-data-dir={tmp_path / "profile"}',
+             f'--window-size={width},1000', '--virtual-time-budget=3000', '--dump-dom']
+    done = subprocess.run([browser, *flags, file.as_uri()], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert [line for line in done.stderr.splitlines() if 'CONSOLE' in line] == []
+    found = re.search(r'<title>wide (-?\d+) flat (\d+) figures (\d+)</title>', done.stdout)
+    assert found, done.stdout[:300]
+    wide, flat, figures = map(int, found.groups())
+    assert wide <= 0 and flat == 0 and figures >= 6
+
