@@ -199,10 +199,12 @@ def test_reload_without_a_file_says_so(bench):
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    ('not: [a calibration', 'must be YAML'), (TEXT['E'].replace('imu_calibration/1', 'imu_calibration/7'), 'must not be newer'),
+    ('not: [a calibration', 'must be YAML'),
+    (TEXT['E'].replace('frame_id: imu_link', 'frame_id: other_imu'), 'must be for the same sensor'),
+    (TEXT['E'].replace('imu_calibration/1', 'imu_calibration/7'), 'must not be newer'),
     (calibration_to_text(Calibration(CALIBRATION['E'].model, 1e3 * CALIBRATION['E'].values, CALIBRATION['E'].covariance,
                                      CALIBRATION['E'].status)), 'check units'),
-], ids=['broken', 'newer', 'implausible'])
+], ids=['broken', 'other sensor', 'newer', 'implausible'])
 def test_a_refused_document_leaves_the_old_one(bench, text, words):
     publish_calibration(bench, 'public', text)
     bench.wait(lambda: words in bench.lines().get(node_name('public'), ''), what=words)

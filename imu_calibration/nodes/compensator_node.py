@@ -115,6 +115,7 @@ class CompensatorNode(Node):
             strange = implausible(calibration)
             if strange:
                 raise DocumentError(f'{strange[0]}; calibrate again')
+            self._check_frame(calibration.frame_id)
         except ImuCalibrationError as error:
             return self._refuse(source, str(error))
         chosen = self.settings
@@ -132,6 +133,12 @@ class CompensatorNode(Node):
         self.get_logger().info(f'calibration {self.version} from {source} taken over')
         self._diagnostics.publish_now()
         return ''
+
+    def _check_frame(self, frame_id):
+        known = '' if self._wanted is None else self._wanted.frame_id
+        if known and frame_id and frame_id != known:
+            raise DocumentError(f"a new calibration must be for the same sensor, '{known}', this one is for '{frame_id}'; "
+                                'restart the node for another sensor')
 
     def _refuse(self, source, why):
         self.problem = f'a calibration from {source} was refused: {why}'

@@ -1,0 +1,30 @@
+"""The loop that leans on inner parts of rclpy knows when they are missing."""
+
+import pytest
+
+relay_loop = pytest.importorskip('imu_calibration.nodes.relay_loop')
+
+
+def test_the_inner_parts_are_there():
+    assert relay_loop.available()
+
+
+@pytest.mark.parametrize('missing', ['WaitSet', 'Subscription', 'Publisher'])
+def test_a_missing_part_is_noticed(monkeypatch, missing):
+    class Some:
+        """rclpy's inner module without one of its parts."""
+
+    for name in {'WaitSet', 'Subscription', 'Publisher'} - {missing}:
+        setattr(Some, name, getattr(relay_loop._inner, name))
+    monkeypatch.setattr(relay_loop, '_inner', Some)
+    assert not relay_loop.available()
+
+
+def test_no_inner_module_at_all_is_noticed(monkeypatch):
+    monkeypatch.setattr(relay_loop, '_inner', None)
+    assert not relay_loop.available()
+
+
+def test_the_executor_never_takes_what_the_loop_reads():
+    group = relay_loop.OutsideExecutor()
+    assert not group.can_execute(object()) and not group.beginning_execution(object())
