@@ -1,5 +1,7 @@
 """Exact kinematics of a chain of revolute joints."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from imu_calibration.earth import earth_rate_n
@@ -56,17 +58,18 @@ def reference_motion(table, motion, temperature_c=None):
     n_samples = len(motion.time)
     mat_sn, force_s = np.empty((n_samples, 3, 3)), np.empty((n_samples, 3))
     rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
-    base, steps = _base_columns(table), _chain_steps(table, motion)
+    base, mat_sl, gravity = _constants(table)
+    steps = _chain_steps(table, motion, mat_sl)
     for start in range(0, n_samples, _BLOCK):
         part = slice(start, min(start + _BLOCK, n_samples))
         columns = _run_chain(base, motion, steps, part)
         mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
-    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=table.gravity_value,
+    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=gravity,
                      temperature_c=temperature_c, motion=motion)
 
 
-def _chain_steps(table, motion):
+def _chain_steps(table, motion, mat_sl):
     """Return what happens to vectors on the way out: (constant matrix, offset before it, moving joint or None, plane)."""
     steps, fixed = [], np.eye(3)
     offset = np.zeros(3)
@@ -81,7 +84,7 @@ def _chain_steps(table, motion):
         fixed, offset = before.T, np.zeros(3)
     if table.mount_xyz is not None:
         offset = offset + fixed.T @ np.array(table.mount_xyz)
-    steps.append((table.mat_sl @ fixed, offset, None, 1.0, 2))
+    steps.append((mat_sl @ fixed, offset, None, 1.0, 2))
     return steps
 
 
@@ -98,6 +101,15 @@ def _to_coordinate_axis(axis):
     if np.abs(axis[third]) == 1.0:
         return np.eye(3), float(np.sign(axis[third])), third
     return align(axis), 1.0, 2
+
+
+@lru_cache(maxsize=64)
+def _constants(table):
+    """Return `_base_columns`, the mount's matrix and gravity: thousands of short windows share one table."""
+    constants = _base_columns(table), table.mat_sl
+    for array in constants:
+        array.flags.writeable = False
+    return *constants, table.gravity_value
 
 
 def _base_columns(table):

@@ -194,6 +194,11 @@ def parse_effects(sensor, text, joint_names=('outer', 'middle', 'inner')):
     return names
 
 
+def warps_act(model):
+    """Tell whether any warp has a point other than zero, so that the sensors feel another motion than the table's."""
+    return any(effect.warp is not None and np.any(model.warp_point(effect)) for effect in model.effects)
+
+
 def warped_reference(model, sensor, table, motion, temperature_c=None, values=None, skip=None):
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.

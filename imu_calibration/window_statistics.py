@@ -6,12 +6,15 @@ import numpy as np
 from scipy.linalg import lapack
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.sensor_model import columns
+from imu_calibration.sensor_model import columns, warps_act
+from imu_calibration.turntable import reference_motion
 
 SLOW_TIME = 0.25
 """Length of the pieces whose means tell correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
 BLOCK = 2000
-"""Rows per orthogonal factorisation: tall blocks cost more than stacked small ones."""
+"""Rows per orthogonal factorisation: taller blocks do not stay in the processor's cache."""
+PANEL = 4
+"""Columns that are reflected at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,9 @@ def reduce_window(window, model, table, session=0, column_function=columns):
         temperature = np.array([temperature.mean()])
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     length = 0 if static or len(window.time) < 2 else int(round(SLOW_TIME * (len(window.time) - 1) / (window.time[-1] - window.time[0])))
-    designs = {sensor: column_function(model, sensor, table, window.motion, temperature) for sensor in SENSORS}
+    # Both sensors feel the same motion unless a lag or a delay acts: then it is worked out once.
+    shared = {'ref': reference_motion(table, window.motion, temperature)} if column_function is columns and not warps_act(model) else {}
+    designs = {sensor: column_function(model, sensor, table, window.motion, temperature, **shared) for sensor in SENSORS}
     sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
     return WindowStatistics(window.kind, float(window.time.mean()), float(window.time[-1] - window.time[0]), len(window.time), sensors, session)
 
@@ -116,18 +121,26 @@ def batch_statistics(output, batches=16):
 
 def triangular(rows):
     """Return the triangular factor of `rows` by Householder reflections, block after block, with as many rows as it has rank bound."""
-    width = rows.shape[1]
-    factor = np.zeros((0, width))
-    for start in range(0, len(rows), BLOCK):
-        stacked = np.asfortranarray(np.concatenate([factor, rows[start:start + BLOCK]]))
-        factor = _r_factor(stacked)
-    return factor
+    count, width = rows.shape
+    if count < 2 * width:
+        return _r_factor(np.array(rows, order='F'))
+    factor = np.zeros((width, width), order='F')
+    for start in range(0, count, BLOCK):
+        # Each block is folded into the triangle, whose zeros cost nothing.
+        block = np.array(rows[start:start + BLOCK], order='F')
+        factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
+        _require_finite(info, factor)
+    return np.triu(factor)
 
 
 def _r_factor(stacked):
     if not len(stacked):
         return stacked
     raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
-    if info != 0 or not np.all(np.isfinite(raw[:, 0])):
-        raise FloatingPointError('orthogonal factorisation met values that are not finite')
+    _require_finite(info, raw[:, 0])
     return np.triu(raw[:min(raw.shape)])
+
+
+def _require_finite(info, values):
+    if info != 0 or not np.isfinite(values).all():
+        raise FloatingPointError('orthogonal factorisation met values that are not finite')

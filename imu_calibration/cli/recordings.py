@@ -1,5 +1,6 @@
 """Options that every verb on recordings shares, and what they open."""
 
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from imu_calibration.resources import config_file
 from imu_calibration.settings import WindowSettings, describe, override
 from imu_calibration.workflow import CalibrationOptions
 from msg_adapters.bag import open_recording
+from msg_adapters.read_ahead import read_ahead
 
 
 def add_topic_arguments(parser):
@@ -79,10 +81,11 @@ def read_blocks(path, topics, joint_names, want_joints, label, quiet=False):
     """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
     recording = open_recording(path, *topics, want_joints=want_joints)
     with recording, progress_bar(label, 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)) as advance:
-        for block in recording.blocks(joint_names) if want_joints else recording.blocks():
-            if block.imu is not None:
-                advance(len(block.imu))
-            yield block
+        with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
+            for block in blocks:
+                if block.imu is not None:
+                    advance(len(block.imu))
+                yield block
         yield from lost_block(recording)
 
 
