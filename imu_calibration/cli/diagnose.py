@@ -6,6 +6,7 @@ from imu_calibration import documents, workflow
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console
+from imu_calibration.diagnosing import diagnose_recording
 
 NAME = 'diagnose'
 HELP = 'Show what the model gets wrong, name the cause, extend the model, and measure the gain on data that were not fitted.'
@@ -26,8 +27,10 @@ def run(options):
     table = files.read_table(options.table)
     folder = files.make_folder(options.output)
     source = recordings.source_of(options.bag, options, table.joint_names)
-    with progress_bar('diagnose', 100, '%') as advance:
-        result = workflow.diagnose_recording(source, table, settings, recordings.provenance_of([options.bag], options), advance)
+    with progress_bar('diagnose', 1000, 'parts') as advance:
+        result = diagnose_recording(source(), table, settings, recordings.provenance_of([options.bag], options), _steps(advance))
+    from imu_calibration.report import diagnosis_report
+    files.write_text(folder / 'report.html', diagnosis_report(result))
     from imu_calibration.report import diagnosis_report
     files.write_text(folder / 'report.html', diagnosis_report(result))
     files.write_text(folder / 'calibration.yaml', documents.calibration_to_text(result.calibration))
@@ -37,3 +40,14 @@ def run(options):
         out.print(line, soft_wrap=True)
     out.print(f'written: diagnosis.json, calibration.yaml and report.html in {folder}', soft_wrap=True)
     return workflow.exit_code(result)
+
+
+def _steps(advance):
+    """Turn shares that are done into steps of a thousand."""
+    done = [0]
+
+    def progress(share):
+        now = int(1000 * share)
+        advance(max(now - done[0], 0))
+        done[0] = max(now, done[0])
+    return progress
