@@ -9,6 +9,8 @@ from imu_calibration.effects.base import SENSORS
 
 SIGNIFICANT = 5.0
 """Standard deviations above noise from which a rest is significant."""
+LEAST_WINDOWS = 12
+"""With fewer windows the model itself hardly predicts those held out, and a rest says nothing."""
 WITHIN_SHARE = 0.02
 """Least excess of the variance within windows that counts."""
 ALPHA = 1e-4
@@ -55,7 +57,7 @@ def _rest(attempt, explained, sensor, excess, values):
     if excess[1] > WITHIN_SHARE * explained.n_within:
         sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
-    significant = bool(sigma > SIGNIFICANT)
+    significant = bool(sigma > SIGNIFICANT and explained.chosen.sum() >= LEAST_WINDOWS)
     if not significant:
         return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
     name, share = _correlate(lifted, residual / noise_sd)
