@@ -31,8 +31,6 @@ def run(options):
         result = diagnose_recording(source(), table, settings, recordings.provenance_of([options.bag], options), _steps(advance))
     from imu_calibration.report import diagnosis_report
     files.write_text(folder / 'report.html', diagnosis_report(result))
-    from imu_calibration.report import diagnosis_report
-    files.write_text(folder / 'report.html', diagnosis_report(result))
     files.write_text(folder / 'calibration.yaml', documents.calibration_to_text(result.calibration))
     files.write_text(folder / 'diagnosis.json', json.dumps(result.document, indent=1) + '\n')
     out = console()
