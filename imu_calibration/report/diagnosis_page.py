@@ -1,0 +1,192 @@
+"""The report of a diagnosis: the finding as a sentence, the plot that convinces, and the evidence on everything that was asked."""
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
+from imu_calibration.report.numbers import in_unit, people, text
+from imu_calibration.report.page import render
+from imu_calibration.report.parameters import parameter_groups
+from imu_calibration.report.residuals import UNIT
+from imu_calibration.units import for_people
+
+BINS = 24
+CLEAR = 0.5
+"""Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
+
+
+def diagnosis_report(result):
+    """
+    Return the report of a diagnosis as one HTML page that needs nothing else; the same input gives the same bytes.
+
+    Parameters
+    ----------
+    result : workflow.DiagnosisResult
+
+    """
+    diagnosis = result.diagnosis
+    rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
+    word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
+    return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests), lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
+                  findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
+                  traces=draw('traces', (8.6, 4.2), _OverTime(diagnosis.traces), 'Residuals over time before and after the extension'),
+                  candidates=[_candidate(row) for row in diagnosis.candidates], rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
+                  not_testable=list(diagnosis.not_testable), groups=parameter_groups(result), windows=diagnosis.windows, locked=diagnosis.locked,
+                  bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
+
+
+def _headline(diagnosis, rests):
+    count = len(diagnosis.findings)
+    if count == 0:
+        return 'Something is wrong that no effect explains' if rests else 'The model is adequate'
+    found = 'One cause found' if count == 1 else f'{count} causes found'
+    return found + (', and something stays unexplained' if rests else '')
+
+
+def _reasons(diagnosis, rests):
+    lines = [(finding.explanation, 'the extended calibration.yaml contains it' if not finding.indistinguishable_from else
+              f'this recording cannot tell it from {", ".join(n.replace("_", " ") for n in finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
+             for finding in diagnosis.findings]
+    if not lines and not rests:
+        lines = [(f'No effect of the {len(diagnosis.candidates)} that were asked about explains more than noise does.', '')]
+    for sensor, rest in rests:
+        more = f', and it goes with {rest.correlates_with}' if rest.correlates_with else ''
+        lines.append((f'{in_unit(rest.rms, UNIT[sensor])} rms of the {sensor} are unexplained{more}' + (f'; {rest.where}' if rest.where else '') + '.',
+                      'look there: a knock, a slip in the fixture, or a cause that the catalogue does not know'))
+    return lines
+
+
+def _tiles(diagnosis):
+    tiles = [{'what': 'effects asked about', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None, 'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
+    if diagnosis.findings:
+        gain = diagnosis.gain
+        number, _, unit = in_unit(gain.heldout_rms_after, UNIT[gain.sensor]).partition(' ')
+        tiles.append({'what': f'held-out {gain.sensor} residual ({gain.measure})', 'number': number, 'unit': unit,
+                      'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'note': _reduction(gain)})
+    navigation = diagnosis.traces.dead_reckoning
+    if navigation and diagnosis.findings:
+        tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']), 'unit': 'm',
+                      'before': f'{text(navigation["position_before"])} m', 'note': f'dead reckoning, median of {navigation["stretches"]} stretches'})
+    return tiles
+
+
+def _reduction(gain):
+    interval = '' if not np.all(np.isfinite(gain.ci95)) else f' (95 %: {text(100 * gain.ci95[0], 2)} to {text(100 * gain.ci95[1], 2)} %)'
+    return f'{text(100 * gain.reduction, 2)} % less{interval}'
+
+
+def _finding(diagnosis, finding, number):
+    rows = [{'name': name, 'cells': people(value, sd, unit), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'} for name, (value, sd, unit) in finding.parameters.items()]
+    gain = finding.gain
+    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': finding.explanation, 'rows': rows, 'p': text(finding.p_value, 2),
+            'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain),
+            'sensor': gain.sensor, 'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from], 'motion': finding.separating_motion,
+            'figure': draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), f'Residual against the cause, before and after: {finding.effect}')}
+
+
+CAUSES = (('thermal', ('temperature',)), ('drift', ('time',)), ('g_sensitivity', ('force',)), ('rate_product', ('rate',)), ('encoder', ('angle',)),
+          ('axis_non', ('angle',)), ('tilt', ('angle',)), ('accel_quadratic', ('force',)), ('accel_cubic', ('force',)), ('accel_cross', ('force',)),
+          ('accel_scale', ('force',)), ('gyro_quadratic', ('rate',)), ('gyro_scale', ('rate',)))
+"""Part of an effect's name -> variables that are its cause; others are drawn against the effect's own signal."""
+
+
+def variables(traces):
+    """Return {label: (kind, values)} of everything that a residual may be drawn against, in people's units."""
+    found = {'time, s': ('time', traces.time)}
+    if traces.temperature_c is not None:
+        found['temperature, °C'] = ('temperature', traces.temperature_c)
+    for k, axis in enumerate('xyz'):
+        found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / 9.80665)
+        found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
+    for k in range(traces.position.shape[1]):
+        found[f'angle of joint {k + 1}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * traces.position[:, k]))))
+    return found
+
+
+def explained_share(values, signal):
+    """Return the share of the variance of `signal` that its means over bins of `values` carry."""
+    edges = np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1])
+    index = np.searchsorted(edges, values)
+    count = np.bincount(index, minlength=BINS)
+    means = np.bincount(index, signal, BINS) / np.maximum(count, 1)
+    total = np.sum((signal - signal.mean())**2)
+    return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
+
+
+def cause_of(traces, finding):
+    """Return (sensor, axis, label, values): what the residual of a finding is drawn against, and for which component."""
+    sensor = finding.gain.sensor
+    signal = traces.before[sensor] - traces.after[sensor]
+    axis = int(np.argmax((signal**2).mean(axis=0)))
+    kinds = next((kinds for part, kinds in CAUSES if part in finding.effect), ())
+    best = max(((explained_share(values, signal[:, axis]), label, values) for label, (kind, values) in variables(traces).items() if kind in kinds),
+               default=(0.0, '', None), key=lambda entry: entry[0])
+    if best[0] < CLEAR:
+        factor, unit = for_people(UNIT[sensor])
+        return sensor, axis, f'what the effect predicts, {unit}', signal[:, axis] * factor
+    return sensor, axis, best[1], best[2]
+
+
+class _AgainstCause:
+    """Two panels with one scale: before with the fitted curve, and after."""
+
+    def __init__(self, traces, finding):
+        self.traces, self.finding = traces, finding
+
+    def __call__(self, figure):
+        traces = self.traces
+        sensor, axis, label, values = cause_of(traces, self.finding)
+        factor, unit = for_people(UNIT[sensor])
+        before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
+        left, right = figure.subplots(1, 2, sharey=True)
+        some = slice(None, None, max(1, len(values) // 2500))
+        for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
+            axes.plot(values[some], residual[some], '.', color=colour, markersize=3, alpha=0.45, mew=0, rasterized=False)
+            axes.axhline(0, color=GREY, lw=0.6)
+            axes.set_title(f'{title}: rms {text(float(np.sqrt(np.mean(residual**2))))} {unit}')
+            axes.set_xlabel(label)
+        place, curve = _curve(values, before - after)
+        left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')
+        left.legend(loc='best')
+        left.set_ylabel(f'{sensor} {"xyz"[axis]} residual, {unit}')
+        limit = 1.1 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.998))
+        left.set_ylim(-limit, limit)
+
+
+def _curve(values, signal):
+    """Return means of the fitted signal over bins of the cause."""
+    edges = np.quantile(values, np.linspace(0, 1, 2 * BINS + 1)[1:-1])
+    index = np.searchsorted(edges, values)
+    count = np.bincount(index, minlength=2 * BINS)
+    filled = count > 0
+    return (np.bincount(index, values, 2 * BINS)[filled] / count[filled], np.bincount(index, signal, 2 * BINS)[filled] / count[filled])
+
+
+class _OverTime:
+    """Size of the residual over time, before and after, one panel per sensor."""
+
+    def __init__(self, traces):
+        self.traces = traces
+
+    def __call__(self, figure):
+        for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
+            factor, unit = for_people(UNIT[sensor])
+            some = slice(None, None, max(1, len(self.traces.time) // 3000))
+            for residual, colour, label in ((self.traces.before, BEFORE, 'before'), (self.traces.after, AFTER, 'after')):
+                size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
+                axes.plot(self.traces.time[some], size[some], '.', color=colour, markersize=3, alpha=0.5, mew=0, label=label)
+            axes.set_title(f'{sensor}, size of the residual over 0.25 s, {unit}')
+            axes.set_ylim(bottom=0)
+        axes.set_xlabel('time, s')
+        figure.axes[0].legend(loc='upper right', markerscale=3)
+
+
+def _candidate(row):
+    return {'effect': row.effect.replace('_', ' '), 'sensor': row.sensor, 'gain': text(row.gain_alone), 'p': text(row.p_value_alone, 2),
+            'beside': text(row.gain_beside) if row.gain_beside is not None else '', 'p_beside': text(row.p_value_beside, 2) if row.p_value_beside is not None else '',
+            'verdict': row.verdict, 'mark': row.verdict == 'found'}
+
+
+def _rest(sensor, rest):
+    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, UNIT[sensor]), 'sigma': text(rest.sigma, 2),
+            'with': f'{rest.correlates_with} ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with else '–', 'where': rest.where or '–'}
