@@ -34,7 +34,7 @@ class CompensationStream:
         if needs_temperature(compensation.invertible(calibration.model)) and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
         self.period, self.derivative = period, None
-        self.count, self.flagged = 0, 0
+        self.count, self.flagged, self.frame_id = 0, 0, ''
         self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
         self._fastest, self._temperatures, self._last = 0.0, [], ()
 
@@ -46,7 +46,7 @@ class CompensationStream:
         slope = np.zeros_like(imu.rate_s)
         slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
         corrected = compensate(self.calibration, imu.force_s, imu.rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
-        self.count += len(imu)
+        self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
         if finite.any():
             self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
@@ -97,8 +97,11 @@ class CompensationStream:
         """Return lines about what was outside the calibration's conditions or could not be corrected."""
         fastest = np.array([[self._fastest, 0.0, 0.0]])
         lines = compensation.outside_conditions(self.calibration, fastest, self._temperatures or None)
+        if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
+            lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
+                         'make sure that it is the same sensor')
         if self.flagged:
-            lines.append(f'{self.flagged} samples are saturated: they are passed on as they are and cannot be trusted')
+            lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
         return lines
 
 
@@ -108,7 +111,7 @@ def derivative_for(calibration, period, transfer=None):
     if transfer is not None:
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
     (force_sd, _), (rate_sd, _) = (calibration.noise(sensor) for sensor in ('accelerometer', 'gyroscope'))
-    return choose_derivative(period, float(rate_sd.max()), arm, max(float(force_sd.min()), 1e-9))
+    return choose_derivative(period, float(rate_sd.max()), arm, float(force_sd.min()))
 
 
 def refuse_corrected(topic):
@@ -140,3 +143,10 @@ def requested_transfer(frame_id, xyz, rpy):
     if any(xyz) or any(rpy):
         raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well')
     return None
+
+
+def late_ns(calibration, wanted=True):
+    """Return by how much stamps are to be moved back, ns: the calibration's time_offset when that is `wanted`, else 0."""
+    if not wanted or not calibration.has('reference', 'time_offset'):
+        return 0
+    return round(float(calibration.value('reference', 'time_offset')) * 1e9)

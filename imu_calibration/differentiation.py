@@ -34,15 +34,6 @@ class CausalDerivative:
         """Return the standard deviation of the angular acceleration for white rate noise, rad/s^2."""
         return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
 
-    def apply(self, rate_s):
-        """Return the angular acceleration, shape (n, 3); the first `taps - 1` samples use the shorter past there is."""
-        from scipy.signal import lfilter   # here, because scipy.signal takes a second to import
-        n, taps = len(rate_s), self.taps
-        alpha = lfilter(self.weights, [1.0], rate_s, axis=0) if n else np.zeros((0, 3))
-        for k in range(min(taps - 1, n)):
-            alpha[k] = CausalDerivative(k + 1, self.period).weights @ rate_s[k::-1] if k else 0.0
-        return alpha
-
 
 def choose_derivative(period, rate_sd, arm, force_sd, largest_delay=0.02):
     """
@@ -53,7 +44,7 @@ def choose_derivative(period, rate_sd, arm, force_sd, largest_delay=0.02):
     period : float
         Sampling period, s.
     rate_sd, force_sd : float
-        Noise of single samples, rad/s and m/s^2.
+        Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the largest delay.
     arm : float
         Longest lever arm that the correction takes out, m.
     largest_delay : float
@@ -61,6 +52,8 @@ def choose_derivative(period, rate_sd, arm, force_sd, largest_delay=0.02):
 
     """
     longest = max(2, int(2 * largest_delay / period) + 1)
+    if not (rate_sd > 0 and force_sd > 0):
+        return CausalDerivative((longest + 2) // 2, period)
     for taps in range(2, longest + 1):
         derivative = CausalDerivative(taps, period)
         if derivative.noise_sd(rate_sd) * arm <= force_sd / 3:

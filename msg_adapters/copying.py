@@ -13,10 +13,11 @@ from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.encode import rows
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
 from msg_adapters.layout import group_by_layout
-from msg_adapters.stamps import MessageError
+from msg_adapters.stamps import MessageError, from_ns
 
 
-def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct, propagate=None, frame_id=None, mat_ts=None, storage=None):
+def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct, propagate=None, frame_id=None, mat_ts=None,
+                        late_ns=0, storage=None):
     """
     Write a bag with all topics of another one and the corrected Imu messages behind the measured ones.
 
@@ -36,6 +37,8 @@ def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct
         corrected (force, rate).
     frame_id : str, optional
         New frame of the corrected messages; `mat_ts` (target from sensor) then turns the orientation.
+    late_ns : int
+        Taken from the stamps of the corrected messages.
     storage : str, optional
         'sqlite3' or 'mcap'; default as the source.
 
@@ -54,7 +57,7 @@ def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct
         bag = recording.source
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]
-        patch = _Patch(correct, propagate, frame_id, mat_ts)
+        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns)
         with BagWriter(destination, storage or bag.storage) as writer:
             ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
@@ -91,8 +94,8 @@ def _write(writer, topic_ids, raw, measured, corrected_id, patch):
 class _Patch:
     """Makes corrected messages from measured ones."""
 
-    def __init__(self, correct, propagate, frame_id, mat_ts):
-        self.correct, self.propagate = correct, propagate
+    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns):
+        self.correct, self.propagate, self.late_ns = correct, propagate, late_ns
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
 
@@ -112,7 +115,10 @@ class _Patch:
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
             fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]))
-            for k, message in zip(place.tolist(), rows(patch_imu_group(layout, group, fields, self.frame_id)), strict=True):
+            table = patch_imu_group(layout, group, fields, self.frame_id)
+            if self.late_ns:
+                _set_stamps(table, layout.order, layout.stamp_ns(group) - self.late_ns)
+            for k, message in zip(place.tolist(), rows(table), strict=True):
                 messages[k] = message
         return done, messages
 
@@ -141,6 +147,11 @@ class _Patch:
         if given.any():
             turned[given] = (Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)).as_quat()
         return turned
+
+
+def _set_stamps(table, order, stamp_ns):
+    for place, values, kind in zip((4, 8), from_ns(stamp_ns), 'iu', strict=True):
+        table[:, place:place + 4] = values.astype(f'{order}{kind}4').view(np.uint8).reshape(-1, 4)
 
 
 def _propagated(propagate, pairs):

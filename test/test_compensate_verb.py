@@ -1,5 +1,8 @@
 """``imu_calibration compensate``: from a bag of a known sensor to a bag of true readings."""
 
+from dataclasses import replace
+from shutil import rmtree
+
 import numpy as np
 import pytest
 from compensation_cases import FURTHER, random_calibration
@@ -43,8 +46,8 @@ def write_case(folder, effects):
     return calibration
 
 
-def compensate(folder, *more):
-    return main(['compensate', str(folder / 'bag'), '--calibration', str(folder / 'calibration.yaml'), '--output', str(folder / 'out'), *more])
+def compensate(folder, *more, bag='bag'):
+    return main(['compensate', f'{folder}/{bag}', '--calibration', f'{folder}/calibration.yaml', '--output', f'{folder}/out', *more])
 
 
 @pytest.mark.parametrize('effects', EFFECTS)
@@ -69,7 +72,8 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
 
 def test_readings_at_another_point_and_frame_of_the_body(tmp_path):
     write_case(tmp_path, 'usual')
-    assert compensate(tmp_path, '--target-frame', 'base_link', '--target-xyz', '0.2', '-0.1', '0.3', '--target-rpy', '0.1', '0.2', '-1.5') == 0
+    pose = '--target-xyz', '0.2', '-0.1', '0.3', '--target-rpy', '0.1', '0.2', '-1.5'
+    assert compensate(tmp_path, '--target-frame', 'base_link', *pose) == 0
     _, force, rate, alpha, _ = true_motion()
     mat_ts = Rotation.from_euler('xyz', [0.1, 0.2, -1.5]).as_matrix()
     rate_t, alpha_t = rate @ mat_ts.T, alpha @ mat_ts.T
@@ -84,6 +88,19 @@ def test_readings_at_another_point_and_frame_of_the_body(tmp_path):
     assert without_arm > 0.5
 
 
+def test_stamps_move_only_when_asked(tmp_path):
+    calibration = write_case(tmp_path, 'usual')
+    late = replace(calibration, model=calibration.model.with_effect('reference', 'time_offset'), values=np.append(calibration.values, 3e-3),
+                   covariance=np.pad(calibration.covariance, (0, 1)), status=calibration.status + ('determined',))
+    tmp_path.joinpath('calibration.yaml').write_text(calibration_to_text(late))
+    stamps = true_motion()[0]
+    for more, shift in (((), 0), (('--correct-stamps',), 3_000_000)):
+        assert compensate(tmp_path, *more) == 0
+        got = [parse_imu(data).stamp_ns for _, data in raw_messages(tmp_path / 'out', '/imu/data_corrected')]
+        assert got == (stamps - shift).tolist()
+        rmtree(tmp_path / 'out')
+
+
 @pytest.mark.parametrize(('more', 'words'), [
     (('--imu-topic', '/imu/data_corrected'), '/imu/data_corrected'), (('--target-xyz', '1', '0', '0'), 'needs the name of that frame'),
 ])
@@ -92,8 +109,7 @@ def test_what_cannot_be_done_is_refused_in_one_line(tmp_path, capsys, more, word
     if '--imu-topic' in more:
         compensate(tmp_path)
         (tmp_path / 'out').rename(tmp_path / 'twice')
-        arguments = ['compensate', str(tmp_path / 'twice'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]
-        code = main([*arguments, *more, '--corrected-topic', '/again'])
+        code = compensate(tmp_path, *more, '--corrected-topic', '/again', bag='twice')
     else:
         code = compensate(tmp_path, *more)
     error = capsys.readouterr().err

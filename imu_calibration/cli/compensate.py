@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from imu_calibration.compensation_stream import CompensationStream, refuse_corrected, requested_transfer
+from imu_calibration.compensation_stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.errors import InputError
@@ -17,11 +17,13 @@ def add_arguments(parser):
     parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
     parser.add_argument('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
     parser.add_argument('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
-    parser.add_argument('--target-frame', metavar='FRAME', default='', help='move the corrected readings to another frame of the same rigid body')
+    parser.add_argument('--target-frame', metavar='FRAME', default='',
+                        help='move the corrected readings to another frame of the same rigid body')
     parser.add_argument('--target-xyz', metavar='M', nargs=3, type=float, default=(0.0, 0.0, 0.0),
                         help='place of the sensor in the target frame, m')
     parser.add_argument('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
                         help='roll, pitch, yaw of the sensor in the target frame, rad')
+    parser.add_argument('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     recordings.add_topic_arguments(parser)
 
 
@@ -41,7 +43,8 @@ def run(options):
             advance(len(imu))
             return stream.correct(imu)
         lost = copy_with_corrected(options.bag, options.output, recording.imu_topic, options.corrected_topic, correct, stream.propagate,
-                                   options.target_frame or None, None if transfer is None else transfer.mat_ts)
+                                   options.target_frame or None, None if transfer is None else transfer.mat_ts,
+                                   late_ns(calibration, options.correct_stamps))
     for line in stream.warnings():
         print(f'note: {line}')
     print(f'written: {options.output} with {options.corrected_topic} ({stream.count} samples)')

@@ -1,6 +1,7 @@
 """What compensator_node says about itself."""
 
 from math import sqrt
+from time import monotonic
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublis
 
 SERIOUS = ('frame_id', 'not an Imu message')
 """Beginnings of the reasons for which a stream as a whole cannot be corrected."""
+QUIET = 2.0
+"""Seconds without a message after which diagnostics say so."""
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
@@ -20,7 +23,8 @@ class CompensatorDiagnostics:
     """Collects the state of the node; a line that is new is logged once."""
 
     def __init__(self, node):
-        self._node, self._logged, self._counts, self._received = node, set(), {}, 0
+        self._node, self._logged, self._counts = node, set(), {}
+        self._received, self._last_change = 0, monotonic()
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
     def publish_now(self):
@@ -33,6 +37,8 @@ class CompensatorDiagnostics:
         node.look_for_correction()
         compensation = node.compensation
         serious, notes = self._lines(compensation)
+        if self._quiet(compensation):
+            notes.append(f'no messages come on {node.input_topic}')
         for line in serious + notes:
             if line not in self._logged:
                 self._logged.add(line)
@@ -41,6 +47,12 @@ class CompensatorDiagnostics:
         message = '; '.join(serious + notes) or f'corrected with calibration {node.version}'
         frame = compensation.calibration.frame_id if compensation is not None else ''
         return [make_status(level, 'compensation', message, self._values(compensation), frame)]
+
+    def _quiet(self, compensation):
+        received = self._node.uncorrected + (0 if compensation is None else compensation.received)
+        if received != self._received:
+            self._received, self._last_change = received, monotonic()
+        return monotonic() - self._last_change > QUIET
 
     def _lines(self, compensation):
         """Return (what prevents correction, what should be known), one line each."""

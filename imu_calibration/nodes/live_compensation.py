@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.compensation import arms_of, invertible, needs_temperature
 from imu_calibration.compensation_covariance import Uncertainty
 from imu_calibration.compensation_kernel import make_kernel
-from imu_calibration.compensation_stream import derivative_for
+from imu_calibration.compensation_stream import derivative_for, late_ns
 from imu_calibration.differentiation import CausalDerivative
 from imu_calibration.stamped_derivative import WARM_UP, StampedDerivative, typical_period
 from msg_adapters.imu import find_imu_layout
@@ -57,8 +57,7 @@ class LiveCompensation:
         self._zero = {s: calibration.value(s, 'bias').tolist() for s in ('accelerometer', 'gyroscope')}
         self._levels = _level(calibration, 'accelerometer', 'accel_saturation'), _level(calibration, 'gyroscope', 'gyro_saturation')
         self._can_saturate = any(np.isfinite(self._levels))
-        moves = correct_stamps and calibration.has('reference', 'time_offset')
-        self._late_ns = round(float(calibration.value('reference', 'time_offset')) * NS) if moves else 0
+        self._late_ns = late_ns(calibration, correct_stamps)
         self._head_in, self._size = None, -1
         self._rate_cov_in = self._force_cov_in = self._orientation_cov_in = None
         self.last = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0)
