@@ -2,6 +2,8 @@
 Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
+
+Several IMUs: one launch each with its own `namespace` and `save_file`.
 """
 
 from launch import LaunchDescription
@@ -21,15 +23,21 @@ def generate_launch_description():
                               description='table description, YAML'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
                               description='parameters of the node, YAML'),
+        DeclareLaunchArgument('save_file', default_value='calibration.yaml', description='where ~/save writes; relative to the working directory'),
+        DeclareLaunchArgument('resume', default_value='false', description='go on with the accumulator beside save_file'),
         DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
         DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
+        DeclareLaunchArgument('temperature', default_value='imu/temperature', description='topic of sensor_msgs/Temperature'),
         DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
         Node(
             package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
-            parameters=[LaunchConfiguration('params'),
-                        {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
-                         'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
-            remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states'))],
+            parameters=[LaunchConfiguration('params'), {
+                'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+                'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str),
+                'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
+                'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
+            remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
+                        ('imu/temperature', LaunchConfiguration('temperature'))],
         ),
     ])

@@ -27,9 +27,9 @@ def generate_launch_description():
         DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
         Node(
             package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
-            parameters=[LaunchConfiguration('params'),
-                        {'calibration_file': ParameterValue(LaunchConfiguration('calibration'), value_type=str),
-                         'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
+            parameters=[LaunchConfiguration('params'), {
+                'calibration_file': ParameterValue(LaunchConfiguration('calibration'), value_type=str),
+                'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
             remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('imu/data_corrected', LaunchConfiguration('corrected'))],
         ),
     ])

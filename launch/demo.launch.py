@@ -1,7 +1,7 @@
 """
 A simulated table with an IMU on it, calibrated and compensated live.
 
-    ros2 launch imu_calibration demo.launch.py
+    ros2 launch imu_calibration demo.launch.py time_factor:=4.0
 """
 
 from launch import LaunchDescription
@@ -15,14 +15,18 @@ CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 
 
 def generate_launch_description():
-    """Describe the simulator and the two nodes that listen to it."""
+    """Describe the simulator and the two nodes that listen to it, all on the simulator's clock."""
     table = {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str)}
+    simulator = {'profile': ParameterValue(LaunchConfiguration('profile'), value_type=str), 'clock': True, 'wait_for_subscribers': 2,
+                 'time_factor': ParameterValue(LaunchConfiguration('time_factor'), value_type=float)}
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description, YAML'),
-        _node('simulator_node', table),
-        _node('calibration_node', table),
-        _node('compensator_node'),
+        DeclareLaunchArgument('profile', default_value='quick', description='motion of the table'),
+        DeclareLaunchArgument('time_factor', default_value='1.0', description='seconds of simulated time per second'),
+        _node('simulator_node', table, simulator),
+        _node('calibration_node', table, {'use_sim_time': True}),
+        _node('compensator_node', {'use_sim_time': True}),
     ])
 
 

@@ -76,7 +76,7 @@ class Station:
     def calibration_node(self, folder, **parameters):
         """Start calibration_node with a place to save in `folder`."""
         options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
-        return self.start('calibration_node', {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 1.0, **parameters},
+        return self.start('calibration_node', {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 0.2, **parameters},
                           **options)
 
     def play(self, bag, rate, subscribers=1, **parameters):

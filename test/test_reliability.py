@@ -25,6 +25,13 @@ def session():
     return make_session(3, 50.0)
 
 
+def beginning(session, seconds=80.0):
+    """The first part of a session: enough for most parameters, in half the time."""
+    imu, joints, values, model = session
+    end = imu.stamp_ns[0] + int(seconds * 1e9)
+    return (*(s.select(s.stamp_ns < end) for s in (imu, joints)), values, model)
+
+
 @pytest.fixture
 def station(tmp_path):
     """A domain of its own."""
@@ -85,10 +92,10 @@ def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, ses
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
 
     assert station.call('/calibration_node/reset').success
-    check_bursts_and_foreign_frames(station, publisher, session, tmp_path)
+    check_bursts_and_foreign_frames(station, publisher, beginning(session), tmp_path)
 
     assert station.call('/calibration_node/reset').success
-    check_clock_jump_and_silence(station, publisher, session, tmp_path)
+    check_clock_jump_and_silence(station, publisher, beginning(session), tmp_path)
     assert station.processes.end(node, signal.SIGTERM) == 0
 
 
@@ -124,21 +131,21 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
     station.until(lambda: any('JointState messages do not come' in message for _, _, message in station.history), 'a warning')
     live = answer_of(station, folder)
-    assert live.statistics['stream']['imu clock reset'] == 1 or live.statistics['dropped'].get('imu clock reset') == 1
+    assert (live.statistics['stream'] | live.statistics['dropped'])['imu clock reset'] == 1
     used = sum(live.statistics['samples_used'].values())
     assert used > 0.9 * sum(offline((imu, joints)).statistics['samples_used'].values())
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
 
 
 def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, tmp_path):
-    imu, joints, values, model = session
-    half = imu.stamp_ns[0] + int(75e9)
+    imu, joints, values, model = beginning(session, 110.0)
+    half = imu.stamp_ns[0] + int(60e9)
     first = station.calibration_node(tmp_path, reliable=True, autosave_period=0.3)
     publisher = Publisher(station)
     publisher.wait()
     send_all(station, publisher, *(s.select(s.stamp_ns < half) for s in (imu, joints)))
     saved = tmp_path / 'calibration.accumulator.npz'
-    station.until(lambda: station.figure('windows') > 8 and saved.is_file(), 'windows to be saved')
+    station.until(lambda: station.figure('windows') > 4 and saved.is_file(), 'windows to be saved')
     station.spin_for(1.0)
     n_saved = station.figure('windows')
     assert station.processes.end(first, signal.SIGKILL) == -signal.SIGKILL
@@ -149,30 +156,30 @@ def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, t
     publisher.wait()
     send_all(station, publisher, *(s.select(s.stamp_ns >= half) for s in (imu, joints)))
     live = answer_of(station, tmp_path)
-    assert sum(live.statistics['windows'].values()) > n_saved + 10
+    assert sum(live.statistics['windows'].values()) > n_saved + 5
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
     assert station.processes.end(second) == 0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
-def test_a_signal_in_mid_session_leaves_whole_files_and_exit_code_zero(station, session, tmp_path, number):
+def test_signals_in_mid_session_leave_whole_files_and_exit_code_zero(station, session, tmp_path):
     imu, joints, _, _ = session
-    part = [s.select(s.stamp_ns < imu.stamp_ns[0] + int(50e9)) for s in (imu, joints)]
-    folder = tmp_path / 'saved'
-    node = station.calibration_node(folder, reliable=True, autosave_period=0.1)
+    topics = {'imu/data_raw': '/imu/data_raw', 'joint_states': '/joint_states'}
+    numbers = {'left': signal.SIGINT, 'right': signal.SIGTERM}
+    nodes = {side: station.calibration_node(tmp_path / side, reliable=True, autosave_period=0.1, namespace=f'/{side}', remappings=topics)
+             for side in numbers}
     compensator = station.start('compensator_node')
     publisher = Publisher(station)
-    publisher.wait(2 if number == signal.SIGINT else 1)
-    publisher.send(*part)
-    station.until(lambda: station.figure('windows') > 0, 'windows')
-    assert station.processes.end(node, number) == 0
-    assert station.processes.end(compensator, number) == 0
-    assert {path.name for path in folder.iterdir()} <= {'calibration.accumulator.npz', 'calibration.yaml'}
+    publisher.wait(2)
+    publisher.send(*(s.select(s.stamp_ns < imu.stamp_ns[0] + int(50e9)) for s in (imu, joints)))
+    station.until(lambda: all(station.figure('windows', f'{side}/calibration_node: calibration') for side in numbers), 'windows')
+    for side, number in numbers.items():
+        assert station.processes.end(nodes[side], number) == 0
+        assert {path.name for path in (tmp_path / side).iterdir()} <= {'calibration.accumulator.npz', 'calibration.yaml'}
+    assert station.processes.end(compensator, signal.SIGTERM) == 0
 
 
 def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp_path):
-    other = make_session(4, 50.0)
-    sessions = {'left': session, 'right': other}
+    sessions = {'left': beginning(session), 'right': beginning(make_session(4, 50.0))}
     sent, documents = {}, {}
     for side, (imu, joints, _, _) in sessions.items():
         station.calibration_node(tmp_path / side, namespace=f'/{side}')
@@ -193,7 +200,7 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
 
 
 def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
-    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=26.0)
+    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=29.0)
     write_session(tmp_path / 'fast', imu, joints)
     node = station.calibration_node(tmp_path, reliable=True)
     station.until(lambda: station.status, 'the node')

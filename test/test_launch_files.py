@@ -1,0 +1,56 @@
+"""Launch files: every argument that is used is declared, every parameter exists. `launch` itself is replaced, it is not on PyPI."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Recorded:
+    """Stands for any class of launch: keeps what it was made with."""
+
+    made = []
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+        Recorded.made.append(self)
+
+
+def stand_in(name):
+    """A class of its own for each name."""
+    return type(name, (Recorded,), {})
+
+
+@pytest.fixture
+def launch(monkeypatch):
+    """Stand-ins for the modules of launch."""
+    names = {'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'],
+             'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'], 'launch_ros': [], 'launch_ros.actions': ['Node'],
+             'launch_ros.parameter_descriptions': ['ParameterValue'], 'launch_ros.substitutions': ['FindPackageShare']}
+    for module, classes in names.items():
+        made = ModuleType(module)
+        for name in classes:
+            setattr(made, name, stand_in(name))
+        monkeypatch.setitem(sys.modules, module, made)
+    Recorded.made = []
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name)
+def test_arguments_are_declared_and_parameters_exist(path, launch):
+    spec = importlib.util.spec_from_file_location('launch_file', path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.generate_launch_description()
+    of_kind = {kind: [r for r in Recorded.made if type(r).__name__ == kind] for kind in ('DeclareLaunchArgument', 'LaunchConfiguration', 'Node')}
+    declared = [r.args[0] for r in of_kind['DeclareLaunchArgument']]
+    assert sorted(declared) == sorted({r.args[0] for r in of_kind['LaunchConfiguration']})
+    for node in of_kind['Node']:
+        name = node.kwargs['executable']
+        known = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
+        given = {key for group in node.kwargs['parameters'] if isinstance(group, dict) for key in group}
+        assert given <= set(known) | {'use_sim_time'}, name
