@@ -1,5 +1,7 @@
 """``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from imu_calibration import documents, workflow
@@ -34,11 +36,13 @@ def run(options):
         recordings.open_bag(bag, options, want_joints=table is not None).close()
     folder = files.make_folder(options.output)
     sources = [recordings.source_of(bag, options, names, table is not None, quiet=jobs > 1) for bag in options.bags]
-    provenance = recordings.provenance_of(options.bags, options)
-    if table is None:
-        result = workflow.calibrate_without_table(sources, settings, options.gravity, provenance)
-    else:
-        result = _on_table(sources, table, settings, provenance, options.bags, jobs)
+    with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
+        provenance = hashing.submit(recordings.provenance_of, options.bags, options)
+        if table is None:
+            result = workflow.calibrate_without_table(sources, settings, options.gravity)
+        else:
+            result = _on_table(sources, table, settings, options.bags, jobs)
+        result = replace(result, calibration=replace(result.calibration, provenance=result.calibration.provenance | provenance.result()))
     text = documents.calibration_to_text(result.calibration)
     if not options.no_report:
         from imu_calibration.report import calibration_report
@@ -48,10 +52,10 @@ def run(options):
     return workflow.exit_code(result)
 
 
-def _on_table(sources, table, settings, provenance, bags, jobs):
+def _on_table(sources, table, settings, bags, jobs):
     """Calibrate with the table, recordings side by side; with several processes one bar counts the recordings."""
     names = [Path(bag).name for bag in bags]
     names = [name if names.count(name) == 1 else str(bag) for name, bag in zip(names, bags, strict=True)]
     with progress_bar('recordings', len(bags) if jobs > 1 else 0, 'recordings') as advance:
         mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-        return workflow.calibrate(sources, table, settings, provenance, mapper=mapper, names=names)
+        return workflow.calibrate(sources, table, settings, mapper=mapper, names=names)
