@@ -9,6 +9,7 @@ from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.modulation import SAMPLES_LEAST, holes, make_windows
 from imu_calibration.noise import STANDARD_GRAVITY
 from imu_calibration.reference import skew
+from imu_calibration.relative_arm_fit import Rows, fit_arm, jackknife_covariance, lever_rows, response
 from imu_calibration.settings import setting
 from imu_calibration.still_search import find_still
 
@@ -18,8 +19,10 @@ ARM_PRIOR = 1.0
 """m; an arm whose sd exceeds half of it counts as not seen."""
 UNCALIBRATED_SCALE_SD = 0.03
 """Scale and misalignment of a consumer gyroscope that no poses calibrated."""
-TAIL_DOF = 3
-"""Student's t of the residuals: knocks make long tails."""
+DELAY_ROUNDS = 5
+"""The delay shifts the windows of the rates until nothing is left of it."""
+WINDOWS_LEAST = 40
+"""Fewer say little about eight numbers and their scatter."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +105,15 @@ def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY,
     _require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
     a, b = (_Stream.make(imu, start, gravity, given, settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
-    mat_ab, offset = _relative_rotation(a, b, settings)
-    rows = _build_rows(a, b, mat_ab, offset, settings)
-    return _solve(rows, a, b, mat_ab, offset, settings)
+    rotation = _relative_rotation(a, b, settings)
+    delay = 0.0
+    for _ in range(DELAY_ROUNDS):
+        rows = _build_rows(a, b, rotation, delay, settings)
+        fit = fit_arm(rows)
+        delay += fit.values[-1]
+        if abs(fit.values[-1]) < 1e-5:
+            break
+    return _result(rows, fit, delay, rotation, (a, b), settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +125,8 @@ class _Stream:
     rate: np.ndarray
     flagged: np.ndarray
     calibration: object
+    poses: object
     period: float
-    rate_sd: float
 
     @classmethod
     def make(cls, imu, start_ns, gravity, calibration, settings):
@@ -125,11 +134,11 @@ class _Stream:
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps carry no new moment
         imu, time = imu.select(keep), time[keep]
         period = float(np.median(np.diff(time)))
-        calibration = _calibrate(imu, gravity) if calibration is None else calibration
+        made_here = calibration is None
+        calibration = _calibrate(imu, gravity) if made_here else calibration
         flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
-        force, rate = _compensated(imu, calibration)
-        noise = np.sqrt(np.mean(np.square(calibration.statistics['rate_noise_sd']))) if calibration else 0.0
-        return cls(time, force, rate, flagged, calibration, period, float(noise))
+        poses = calibration.poses if made_here and calibration is not None else None
+        return cls(time, *_compensated(imu, calibration), flagged, calibration, poses, period)
 
 
 def clipped(values):
@@ -170,33 +179,48 @@ def _require_overlap(imu_a, imu_b):
         raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; check the clocks')
 
 
-def _windows(a, b, offset, settings):
-    """Return (windows over A, windows over B, centres): the same moments in both streams, nothing clipped, no holes."""
-    length = max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
-    step = max(a.period, length / SAMPLES_LEAST)
-    begin = max(a.time[0], b.time[0] - offset) + 0.51 * length
-    end = min(a.time[-1], b.time[-1] - offset) - 0.51 * length
-    first = a.time[np.searchsorted(a.time, begin)]  # on A's samples where these are even
-    centres = first + step * np.arange(max(0, int((end - first) / step) + 1))
-    if len(centres) == 0:
-        raise InputError(f'the two IMUs must overlap by more than a window of {length:.3f} s; record longer')
-    over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
-    free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
-    return over_a, over_b, centres, free
+def _length(a, b, settings):
+    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
+
+
+def _centres(a, b, offset, length):
+    """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
+    step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
+    begin = max(a.time[0], b.time[0] - offset) + margin
+    end = min(a.time[-1], b.time[-1] - offset) - margin
+    if end - begin < step:
+        raise InputError(f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer')
+    first = a.time[np.searchsorted(a.time, begin)]
+    return first + step * np.arange(int((end - first) / step) + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rotation:
+    """How B's axes and clock lie against A's."""
+
+    mat_ab: np.ndarray
+    cov: np.ndarray
+    offset: float
 
 
 def _relative_rotation(a, b, settings, rounds=4):
-    """Return (mat_ab, time offset): from the directions at rest where both were calibrated, else from the rates."""
-    offset, mat_ab = 0.0, np.eye(3)
+    """Return the rotation from the directions at rest where both were calibrated, else from the rates; the offset from the rates."""
+    offset, length = 0.0, _length(a, b, settings)
     for _ in range(rounds):
-        over_a, over_b, _, free = _windows(a, b, offset, settings)
+        centres = _centres(a, b, offset, length)
+        over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+        free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
         over_a, over_b = over_a.select(free), over_b.select(free)
         rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
         mat_ab = _align(rate_a, rate_b)
-        difference = rate_b @ mat_ab.T - rate_a
-        offset += -float(np.sum(difference * alpha) / np.sum(alpha * alpha)) if np.any(alpha) else 0.0
+        offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
     at_rest = _directions_at_rest(a, b, offset)
-    return (mat_ab if at_rest is None else _align(*at_rest)), offset
+    pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
+    mat_ab = _align(*pairs)
+    residual = pairs[0] - pairs[1] @ mat_ab.T
+    cross = skew(pairs[0])
+    information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
+    return _Rotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
 
 
 def _align(vectors_a, vectors_b):
@@ -207,10 +231,10 @@ def _align(vectors_a, vectors_b):
 
 def _directions_at_rest(a, b, offset):
     """Return mean forces of both over the times when both rest, or None when there are too few directions."""
-    if a.calibration is None or b.calibration is None:
+    if a.poses is None or b.calibration is None:
         return None
     pairs = []
-    for first, last in zip(a.calibration.poses.start, a.calibration.poses.stop):
+    for first, last in zip(a.poses.start, a.poses.stop):
         begin, end = a.time[first], a.time[last - 1]
         in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
         if in_b.stop - in_b.start >= 2:
@@ -218,45 +242,30 @@ def _directions_at_rest(a, b, offset):
     return tuple(np.array(pairs).swapaxes(0, 1)) if len(pairs) >= 4 else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Integrated equations of the windows that show the arm."""
-
-    centres: np.ndarray
-    difference: np.ndarray
-    alpha: np.ndarray
-    products: np.ndarray
-    jerk: np.ndarray
-    products_slope: np.ndarray
-    force_slope: np.ndarray
-    clipped_share: float
-    length: float
-    alpha_noise: float
-
-
-def _build_rows(a, b, mat_ab, offset, settings):
-    over_a, over_b, centres, free = _windows(a, b, offset, settings)
-    rate_b, force_b = b.rate @ mat_ab.T, b.force @ mat_ab.T
-    alpha = 0.5 * (over_a.slope(a.rate) + over_b.slope(rate_b))
-    products = 0.5 * (_products(over_a.mean, a.rate) + _products(over_b.mean, rate_b))
-    strength = np.sqrt(np.sum(alpha**2, axis=1) + np.trace(products, axis1=1, axis2=2)**2)
+def _build_rows(a, b, rotation, delay, settings):
+    """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
+    length, offset = _length(a, b, settings), rotation.offset
+    centres = _centres(a, b, offset, length)
+    force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+    rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
+    free = ~(force_a.touches(a.flagged) | force_b.touches(b.flagged) | rate_a.touches(a.flagged) | rate_b.touches(b.flagged))
+    in_a = b.rate @ rotation.mat_ab.T
+    alpha_a, alpha_b = rate_a.slope(a.rate), rate_b.slope(in_a)
+    products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, in_a))
+    strength = np.sqrt(0.25 * np.sum((alpha_a + alpha_b)**2, axis=1) + np.trace(products, axis1=1, axis2=2)**2)
     moving = strength > settings.motion_share * np.quantile(strength, 0.99)
     keep = free & moving
-    if keep.sum() < 20:
-        raise NotObservableError(f'the arm needs fast twisting of both IMUs together, got {keep.sum()} windows of motion without clipping; '
-                                 'twist the body about all axes for 20 s or more')
-    over_a, over_b = over_a.select(keep), over_b.select(keep)
-    # second derivative by central difference of the windows' slope: only the small delay column uses it
-    lag = 0.1 * (centres[1] - centres[0])
-    later, sooner = (make_windows(a.time, centres[keep] + s * lag, _length(a, b, settings)) for s in (1, -1))
-    jerk = (later.slope(a.rate) - sooner.slope(a.rate)) / (2 * lag)
-    noise = 0.25 * (a.rate_sd**2 * np.mean(np.sum(over_a.weight_slope**2, axis=1)) + b.rate_sd**2 * np.mean(np.sum(over_b.weight_slope**2, axis=1)))
-    return _Rows(centres[keep], over_b.mean(force_b) - over_a.mean(a.force), alpha[keep], products[keep], jerk, _products(over_a.slope, a.rate),
-                 over_a.slope(a.force), float(np.mean(~free[moving])), _length(a, b, settings), float(noise))
-
-
-def _length(a, b, settings):
-    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
+    if keep.sum() < WINDOWS_LEAST:
+        raise NotObservableError(f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
+                                 'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes')
+    lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
+    later, sooner = (make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1))
+    # half of the difference of two gyroscopes is the error of their mean, as far as they err independently
+    noise = np.mean((alpha_b - alpha_a)[keep]**2) / 4
+    force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
+    return Rows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
+                (later - sooner) / (2 * lag), _products(rate_a.select(keep).slope, a.rate), force_a.select(keep).slope(a.force),
+                force, float(noise), float(np.mean(~free[moving])), length)
 
 
 def _products(integrate, rate):
@@ -264,60 +273,13 @@ def _products(integrate, rate):
     return integrate((rate[:, :, None] * rate[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
 
 
-def _lever(alpha, products):
-    """``[alpha x] + omega omega^T - |omega|^2``, shape (n, 3, 3)."""
-    return skew(alpha) + products - np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+def _rotation_covariance(fit, rows, rotation):
+    """What the uncertainty of the rotation between the IMUs adds."""
+    shift = response(fit, -skew(rows.force))
+    return (shift @ rotation.cov @ shift.T)[:3, :3]
 
 
-def _solve(rows, a, b, mat_ab, offset, settings):
-    lever = _lever(rows.alpha, rows.products)
-    lever_slope = _lever(rows.jerk, rows.products_slope)
-    count, arm = len(lever), np.zeros(3)
-    for _ in range(3):  # the delay column needs the arm
-        design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), -rows.force_slope[:, :, None], (-lever_slope @ arm)[:, :, None]], axis=2)
-        values, weights = _robust_fit(design, rows.difference, rows.alpha_noise, use_delay=np.any(arm))
-        arm = values[:3]
-    residual = rows.difference - design @ values
-    inverse = np.linalg.pinv(_normal(design, weights, rows.alpha_noise), hermitian=True)
-    cov = _cluster_covariance(design, residual, weights, inverse, rows.centres, settings.cluster)[:3, :3]
-    added = _calibration_covariance(design, weights, inverse, rows, arm, a, b)
-    return _result(arm, cov, added, values, residual, weights, rows, (a, b), mat_ab, offset, inverse)
-
-
-def _normal(design, weights, alpha_noise):
-    """Weighted normal matrix, less what the noise of the angular acceleration adds to it (errors in variables)."""
-    flat = design * np.sqrt(weights)[:, None, None]
-    normal = np.einsum('nip,niq->pq', flat, flat)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    normal[:3, :3] -= 2 * alpha_noise * weights.sum() * np.eye(3)
-    return normal + 1e-12 * np.diag(scale**2)
-
-
-def _robust_fit(design, target, alpha_noise, use_delay):
-    """Student-t regression by reweighting; returns (values, weights of the windows)."""
-    if not use_delay:
-        design = design[:, :, :-1]
-    weights = np.ones(len(design))
-    for _ in range(20):
-        right = np.einsum('nip,ni,n->p', design, target, weights)
-        values = np.linalg.solve(_normal(design, weights, alpha_noise), right)
-        size = np.sum((target - design @ values)**2, axis=1)
-        scale = np.median(size) / 2.366 + 1e-300  # the median of chi-square with three degrees of freedom
-        weights = (TAIL_DOF + 3) / (TAIL_DOF + size / scale)
-    return (values if use_delay else np.append(values, 0.0)), weights
-
-
-def _cluster_covariance(design, residual, weights, inverse, centres, cluster):
-    """Sandwich over stretches of time: errors within one may be anything."""
-    score = np.einsum('nip,ni,n->np', design, residual, weights)
-    label = np.unique(np.floor((centres - centres[0]) / cluster).astype(int), return_inverse=True)[1]
-    sums = np.zeros((label.max() + 1, design.shape[2]))
-    np.add.at(sums, label, score)
-    groups = len(sums)
-    return inverse @ (sums.T @ sums) @ inverse * groups / max(groups - 1, 1)
-
-
-def _calibration_covariance(design, weights, inverse, rows, arm, a, b):
+def _calibration_covariance(fit, rows, a, b):
     """What the uncertainty of the gyroscopes' matrices adds: ``rate -> (1 - E) rate`` with the sd of E."""
     columns = []
     for p in range(3):
@@ -325,8 +287,8 @@ def _calibration_covariance(design, weights, inverse, rows, arm, a, b):
             turn = np.zeros((3, 3))
             turn[p, q] = 1.0
             product = rows.products @ turn.T
-            columns.append(-_lever(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ arm)
-    shift = inverse @ np.einsum('nip,nic,n->pc', design, np.stack(columns, axis=2), weights)
+            columns.append(-lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ fit.values[:3])
+    shift = response(fit, np.stack(columns, axis=2))
     spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4  # the mean of both rates is used
     return (shift @ spread @ shift.T)[:3, :3]
 
@@ -338,21 +300,30 @@ def _matrix_covariance(calibration):
     return calibration.covariance[np.ix_(index, index)]
 
 
-def _result(arm, cov, added, values, residual, weights, rows, streams, mat_ab, offset, inverse):
-    total = cov + added
+def _result(rows, fit, delay, rotation, streams, settings):
+    motion = jackknife_covariance(fit, rows.centres, settings.cluster)[:3, :3]
+    calibration, turned = _calibration_covariance(fit, rows, *streams), _rotation_covariance(fit, rows, rotation)
+    total = motion + calibration + turned
     sd = np.sqrt(np.diag(total))
-    if np.max(sd) > 0.5 * ARM_PRIOR or not np.all(np.isfinite(sd)):
-        worst = 'xyz'[int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))]
-        raise NotObservableError(f'the motion must show the whole arm, along {worst} it leaves an sd of {np.max(sd):.2g} m; '
-                                 f'twist fast about the axes other than {worst} too')
+    _require_seen(fit.seen, sd)
     diagnostics = {
-        'windows': len(rows.centres), 'window': rows.length, 'clipped_share': rows.clipped_share, 'calibrated': all(s.calibration for s in streams),
-        'signal_rms': float(np.sqrt(np.mean(rows.difference**2))), 'residual_rms': float(np.sqrt(np.mean(residual**2))),
-        'residual_median': float(np.sqrt(np.median(np.sum(residual**2, axis=1)))), 'mean_weight': float(np.mean(weights)),
-        'calibration_sd': np.sqrt(np.diag(added)).tolist(), 'motion_sd': np.sqrt(np.diag(cov)).tolist(),
-        'attenuation': float(2 * rows.alpha_noise / np.mean(np.sum(rows.alpha**2, axis=1))), 'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
-        **{name: float(value) for name, value in zip(NUISANCE, values[3:])}}
-    return RelativeArm(arm, total, mat_ab, offset, tuple('determined' if s <= 1e-3 else 'weak' for s in sd), diagnostics)
+        'windows': len(rows.centres), 'window': rows.length, 'clipped_share': rows.clipped_share,
+        'calibrated': all(s.calibration is not None for s in streams), 'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
+        'signal_rms': float(np.sqrt(np.mean(rows.difference**2))), 'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
+        'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))), 'attenuation': float(1 - fit.seen[0].min()),
+        'motion_sd': np.sqrt(np.diag(motion)).tolist(), 'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
+        'rotation_sd': np.sqrt(np.diag(turned)).tolist(), **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])}}
+    return RelativeArm(fit.values[:3], total, rotation.mat_ab, rotation.offset, tuple('determined' if s <= 1e-3 else 'weak' for s in sd), diagnostics)
+
+
+def _require_seen(seen, sd):
+    """Refuse when some direction of the arm shows in the gyroscopes' noise only, or hardly at all."""
+    shares, directions = seen
+    direction = directions[:, np.argmin(shares)]
+    worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
+    if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
+        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} it shows {max(shares.min(), 0):.0%} more than noise; '
+                                 f'twist fast about the axes other than {"xyz"[worst]} too')
 
 
 def _rotation_vector(matrix):
