@@ -159,6 +159,13 @@ def test_another_frame_is_not_corrected_unless_asked():
     assert [d is None for d in mixed] == [False, True] * 3
 
 
+def test_memory_stays_bounded_whatever_frames_come():
+    live, data = LiveCompensation(random_calibration(2)), messages(imu_samples(1))[0]
+    for k in range(100):
+        live(patch_imu(data, frame_id=f'frame_{k}'))
+    assert sum(live.counts.values()) == 100 and len(live.counts) <= 31
+
+
 def test_transfer_turns_orientation_and_its_covariance():
     rotation = Rotation.from_euler('xyz', [0.3, -0.5, 1.0])
     data = patch_imu(messages(imu_samples(1))[0], orientation=rotation.as_quat(), orientation_cov=KNOWN)

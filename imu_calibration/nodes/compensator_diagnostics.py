@@ -1,5 +1,6 @@
 """What compensator_node says about itself."""
 
+import re
 from math import sqrt
 from time import monotonic
 
@@ -20,7 +21,7 @@ KNOWN = {'no temperature yet': 'the calibration has thermal effects and no tempe
 
 
 class CompensatorDiagnostics:
-    """Collects the state of the node; a line that is new is logged once."""
+    """Collects the state of the node; a line that differs from earlier ones in more than its numbers is logged."""
 
     def __init__(self, node):
         self._node, self._logged, self._counts = node, set(), {}
@@ -40,8 +41,9 @@ class CompensatorDiagnostics:
         if self._quiet(compensation):
             notes.append(f'no messages come on {node.input_topic}')
         for line in serious + notes:
-            if line not in self._logged:
-                self._logged.add(line)
+            kind = re.sub(r'[\d.]+', '#', line)
+            if kind not in self._logged:
+                self._logged.add(kind)
                 node.get_logger().warning(line)
         level = ERROR if serious else WARN if notes else OK
         message = '; '.join(serious + notes) or f'corrected with calibration {node.version}'

@@ -18,6 +18,8 @@ STAMP_AT = 4
 HEAD_AT = 12
 """Bytes before the frame_id's length: encapsulation and stamp."""
 NS = 1_000_000_000
+MANY = 30
+"""Reasons that are counted apart at most, so that memory stays bounded whatever comes."""
 NO_SLOPE = (0.0, 0.0, 0.0)
 ABSENT = -1.0
 """First element of the covariance of a quantity that the message does not have."""
@@ -145,7 +147,8 @@ class LiveCompensation:
             return False
         if self.frame_id and layout.names[0] != self.frame_id:
             self._size = -1
-            self._refuse(f"frame_id '{layout.names[0]}'")
+            known = len(self.counts) < MANY or f"frame_id '{layout.names[0]}'" in self.counts
+            self._refuse(f"frame_id '{layout.names[0]}'" if known else 'frame_id of many others')
             return False
         order = layout.order
         self._size, self._order_in, self._body = len(data), data[:2], layout.offsets['orientation'][0]
