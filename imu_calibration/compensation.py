@@ -30,6 +30,8 @@ class Corrected:
     """Angular rate, rad/s, shape (n, 3)."""
     flagged: np.ndarray
     """True where the output cannot be trusted: the input was saturated, or too large for the inversion, shape (n,)."""
+    marks: np.ndarray
+    """Variance of saturated (force, rate): the square of the range, since the true value is not known better; else 0. Shape (n, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +105,11 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
         true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
     beyond = left > CONVERGED
     true_force[beyond] = true_rate[beyond] = np.nan
-    flagged = saturated(calibration, force_s, rate_s) | beyond
+    marks = saturation_marks(calibration, force_s, rate_s)
+    flagged = marks.any(axis=1) | beyond
     if transfer is None:
-        return Corrected(true_force, true_rate, flagged)
-    return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged)
+        return Corrected(true_force, true_rate, flagged, marks)
+    return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged, marks)
 
 
 def needs_temperature(model):
@@ -139,13 +142,20 @@ def moved(transfer, force_s, rate_s, alpha_s):
     return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
 
 
-def saturated(calibration, force_s, rate_s):
-    """Return a mask of samples at or beyond a saturation level of the calibration."""
-    mask = np.zeros(len(force_s), bool)
-    for sensor, name, measured in (('accelerometer', 'accel_saturation', force_s), ('gyroscope', 'gyro_saturation', rate_s)):
-        if calibration.has(sensor, name):
-            mask |= np.any(np.abs(measured) >= float(calibration.value(sensor, name)) * (1 - 1e-6), axis=1)
-    return mask
+def saturation_level(calibration, sensor):
+    """Return the reading from which a sensor counts as saturated, infinite without a saturation in the calibration."""
+    name = {'accelerometer': 'accel_saturation', 'gyroscope': 'gyro_saturation'}[sensor]
+    return float(calibration.value(sensor, name)) * (1 - 1e-6) if calibration.has(sensor, name) else np.inf
+
+
+def saturation_marks(calibration, force_s, rate_s):
+    """Return the square of the saturation level where a component of (force, rate) reaches it, else 0; shape (n, 2)."""
+    marks = np.zeros((len(force_s), 2))
+    for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
+        level = saturation_level(calibration, sensor)
+        if np.isfinite(level):
+            marks[np.any(np.abs(measured) >= level, axis=1), k] = level**2
+    return marks
 
 
 def arms_of(calibration):

@@ -39,13 +39,21 @@ class CompensationStream:
         self._fastest, self._temperatures, self._last = 0.0, [], ()
 
     def correct(self, imu):
-        """Return `Corrected` for the next block of ImuSamples; what is not finite stays so and leaves its neighbours alone."""
+        """
+        Return `Corrected` for the next block of ImuSamples.
+
+        What is NaN, absent in the message or broken, stays NaN and leaves its neighbours and the other sensor alone.
+        """
         self._settle(imu)
         temperature = self._temperature_at(imu.stamp_ns)
         finite = np.isfinite(imu.rate_s).all(axis=1)
         slope = np.zeros_like(imu.rate_s)
         slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
-        corrected = compensate(self.calibration, imu.force_s, imu.rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
+        force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.value(sensor, 'bias'))
+                           for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
+        corrected = compensate(self.calibration, force_s, rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
+        corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
+        corrected.rate[~finite] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
         if finite.any():

@@ -31,7 +31,8 @@ def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct
     imu_topic, corrected_topic : str
         Topic to correct, and name of the new one.
     correct : callable
-        ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in the order of the file.
+        ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in the order of the file; and
+        with `marks` (n, 2), variances that take the place of the covariances of (force, rate) where they are not zero.
     propagate : callable, optional
         Asked after each block for each distinct pair of covariances: measured (force, rate), each (3, 3) or None when unknown ->
         corrected (force, rate).
@@ -114,7 +115,7 @@ class _Patch:
         messages = [None] * len(done)
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
-            fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]))
+            fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), corrected.marks[place])
             table = patch_imu_group(layout, group, fields, self.frame_id)
             if self.late_ns:
                 _set_stamps(table, layout.order, layout.stamp_ns(group) - self.late_ns)
@@ -122,7 +123,7 @@ class _Patch:
                 messages[k] = message
         return done, messages
 
-    def _fields(self, layout, packed, vectors):
+    def _fields(self, layout, packed, vectors, marks):
         """Return the new fields of one group: field name -> values."""
         measured = [layout.column(packed, f'{quantity}_cov') for quantity in ('force', 'rate')]
         absent = [covariance[:, :1] == -1.0 for covariance in measured]
@@ -131,7 +132,9 @@ class _Patch:
             fields[f'{quantity}_s'] = np.where(missing, layout.column(packed, f'{quantity}_s'), values)
         if self.propagate is not None:
             covariances = _propagated(self.propagate, np.concatenate(measured, axis=1))
-            for quantity, before, after, missing in zip(('force', 'rate'), measured, np.split(covariances, 2, axis=1), absent, strict=True):
+            for k, (quantity, before, missing) in enumerate(zip(('force', 'rate'), measured, absent, strict=True)):
+                mark = marks[:, k:k + 1]
+                after = np.where(mark > 0, mark * np.eye(3).ravel(), covariances[:, 9 * k:9 * k + 9])
                 fields[f'{quantity}_cov'] = np.where(missing, before, after)
         if self.mat_st is not None:
             orientation_cov = layout.column(packed, 'orientation_cov')

@@ -17,12 +17,16 @@ def raw_messages(path, topic):
         return [(stamp, bytes(data)) for c, stamp, data in reader.messages(reader.topics[topic].connections)]
 
 
+def corrected_samples(force, rate):
+    return SimpleNamespace(force=force, rate=rate, marks=np.zeros((len(force), 2)))
+
+
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_everything_else_is_copied_to_the_last_bit(tmp_path, storage):
     imu, joints, temperature = make_session()
     write_session(tmp_path / 'a', imu, joints, temperature, storage=storage)
     lost = copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/imu/data_corrected',
-                               lambda samples: SimpleNamespace(force=2.0 * samples.force_s, rate=samples.rate_s - 1.0))
+                               lambda samples: corrected_samples(2.0 * samples.force_s, samples.rate_s - 1.0))
     assert lost == {}
     for topic in ('/imu/data_raw', '/joint_states', '/imu/temperature'):
         assert raw_messages(tmp_path / 'a', topic) == raw_messages(tmp_path / 'b', topic)
@@ -44,7 +48,7 @@ def test_covariances_and_frame_follow_the_message_definition(tmp_path, frame_id)
 
     def propagate(*measured):
         return [noise if cov is None else gain @ cov @ gain.T for cov in measured]
-    copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/c', lambda s: SimpleNamespace(force=s.force_s, rate=s.rate_s),
+    copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/c', lambda s: corrected_samples(s.force_s, s.rate_s),
                         propagate=propagate, frame_id=frame_id, mat_ts=turn)
     message = parse_imu(raw_messages(tmp_path / 'b', '/c')[7][1])
     assert message.frame_id == (frame_id or 'imu_link')

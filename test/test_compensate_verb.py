@@ -88,6 +88,32 @@ def test_readings_at_another_point_and_frame_of_the_body(tmp_path):
     assert without_arm > 0.5
 
 
+def test_a_gyroscope_that_is_absent_does_not_spoil_the_accelerometer(tmp_path):
+    calibration = write_case(tmp_path, 'usual')
+    stamps, force, _, _, _ = true_motion()
+    readings = force @ calibration.value('accelerometer', 'matrix').T + calibration.value('accelerometer', 'bias')
+    absent = np.diag([-1.0, 0.0, 0.0])
+    write_session(tmp_path / 'half', ImuSamples(stamps, readings, np.full((N, 3), np.nan), 'imu_link'), rate_cov=absent)
+    assert compensate(tmp_path, bag='half') == 0
+    parsed = [parse_imu(data) for _, data in raw_messages(tmp_path / 'out', '/imu/data_corrected')]
+    got = np.array([message.doubles for message in parsed])
+    np.testing.assert_allclose(got[:, FIELDS['force_s']], force, atol=1e-12)
+    assert np.isnan(got[:, FIELDS['rate_s']]).all() and np.all(got[:, FIELDS['rate_cov']] == absent.ravel())
+
+
+def test_saturated_readings_are_marked_in_the_bag(tmp_path):
+    calibration = write_case(tmp_path, 'usual')
+    limited = replace(calibration, model=calibration.model.with_effect('gyroscope', 'gyro_saturation'),
+                      values=np.append(calibration.values, 0.9), covariance=np.pad(calibration.covariance, (0, 1)),
+                      status=calibration.status + ('determined',))
+    tmp_path.joinpath('calibration.yaml').write_text(calibration_to_text(limited))
+    assert compensate(tmp_path) == 0
+    pairs = zip(raw_messages(tmp_path / 'bag', '/imu/data_raw'), raw_messages(tmp_path / 'out', '/imu/data_corrected'), strict=True)
+    for (_, raw), (_, corrected) in pairs:
+        saturated = np.abs(parse_imu(raw).doubles[FIELDS['rate_s']]).max() >= 0.9 * (1 - 1e-6)
+        assert (parse_imu(corrected).doubles[FIELDS['rate_cov']][0] == pytest.approx(0.81, rel=1e-5)) == saturated
+
+
 def test_stamps_move_only_when_asked(tmp_path):
     calibration = write_case(tmp_path, 'usual')
     late = replace(calibration, model=calibration.model.with_effect('reference', 'time_offset'), values=np.append(calibration.values, 3e-3),

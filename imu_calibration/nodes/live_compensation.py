@@ -5,7 +5,7 @@ from collections import Counter
 
 import numpy as np
 
-from imu_calibration.compensation import arms_of, invertible, needs_temperature
+from imu_calibration.compensation import arms_of, invertible, needs_temperature, saturation_level
 from imu_calibration.compensation_covariance import Uncertainty
 from imu_calibration.compensation_kernel import make_kernel
 from imu_calibration.compensation_stream import derivative_for, late_ns
@@ -57,7 +57,7 @@ class LiveCompensation:
         self.needs_slope = bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
         self._kernel = make_kernel(calibration, transfer)
         self._zero = {s: calibration.value(s, 'bias').tolist() for s in ('accelerometer', 'gyroscope')}
-        self._levels = _level(calibration, 'accelerometer', 'accel_saturation'), _level(calibration, 'gyroscope', 'gyro_saturation')
+        self._levels = tuple(saturation_level(calibration, sensor) for sensor in ('accelerometer', 'gyroscope'))
         self._can_saturate = any(np.isfinite(self._levels))
         self._late_ns = late_ns(calibration, correct_stamps)
         self._head_in, self._size = None, -1
@@ -242,11 +242,6 @@ class LiveCompensation:
             from scipy.spatial.transform import Rotation
             self._quaternion_st = tuple(Rotation.from_matrix(self.transfer.mat_ts.T).as_quat().tolist())
         self.refresh()
-
-
-def _level(calibration, sensor, name):
-    """Return the reading from which a sensor counts as saturated, infinite without a saturation."""
-    return float(calibration.value(sensor, name)) * (1 - 1e-6) if calibration.has(sensor, name) else float('inf')
 
 
 def _product(p, q):
