@@ -182,6 +182,7 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
         if model not in (None, 'bias+matrix', 'axial', 'rate'):
             raise InputError(f"calibration by hand estimates bias+matrix, '{model}' was asked for; give --table for more")
     calibration, hand, gathered, tolerances = calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance)
+    _check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     calibration = replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity})
     return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances, options)
 
@@ -290,12 +291,16 @@ def check_units(gathered, model):
     static = [row for row in rows if row.kind == 'static']
     if static:
         length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
-        if 0.8 < length < 1.25:
-            raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
-                             f'give --nominal with accelerometer_scale {1 / G:.6f}')
-        if not 3.0 < length < 30.0:
-            raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')
+        _check_force(length)
     _check_rates([row for row in rows if row.kind != 'static'], gathered, model)
+
+
+def _check_force(length):
+    if 0.8 < length < 1.25:
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
+                         f'give --nominal with accelerometer_scale {1 / G:.6f}')
+    if not 3.0 < length < 30.0:
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')
 
 
 def _check_rates(moving, gathered, model):

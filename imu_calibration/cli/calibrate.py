@@ -30,11 +30,15 @@ def run(options):
     """Calibrate, write, print the verdict."""
     settings = recordings.calibration_options(options)
     table = files.read_table(options.table) if options.table else None
-    names = None if table is None else table.joint_names
-    jobs = jobs_for(options.jobs, len(options.bags))
     for bag in options.bags:
         recordings.open_bag(bag, options, want_joints=table is not None).close()
-    folder = files.make_folder(options.output)
+    with files.output_folder(options.output) as folder:
+        return _into(folder, options, settings, table)
+
+
+def _into(folder, options, settings, table):
+    """Calibrate into a folder that can be written, print, return the exit code."""
+    names, jobs = None if table is None else table.joint_names, jobs_for(options.jobs, len(options.bags))
     sources = [recordings.source_of(bag, options, names, table is not None, quiet=jobs > 1) for bag in options.bags]
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
         provenance = hashing.submit(recordings.provenance_of, options.bags, options)

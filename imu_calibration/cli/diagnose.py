@@ -25,27 +25,22 @@ def run(options):
     """Diagnose, write, print the findings."""
     settings = recordings.calibration_options(options)
     table = files.read_table(options.table)
-    folder = files.make_folder(options.output)
+    with files.output_folder(options.output) as folder:
+        return _into(folder, options, settings, table)
+
+
+def _into(folder, options, settings, table):
+    """Diagnose into a folder that can be written, print, return the exit code."""
     source = recordings.source_of(options.bag, options, table.joint_names)
-    with progress_bar('diagnose', 1000, 'parts') as advance:
-        result = diagnose_recording(source(), table, settings, recordings.provenance_of([options.bag], options), _steps(advance))
+    with progress_bar('diagnose', 100, '%') as advance:
+        result = workflow.diagnose_recording(source, table, settings, recordings.provenance_of([options.bag], options), advance)
     from imu_calibration.report import diagnosis_report
-    files.write_text(folder / 'report.html', diagnosis_report(result))
-    files.write_text(folder / 'calibration.yaml', documents.calibration_to_text(result.calibration))
+    page = diagnosis_report(result)
     files.write_text(folder / 'diagnosis.json', json.dumps(result.document, indent=1) + '\n')
+    files.write_text(folder / 'report.html', page)
+    files.write_text(folder / 'calibration.yaml', documents.calibration_to_text(result.calibration))
     out = console()
     for line in result.lines:
         out.print(line, soft_wrap=True)
     out.print(f'written: diagnosis.json, calibration.yaml and report.html in {folder}', soft_wrap=True)
     return workflow.exit_code(result)
-
-
-def _steps(advance):
-    """Turn shares that are done into steps of a thousand."""
-    done = [0]
-
-    def progress(share):
-        now = int(1000 * share)
-        advance(max(now - done[0], 0))
-        done[0] = max(now, done[0])
-    return progress

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from contextlib import contextmanager
 from pathlib import Path
 
 from imu_calibration import documents
@@ -46,6 +47,21 @@ def make_folder(path):
     except OSError as error:
         raise InputError(f'the output folder {folder} must be writable: {error.strerror}; choose another one') from error
     return folder
+
+
+@contextmanager
+def output_folder(path):
+    """Give the output folder; when the work is refused, folders that were made for it are taken away again."""
+    missing = [folder for folder in (Path(path), *Path(path).parents) if not folder.exists()]
+    folder = make_folder(path)
+    try:
+        yield folder
+    except BaseException:
+        for made in missing:
+            if not made.is_dir() or any(made.iterdir()):
+                break
+            made.rmdir()
+        raise
 
 
 def write_text(path, text):

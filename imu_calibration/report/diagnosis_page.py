@@ -10,7 +10,7 @@ from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.residuals import UNIT
 from imu_calibration.units import for_people
 
-BINS = 24
+BINS = 16
 CLEAR = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
@@ -44,7 +44,7 @@ def _headline(diagnosis, rests):
 
 
 def _reasons(diagnosis, rests):
-    lines = [(finding.explanation, 'the extended calibration.yaml contains it' if not finding.indistinguishable_from else
+    lines = [(in_type(finding.explanation), 'the extended calibration.yaml contains it' if not finding.indistinguishable_from else
               f'this recording cannot tell it from {", ".join(n.replace("_", " ") for n in finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
              for finding in diagnosis.findings]
     if not lines and not rests:
@@ -78,7 +78,7 @@ def _reduction(gain):
 def _finding(diagnosis, finding, number):
     rows = [{'name': name, 'cells': people(value, sd, unit), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'} for name, (value, sd, unit) in finding.parameters.items()]
     gain = finding.gain
-    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': finding.explanation, 'rows': rows, 'p': text(finding.p_value, 2),
+    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows, 'p': chance(finding.p_value),
             'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain),
             'sensor': gain.sensor, 'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from], 'motion': finding.separating_motion,
             'figure': draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), f'Residual against the cause, before and after: {finding.effect}')}
@@ -141,7 +141,7 @@ class _AgainstCause:
         left, right = figure.subplots(1, 2, sharey=True)
         some = slice(None, None, max(1, len(values) // 2500))
         for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
-            axes.plot(values[some], residual[some], '.', color=colour, markersize=3, alpha=0.45, mew=0, rasterized=False)
+            axes.plot(values[some], residual[some], '.', color=colour, markersize=4, alpha=0.5, mew=0)
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_title(f'{title}: rms {text(float(np.sqrt(np.mean(residual**2))))} {unit}')
             axes.set_xlabel(label)
@@ -154,12 +154,12 @@ class _AgainstCause:
 
 
 def _curve(values, signal):
-    """Return means of the fitted signal over bins of the cause."""
-    edges = np.quantile(values, np.linspace(0, 1, 2 * BINS + 1)[1:-1])
+    """Return means of the fitted signal over bins of equal width of the cause, where a bin holds enough to have a mean."""
+    edges = np.linspace(values.min(), values.max(), BINS + 1)[1:-1]
     index = np.searchsorted(edges, values)
-    count = np.bincount(index, minlength=2 * BINS)
-    filled = count > 0
-    return (np.bincount(index, values, 2 * BINS)[filled] / count[filled], np.bincount(index, signal, 2 * BINS)[filled] / count[filled])
+    count = np.bincount(index, minlength=BINS)
+    filled = count >= max(3, 0.002 * len(values))
+    return tuple(np.bincount(index, column, BINS)[filled] / count[filled] for column in (values, signal))
 
 
 class _OverTime:
@@ -182,9 +182,19 @@ class _OverTime:
 
 
 def _candidate(row):
-    return {'effect': row.effect.replace('_', ' '), 'sensor': row.sensor, 'gain': text(row.gain_alone), 'p': text(row.p_value_alone, 2),
-            'beside': text(row.gain_beside) if row.gain_beside is not None else '', 'p_beside': text(row.p_value_beside, 2) if row.p_value_beside is not None else '',
+    return {'effect': row.effect.replace('_', ' '), 'sensor': row.sensor, 'gain': text(row.gain_alone), 'p': chance(row.p_value_alone),
+            'beside': text(row.gain_beside) if row.gain_beside is not None else '', 'p_beside': chance(row.p_value_beside) if row.p_value_beside is not None else '',
             'verdict': row.verdict, 'mark': row.verdict == 'found'}
+
+
+def chance(probability):
+    """Return a probability as text; what underflows is not nothing."""
+    return text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
+
+
+def in_type(sentence):
+    """Return a sentence with printed signs."""
+    return sentence.replace(' +- ', ' ± ').replace(' -', ' −').replace('^2', '²').replace('^3', '³')
 
 
 def _rest(sensor, rest):
