@@ -31,7 +31,7 @@ class StreamWatch:
         self._newest = {}
         self._arrived = {}
         self._period = {}
-        self._lost, self._lost_at, self._recent = {}, None, {}
+        self._lost, self._lost_at, self._recent, self._apart_since = {}, None, {}, None
 
     @property
     def last_arrival(self):
@@ -63,6 +63,14 @@ class StreamWatch:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
+    def _apart_for(self, lead, now):
+        """Return for how long the stamps of the streams have been apart, s; a fast replay sets them apart for moments."""
+        if abs(lead) <= SILENT_AFTER:
+            self._apart_since = None
+            return 0.0
+        self._apart_since = now if self._apart_since is None else self._apart_since
+        return now - self._apart_since
+
     def state(self, now):
         """Return the StreamState at `now`."""
         values = {f'{name} messages': count for name, count in self._count.items()}
@@ -75,7 +83,7 @@ class StreamWatch:
             missing = {'imu': 'Imu messages do not come (imu/data_raw)', 'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
             return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9
-        if abs(lead) > SILENT_AFTER:
+        if self._apart_for(lead, now) > SILENT_AFTER:
             ahead = 'ahead of' if lead > 0 else 'behind'
             return StreamState(TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {ahead} the joint stamps; bring the clocks together', values)
         if self._lost_at is not None and now - self._lost_at < RECENT:

@@ -8,8 +8,9 @@ import pytest
 from imu_calibration import accumulator_state, workflow
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.live_calibration import LiveCalibration, LiveSettings, SolvePacer
+from imu_calibration.live_streams import StreamWatch
 from imu_calibration.profiles import make_profile
-from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.sensor_model import SensorModel
 from imu_calibration.simulation import SimulationOptions, random_values, simulate
 from imu_calibration.turntable import Table
@@ -226,3 +227,29 @@ def test_solving_takes_no_more_than_its_share():
     assert pacer.due(0.0)
     pacer.note(0.0, 2.0)
     assert not pacer.due(19.9) and pacer.due(20.0)
+
+
+def stream_block(n_imu, n_joints, start=0.0):
+    """A block with so many samples at 100 Hz from `start` s on."""
+    imu = ImuSamples(((start + np.arange(n_imu) / 100) * 1e9).astype(np.int64), np.zeros((n_imu, 3)), np.zeros((n_imu, 3)))
+    joints = JointSamples(((start + np.arange(n_joints) / 100) * 1e9).astype(np.int64), np.zeros((n_joints, 3)), np.zeros((n_joints, 3)))
+    return SampleBlock(imu, joints)
+
+
+def test_streams_are_watched_by_silence_stamps_and_losses():
+    watch = StreamWatch()
+    assert watch.state(0.0).word == 'silent'
+    watch.note(stream_block(100, 0), 0.0)
+    assert 'JointState messages do not come' in watch.state(1.0).message
+    watch.note(stream_block(100, 100), 1.0)
+    state = watch.state(1.0)
+    assert state.word == 'good' and state.values['imu rate [Hz]'] == '100.0'
+    watch.note_counts({'imu not finite': 3, 'static': 50}, 1.5)
+    assert watch.state(1.6).word == 'trouble' and '3 imu not finite' in watch.state(1.6).message
+    watch.note(stream_block(100, 100, 5.0), 12.0)
+    assert watch.state(12.0).word == 'good'
+    watch.note(SampleBlock(imu=stream_block(100, 0, 30.0).imu, joints=stream_block(0, 100, 6.0).joints), 13.0)
+    assert watch.state(13.0).word == 'good'   # for a moment
+    watch.note(SampleBlock(imu=stream_block(100, 0, 32.0).imu, joints=stream_block(0, 100, 8.0).joints), 15.5)
+    assert 'ahead of the joint stamps' in watch.state(15.5).message
+    assert watch.state(30.0).word == 'silent'

@@ -13,6 +13,7 @@ from msg_adapters.write import write_session
 
 pytest.importorskip('rclpy')
 from live_station import Publisher, Station  # noqa: E402
+from soak import LIMIT_MB, soak  # noqa: E402
 
 pytestmark = pytest.mark.dds
 SIGMA = 5.0
@@ -209,3 +210,10 @@ def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(stat
     station.until(lambda: received(station) == [len(imu), len(joints)], 'every message to arrive', patience=20.0)
     assert station.figure('windows') > 0
     assert station.processes.end(node) == 0
+
+
+def test_ten_minutes_of_data_leave_no_memory_behind(tmp_path):
+    found = soak(600.0, 20.0, tmp_path, 100.0, 50.0)
+    for name, (middle, last, n_imu) in found.items():
+        assert last - middle <= LIMIT_MB, f'{name} grew from {middle:.1f} to {last:.1f} MB'
+        assert n_imu > 10_000

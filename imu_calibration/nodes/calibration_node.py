@@ -28,6 +28,8 @@ from msg_adapters.live import LiveGatherer
 
 INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
+MOST_WAITING = 200_000
+"""Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
 COMPLAINT_PERIOD = 10.0
 """Seconds between two warnings."""
 
@@ -63,7 +65,7 @@ class CalibrationNode(Node):
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
         self._table = self._read_table()
-        self._gatherer = LiveGatherer(self._table.joint_names, frame_id=self.settings.frame_id)
+        self._gatherer = LiveGatherer(self._table.joint_names, MOST_WAITING, self.settings.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self.worker = CalibrationWorker(self._gatherer, self._make_live, self.settings.save_file, self.settings.autosave_period,
