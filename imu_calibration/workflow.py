@@ -403,6 +403,7 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
         Returns an iterator of SampleBlock, twice.
     table : Table
     options : CalibrationOptions
+        The model to start from; where nothing is asked for, bias and matrix alone, so that everything else has to prove itself.
     provenance : dict, optional
     progress : callable, optional
         Called with the percent done since the last call.
@@ -412,6 +413,7 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     DiagnosisResult
 
     """
+    options = replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
     baseline = calibrate([source], table, options, provenance)
     windows = collect_windows(source(), table, options)
     diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)

@@ -6,7 +6,6 @@ from imu_calibration import documents, workflow
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console
-from imu_calibration.diagnosing import diagnose_recording
 
 NAME = 'diagnose'
 HELP = 'Show what the model gets wrong, name the cause, extend the model, and measure the gain on data that were not fitted.'
