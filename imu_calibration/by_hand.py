@@ -39,12 +39,15 @@ class ByHandSettings:
     gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
                          'too large: rotation is lost in holes and shows as turn scatter')
     pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
-    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it', (0.0, 1.0), '')
+    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it',
+                                   (0.0, 1.0), '')
     turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
-    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0), 'too small: scales too sure')
+    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0),
+                                   'too small: scales too sure')
     known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
                                    'too small: misalignments too sure')
-    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it", symptom="off: it shows as drift and turn scatter")
+    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it",
+                                 symptom="off: it shows as drift and turn scatter")
 
 
 @dataclass(frozen=True)
@@ -164,11 +167,13 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     poses, noise = average_poses(imu, _as_ranges(imu, stills))
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:
-        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all '
-                                 f'parameters), got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
+        raise NotObservableError(
+            f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
+            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
     turns, dropped = collect_turns(time, imu, poses, noise, settings)
     turns += [known_turn_data(time, imu, turn, noise, settings) for turn in known_turns]
-    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, {'attitudes': attitudes, 'turns_dropped': dropped, **noise}, tolerances)
+    statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise}
+    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances)
 
 
 def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None):
@@ -242,6 +247,6 @@ def _as_ranges(imu, stills):
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
     ranges = [(a, b) for a, b in ranges if b - a >= 2]
     if not ranges:
-        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, got no interval at rest; '
-                                 'hold the IMU still for a second or more in each attitude')
+        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
+                                 'got no interval at rest; hold the IMU still for a second or more in each attitude')
     return ranges

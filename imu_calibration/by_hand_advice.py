@@ -35,7 +35,8 @@ def missing_motion(factor, values, statuses, param_names, modelled, priors, tole
 
     """
     advice, sure = [], np.where(modelled, priors, 1e-9 * priors)
-    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)), (slice(GYRO_BIAS.start, GYRO_MATRIX.stop), _turn_candidates(values, turn_sd)))
+    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)),
+              (slice(GYRO_BIAS.start, GYRO_MATRIX.stop), _turn_candidates(turn_sd)))
     for group, candidates in groups:
         index = np.arange(N_PARAMS)[group][modelled[group]]
         lacking = [k for k in index if statuses[k] != 'determined']
@@ -69,7 +70,7 @@ def _direction(up):
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
-def _turn_candidates(values, sd):
+def _turn_candidates(sd):
     """Half turns about each axis held level, gravity first along either of the other two."""
     for axis, first in itertools.permutations(range(3), 2):
         about, up = np.eye(3)[axis], np.eye(3)[first]
@@ -77,7 +78,8 @@ def _turn_candidates(values, sd):
         across = np.array([about, np.cross(about, up)])
         rows = np.zeros((2, N_PARAMS))
         rows[:, GYRO_MATRIX] = (across @ skew(carried) @ _psi_by_matrix(about)).reshape(2, 9)
-        yield rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, still before and after'
+        yield rows / sd, (f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
+                          'still before and after')
 
 
 def _psi_by_matrix(about, angle=np.pi):

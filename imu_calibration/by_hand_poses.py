@@ -85,7 +85,8 @@ def known_turn_data(time, imu, turn, noise, settings):
     cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
     piece = slice(turn.start, turn.stop)
     density = np.mean(np.square(noise['rate_noise_sd'])) * noise['period']
-    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=density * (time[piece][-1] - time[piece][0]), rotation=turn.angle * axis,
+    noise_variance = density * (time[piece][-1] - time[piece][0])
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
                     rotation_cov=cov)
 
 

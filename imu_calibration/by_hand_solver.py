@@ -55,7 +55,8 @@ def solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback):
 
     """
     memory = {}
-    state, scatter, steps = _iterate(_first_state(poses, gravity, priors), poses, turns, gravity, modelled, priors, fallback, fallback, memory)
+    state = _first_state(poses, gravity, priors)
+    state, scatter, steps = _iterate(state, poses, turns, gravity, modelled, priors, fallback, fallback, memory)
     held = np.zeros(N_PARAMS, bool)
     held[modelled] = choose_held(_factor(state, poses, turns, gravity, scatter, memory)[:, modelled], priors[modelled])
     state = State(np.where(held, NOMINAL, state.values), state.up, state.drift)

@@ -157,7 +157,8 @@ def build_system(state, poses, turns, gravity, memory=None):
     memory = {} if memory is None else memory
     across = tangent(state.up)
     rows = [_pose_rows(state, poses, gravity, across), _drift_rows(state, poses, gravity), _calm_rows(state, poses)]
-    rows += [_gravity_turn_rows(state, t, k, memory, across) if t.rotation is None else _known_turn_rows(state, t) for k, t in enumerate(turns)]
+    for key, turn in enumerate(turns):
+        rows.append(_gravity_turn_rows(state, turn, key, memory, across) if turn.rotation is None else _known_turn_rows(state, turn))
     return System(*(np.concatenate(parts) for parts in zip(*rows)))
 
 

@@ -17,6 +17,8 @@ NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
 """Differences of the accelerometers' biases and stamps, and the gyroscopes' lateness against the accelerometers."""
 ARM_PRIOR = 1.0
 """m; an arm whose sd exceeds half of it counts as not seen."""
+ARM_TOLERANCE = 1e-3
+"""m; the sd that is good enough."""
 UNCALIBRATED_SCALE_SD = 0.03
 """Scale and misalignment of a consumer gyroscope that no poses calibrated."""
 DELAY_ROUNDS = 5
@@ -31,9 +33,10 @@ class ArmSettings:
 
     window: float = setting(0.12, 's', 'length of the windows over which the motion is integrated; never below eight samples', (0.004, 5.0),
                             'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
-    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out', (0.0, 0.9),
-                                  'too small: resting windows rule the noise estimate')
-    cluster: float = setting(2.0, 's', 'errors are taken as independent between stretches of this length', (0.1, 100.0), 'too small: sd too small')
+    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
+                                  (0.0, 0.9), 'too small: resting windows rule the noise estimate')
+    cluster: float = setting(2.0, 's', 'errors are taken as independent between stretches of this length', (0.1, 100.0),
+                             'too small: sd too small')
     gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
 
 
@@ -64,8 +67,9 @@ class RelativeArm:
         d = self.diagnostics
         turn = np.degrees(np.linalg.norm(_rotation_vector(self.mat_ab)))
         yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
-        yield (f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out as clipped; '
-               f'the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} down to {d["residual_rms"]:.2f} m/s^2')
+        yield (f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
+               f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
+               f'down to {d["residual_rms"]:.2f} m/s^2')
         if not d['calibrated']:
             yield 'no poses at rest to calibrate the two IMUs with: scale errors of a consumer gyroscope are in the sd'
         for axis, status in zip('xyz', self.statuses):
@@ -176,7 +180,8 @@ def _require_overlap(imu_a, imu_b):
         raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics')
     overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
     if overlap <= 0:
-        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; check the clocks')
+        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; '
+                         'check the clocks')
 
 
 def _length(a, b, settings):
@@ -308,12 +313,14 @@ def _result(rows, fit, delay, rotation, streams, settings):
     _require_seen(fit.seen, sd)
     diagnostics = {
         'windows': len(rows.centres), 'window': rows.length, 'clipped_share': rows.clipped_share,
-        'calibrated': all(s.calibration is not None for s in streams), 'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
+        'calibrated': all(s.calibration is not None for s in streams),
+        'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
         'signal_rms': float(np.sqrt(np.mean(rows.difference**2))), 'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
         'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))), 'attenuation': float(1 - fit.seen[0].min()),
         'motion_sd': np.sqrt(np.diag(motion)).tolist(), 'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
         'rotation_sd': np.sqrt(np.diag(turned)).tolist(), **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])}}
-    return RelativeArm(fit.values[:3], total, rotation.mat_ab, rotation.offset, tuple('determined' if s <= 1e-3 else 'weak' for s in sd), diagnostics)
+    statuses = tuple('determined' if s <= ARM_TOLERANCE else 'weak' for s in sd)
+    return RelativeArm(fit.values[:3], total, rotation.mat_ab, rotation.offset, statuses, diagnostics)
 
 
 def _require_seen(seen, sd):
@@ -322,8 +329,8 @@ def _require_seen(seen, sd):
     direction = directions[:, np.argmin(shares)]
     worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
-        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} it shows {max(shares.min(), 0):.0%} more than noise; '
-                                 f'twist fast about the axes other than {"xyz"[worst]} too')
+        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
+                                 f'it shows is not noise and the sd is {np.max(sd):.2g} m; twist fast about the axes other than {"xyz"[worst]} too')
 
 
 def _rotation_vector(matrix):

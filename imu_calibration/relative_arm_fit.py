@@ -97,7 +97,8 @@ def fit_arm(rows):
     lever, lever_slope = lever_rows(rows.alpha, rows.products), lever_rows(rows.jerk, rows.products_slope)
     count, arm = len(lever), np.zeros(3)
     for number in range(3):  # the delay column needs the arm
-        design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), -rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]], axis=2)
+        clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
+        design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), *clocks], axis=2)
         used = design if number else design[:, :, :-1]
         values, weights, bend, excess = _robust_fit(used, rows.difference, rows.alpha_noise)
         arm = values[:3]
@@ -105,7 +106,8 @@ def fit_arm(rows):
     try:
         seen = scipy.linalg.eigh(_reduced(normal), _reduced(raw))
     except np.linalg.LinAlgError as error:
-        raise NotObservableError('the motion must show the whole arm, it leaves a direction without any sign; twist fast about all axes') from error
+        raise NotObservableError('the motion must show the whole arm, it leaves a direction without any sign; '
+                                 'twist fast about all axes') from error
     partial = Fit(values, design, rows.difference - design @ values, weights, bend, normal, seen)
     hessian = partial.curvature(slice(None)) + (normal - raw)
     return replace(partial, hessian=hessian)

@@ -35,8 +35,8 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     Integrate ``rate = matrix^-1 (measured - bias - sensitivity @ force)`` over one stretch of samples.
 
     The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12 (w1' - w0') + h^2/12 w0 x w1``
-    with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by a prefix product, log2(n) passes
-    over the samples.
+    with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by
+    a prefix product, log2(n) passes over the samples.
 
     Parameters
     ----------
@@ -65,7 +65,8 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     slope = slopes[1][:, None] * rate
     slope[1:] += slopes[0][1:, None] * rate[:-1]
     slope[:-1] += slopes[2][:-1, None] * rate[1:]
-    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * (np.cross(first, second) - np.diff(slope, axis=0))
+    bend = np.cross(first, second) - np.diff(slope, axis=0)
+    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * bend
     forward = _prefix_product(_quaternion(vectors))
     mat_ki = _matrix_to_sensor(forward)
     to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)

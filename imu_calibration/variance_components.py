@@ -70,7 +70,8 @@ def estimate_scatter(design, residual, noise, group, start, fallback):
     """
     count = len(start)
     member = np.array([group == c for c in range(count)], float)
-    large = 100 * (np.asarray(fallback, float) + (member @ noise) / np.maximum(member.sum(1), 1))  # where only the layout of the rows counts
+    # at a large scatter only the layout of the rows counts: can they tell it at all?
+    large = 100 * (np.asarray(fallback, float) + (member @ noise) / np.maximum(member.sum(1), 1))
     free = _evaluate(design, residual, noise, group, member, large)[2] >= DOF_LEAST
     current = np.where(free, start, fallback)
     for _ in range(STEPS):

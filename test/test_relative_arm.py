@@ -28,14 +28,15 @@ def motion(time, rng, axes=(1, 1, 1), size=15.0):
     return rate, alpha, force
 
 
-def pair(seed, period=0.016, period_b=None, duration=60.0, late=0.0, turn=(0, 0, 0), force_sd=0.0, rate_sd=0.0, limit=None, axes=(1, 1, 1), jitter=0.0):
+def pair(seed, period=0.016, period_b=None, duration=60.0, late=0.0, turn=(0, 0, 0), force_sd=0.0, rate_sd=0.0, limit=None,
+         axes=(1, 1, 1)):
     """Two IMUs on one body, twisted; B is turned by the rotation vector `turn` and its stamps are `late`."""
     rng = np.random.default_rng(seed)
     phases = rng.integers(2**31)
     mat_ab = Rotation.from_rotvec(turn).as_matrix()
     imus = []
     for which, step in (('a', period), ('b', period_b or period)):
-        time = step * np.arange(int(duration / step)) + (rng.uniform(-jitter, jitter, int(duration / step)) * step if jitter else 0.0)
+        time = step * np.arange(int(duration / step))
         rate, alpha, force = motion(time - (late if which == 'b' else 0.0), np.random.default_rng(phases), axes)
         if which == 'b':
             force = (force + np.einsum('nij,j->ni', lever_matrix(rate, alpha), ARM)) @ mat_ab
