@@ -159,7 +159,7 @@ def test_launch_files_name_executables_and_config_files_that_exist(path):
     ast.parse(text)
     nodes = set(re.findall(r'\b(\w+_node)\b', text))
     assert nodes and nodes <= EXECUTABLES
-    files = set(re.findall(r"'(\w+\.yaml)'", text)) | ({f'{node}.yaml' for node in nodes} if "{name}.yaml" in text else set())
+    files = set(re.findall(r"CONFIG, '(\w+\.yaml)'", text)) | ({f'{node}.yaml' for node in nodes} if "{name}.yaml" in text else set())
     assert files and all((ROOT / 'config' / name).is_file() for name in files)
 
 
