@@ -76,7 +76,7 @@ def split(matrix):
 def angles_of(axes):
     """Return the angle between each unit vector and each coordinate axis, rad; exact for small angles too, shape (n, 3)."""
     axes = np.asarray(axes, float)
-    across = np.sqrt(np.stack([(axes**2).sum(axis=1) - axes[:, j]**2 for j in range(3)], axis=1).clip(0))
+    across = np.stack([np.hypot(axes[:, j - 2], axes[:, j - 1]) for j in range(3)], axis=1)
     return np.arctan2(across, axes)
 
 

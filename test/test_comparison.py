@@ -1,0 +1,96 @@
+"""Whether two calibrations agree: honest ones do, a moved parameter is found, and what cannot be compared is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration import DETERMINED, HELD, Calibration
+from imu_calibration.cli import main
+from imu_calibration.comparison import LEVEL, compare
+from imu_calibration.documents import calibration_to_text
+from imu_calibration.errors import InputError
+from imu_calibration.sensor_model import SensorModel
+
+MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
+COUNT = len(MODEL.param_names)
+RNG = np.random.default_rng(17)
+ROOT = 1e-4 * (np.eye(COUNT) + 0.5 * RNG.normal(size=(COUNT, COUNT)))
+"""Correlated errors: a common direction must not count as many."""
+
+
+def draw(rng):
+    """Return a calibration with errors drawn from its own covariance."""
+    values = MODEL.start() + ROOT @ rng.normal(size=COUNT)
+    return Calibration(MODEL, values, ROOT @ ROOT.T, (DETERMINED,) * COUNT, 'imu', {'origin': 'mount', 'axes': 'mount'})
+
+
+def moved(calibration, name, by):
+    """Return the calibration with one parameter moved."""
+    values = calibration.values.copy()
+    values[calibration.param_names.index(name)] += by
+    return replace(calibration, values=values)
+
+
+def test_honest_calibrations_disagree_no_more_often_than_stated():
+    rng = np.random.default_rng(3)
+    disagreements = sum(not compare(draw(rng), draw(rng)).agree for _ in range(400))
+    assert disagreements <= 400 * LEVEL + 3 * np.sqrt(400 * LEVEL) + 1
+
+
+def test_a_calibration_agrees_with_itself():
+    one = draw(np.random.default_rng(1))
+    result = compare(one, one)
+    assert result.agree and all(row.ratio == 0 for row in result.rows)
+    assert result.lines[-1] == 'the calibrations agree'
+
+
+@pytest.mark.parametrize('name', ('accelerometer.bias.y', 'gyroscope.matrix.zx', 'accelerometer.accel_size_effect.xx'))
+def test_a_parameter_that_moved_is_found_and_its_group_named(name):
+    one = draw(np.random.default_rng(2))
+    sd = one.sd[one.param_names.index(name)]
+    result = compare(one, moved(one, name, 20 * sd))
+    assert not result.agree
+    assert any(line.startswith(name.rpartition('.')[0] + ': differs') for line in result.lines)
+    row = next(row for row in result.rows if row.name == name)
+    assert row.ratio == pytest.approx(20 / np.sqrt(2))
+    assert all(row.ratio == 0 for row in result.rows if row.name != name)
+
+
+def test_held_parameters_are_not_compared():
+    one = draw(np.random.default_rng(4))
+    name = 'gyroscope.matrix.xx'
+    held = replace(one, status=tuple(HELD if n == name else s for n, s in zip(one.param_names, one.status)))
+    result = compare(moved(held, name, 1.0), one)
+    assert result.agree
+    assert next(row for row in result.rows if row.name == name).ratio is None
+    assert any('1 parameters are held' in line for line in result.lines)
+
+
+def test_only_common_parameters_are_compared_and_conventions_are_noted():
+    one = draw(np.random.default_rng(5))
+    small = SensorModel()
+    keep = [one.param_names.index(name) for name in small.param_names]
+    other = Calibration(small, one.values[keep], one.covariance[np.ix_(keep, keep)], (DETERMINED,) * len(keep), 'other', {'origin': 'not_needed'})
+    result = compare(one, other)
+    assert [row.name for row in result.rows] == list(small.param_names)
+    assert sum(line.startswith('note:') for line in result.lines) == 2
+
+
+def test_nothing_in_common_is_refused():
+    one = draw(np.random.default_rng(6))
+
+    class Foreign:
+        param_names = ('camera.focal_length',)
+    with pytest.raises(InputError, match='in common'):
+        compare(one, Foreign())
+
+
+def test_the_command_line_prints_each_parameter_and_the_verdict(tmp_path, capsys):
+    one = draw(np.random.default_rng(7))
+    (tmp_path / 'a.yaml').write_text(calibration_to_text(one))
+    (tmp_path / 'b.yaml').write_text(calibration_to_text(moved(one, 'accelerometer.bias.x', 1.0)))
+    assert main(['compare', str(tmp_path / 'a.yaml'), str(tmp_path / 'b.yaml')]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in one.param_names)
+    assert 'accelerometer.bias: differs' in printed and printed.rstrip().endswith('the calibrations disagree')

@@ -1,0 +1,130 @@
+"""The calibration document: any calibration survives YAML whole, and what is no calibration is refused."""
+
+import copy
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imu_calibration import calibration as calibrations
+from imu_calibration import documents
+from imu_calibration.calibration import DETERMINED, HELD, WEAK, Calibration, from_mapping, to_mapping
+from imu_calibration.effects import catalogue
+from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.sensor_model import SensorModel
+
+ACCELEROMETER = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry', 'accel_size_effect', 'lever_arm', 'accel_thermal_bias',
+                 'accel_thermal_scale', 'accel_bias_drift', 'accel_bandwidth')
+GYROSCOPE = ('gyro_g_sensitivity', 'gyro_rate_product', 'gyro_quadratic', 'gyro_scale_asymmetry', 'gyro_thermal_bias', 'gyro_thermal_scale', 'gyro_bias_drift',
+             'gyro_bandwidth')
+REFERENCE = ('table_tilt', 'axis_non_orthogonality', 'encoder_zero', 'encoder_harmonic', 'time_offset', 'earth_rate')
+IN_DOCUMENT_REFERENCE = ('accel_bandwidth', 'gyro_bandwidth')
+numbers = st.floats(-1e3, 1e3, allow_nan=False).map(lambda x: x + 0.0)
+texts = st.text(st.characters(blacklist_categories=('Cs', 'Cc'), blacklist_characters='\u2028\u2029\x85\ufeff'), max_size=12)
+
+
+@st.composite
+def models(draw):
+    """Any model of the catalogue."""
+    def some(names):
+        return tuple(draw(st.lists(st.sampled_from(names), unique=True, max_size=3)))
+    joints = tuple(draw(st.lists(st.text('abcxyz_', min_size=1, max_size=6), unique=True, min_size=1, max_size=4)))
+    sensors = [('bias', 'matrix') + tuple(n for n in some(names)) for names in (ACCELEROMETER, GYROSCOPE)]
+    # a sensor's lag stands under `reference` in the document and comes back as the last effect of its sensor
+    sensors = [tuple(sorted(names, key=lambda n: n in IN_DOCUMENT_REFERENCE + ('lever_arm',))) for names in sensors]
+    known = [name for name in REFERENCE if ('reference', name) in catalogue(joints)]
+    return SensorModel(*sensors, some(known), joints, draw(st.floats(-40, 85)))
+
+
+@st.composite
+def any_calibration(draw):
+    """Any calibration with sound matrices."""
+    model = draw(models())
+    count = len(model.param_names)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    values = rng.normal(0, 1, count) * 10.0**rng.integers(-9, 3, count)
+    for sensor in ('accelerometer', 'gyroscope'):
+        values[model.slices[sensor, 'matrix']] = (np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3))).ravel()
+    root = rng.normal(0, 1e-3, (count, count))
+    status = tuple(rng.choice([DETERMINED, WEAK, HELD], count).tolist())
+    undetermined = tuple(draw(st.lists(st.fixed_dictionaries({'parameters': st.dictionaries(st.sampled_from(model.param_names), numbers, max_size=3),
+                                                              'needs': texts}), max_size=2)))
+    extra = st.dictionaries(texts.filter(bool), st.one_of(numbers, texts, st.integers(), st.none(), st.booleans(), st.lists(numbers, max_size=3)), max_size=3)
+    return Calibration(model.at(values), values, root @ root.T, status, draw(texts), {'origin': 'mount', 'axes': 'mount'}, undetermined, draw(extra), draw(extra),
+                       draw(extra))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(any_calibration())
+def test_any_calibration_survives_yaml_whole(calibration):
+    text = documents.calibration_to_text(calibration)
+    read = documents.calibration_from_text(text)
+    assert set(read.param_names) == set(calibration.param_names)
+    order = [read.param_names.index(name) for name in calibration.param_names]
+    assert np.array_equal(read.values[order], calibration.values)
+    assert np.array_equal(read.covariance[np.ix_(order, order)], calibration.covariance)
+    assert tuple(read.status[k] for k in order) == calibration.status
+    for name in ('frame_id', 'gauge', 'undetermined', 'statistics', 'conditions', 'provenance'):
+        assert getattr(read, name) == getattr(calibration, name), name
+    assert (read.model.joint_names, read.model.temperature_ref_c) == (calibration.model.joint_names, calibration.model.temperature_ref_c)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(any_calibration())
+def test_written_read_and_written_again_is_the_same_text(calibration):
+    once = documents.calibration_to_text(documents.calibration_from_text(documents.calibration_to_text(calibration)))
+    assert documents.calibration_to_text(documents.calibration_from_text(once)) == once
+
+
+def plain():
+    """Return the mapping of a simple calibration."""
+    model = SensorModel()
+    return to_mapping(Calibration(model, model.start(), 1e-6 * np.eye(24), (DETERMINED,) * 24))
+
+
+def test_the_document_has_the_published_layout():
+    document = yaml.safe_load(documents.to_text(plain()))
+    assert document['format'] == 'imu_calibration/1'
+    assert list(document)[:6] == ['format', 'frame_id', 'gauge', 'accelerometer', 'gyroscope', 'reference']
+    assert document['accelerometer']['bias'] == {'value': [0.0] * 3, 'sd': [0.001] * 3, 'unit': 'm/s^2', 'status': ['determined'] * 3}
+    assert len(document['covariance']['matrix']) == len(document['covariance']['names']) == 24
+
+
+@pytest.mark.parametrize(('change', 'words'), (
+    (lambda d: d.update(format='imu_calibration/2'), 'newer'),
+    (lambda d: d.update(format='imu_calibration/x'), 'format'),
+    (lambda d: d.pop('format'), 'format'),
+    (lambda d: d['accelerometer'].pop('bias'), 'missing'),
+    (lambda d: d['accelerometer']['bias'].update(value=[0.0, 1.0]), 'shape'),
+    (lambda d: d['accelerometer']['bias'].update(value=[0.0, 1.0, float('nan')]), 'finite'),
+    (lambda d: d['accelerometer']['bias'].update(value=['a', 'b', 'c']), 'misshapen'),
+    (lambda d: d['gyroscope']['effects'].append('magic'), 'magic'),
+    (lambda d: d['gyroscope'].update(effects=['bias']), 'matrix'),
+    (lambda d: d['gyroscope']['matrix'].update(value=[[1.0, 0.0, 0.0]] * 3), 'condition'),
+    (lambda d: d['covariance']['matrix'][0].__setitem__(0, -1.0), 'negative'),
+    (lambda d: d['covariance']['names'].pop(), 'missing'),
+))
+def test_what_is_no_calibration_is_refused_in_one_line(change, words):
+    document = copy.deepcopy(plain())
+    change(document)
+    with pytest.raises(InputError, match=words) as refusal:
+        from_mapping(document)
+    assert '\n' not in str(refusal.value)
+
+
+@pytest.mark.parametrize('text', ('', 'a: [', '[]', '\x00', '7', 'a: !!python/object/apply:os.getcwd []'))
+def test_text_that_is_no_document_is_refused_in_one_line(text):
+    with pytest.raises(DocumentError) as refusal:
+        documents.calibration_from_text(text)
+    assert '\n' not in str(refusal.value)
+
+
+def test_implausible_values_are_named():
+    model = SensorModel()
+    values = model.start()
+    assert calibrations.implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24)) == []
+    values[1] = 50.0
+    lines = calibrations.implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24))
+    assert len(lines) == 1 and 'accelerometer bias' in lines[0]
