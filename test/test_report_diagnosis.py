@@ -1,0 +1,72 @@
+"""The report of a diagnosis: the finding, its evidence and its picture, on a recording with a hidden g-sensitivity."""
+
+import re
+
+import numpy as np
+import pytest
+
+from imu_calibration.noise import GRADES
+from imu_calibration.profiles import make_profile
+from imu_calibration.report import diagnosis_report
+from imu_calibration.report.diagnosis_page import cause_of, chance, explained_share
+from imu_calibration.samples import SampleBlock
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.simulation import SimulationOptions, random_values, simulate
+from imu_calibration.turntable import Table
+from imu_calibration.workflow import CalibrationOptions, diagnose_recording, exit_code
+
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+                            'up': [0, 0, 1], 'latitude': 48.8, 'azimuth_deg': 0.0})
+MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
+
+
+@pytest.fixture(scope='module')
+def result():
+    """The diagnosis of a short session."""
+    values = random_values(MODEL, 'industrial', 9)
+    values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array([1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1])
+    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile('quick', 9, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), 9)
+    block = SampleBlock(imu, joints)
+    return diagnose_recording(lambda: iter([block]), TABLE, CalibrationOptions(), {'bags': [{'name': 'session', 'sha256': '0'}]})
+
+
+def test_the_finding_is_told_drawn_and_measured(result):
+    assert [f.effect for f in result.diagnosis.findings][:1] == ['gyro_g_sensitivity']
+    assert result.lines[0].startswith('1. gyro_g_sensitivity')
+    page = diagnosis_report(result)
+    assert diagnosis_report(result) == page
+    head = page[:page.index('<nav>')]
+    assert 'cause found' in head or 'causes found' in head
+    assert 'respond to specific force' in head
+    assert page.count('<svg') == 1 + len(result.diagnosis.findings)
+    assert not re.search(r'https?://(?!www\.w3\.org)|<script', page)
+    for section in ('findings', 'unexplained', 'candidates', 'untested', 'parameters'):
+        assert f'<section id="{section}">' in page
+    for row in result.diagnosis.candidates:
+        assert row.effect.replace('_', ' ') in page
+
+
+def test_it_is_drawn_against_its_cause(result):
+    finding = result.diagnosis.findings[0]
+    sensor, _, label, _ = cause_of(result.diagnosis.traces, finding)
+    assert sensor == 'gyroscope' and label.startswith('specific force')
+
+
+def test_the_document_and_the_calibration_agree(result):
+    parameters = result.document['findings'][0]['parameters']
+    for name, entry in parameters.items():
+        assert result.calibration.values[result.calibration.param_names.index(name)] == pytest.approx(entry['value'], rel=1e-9)
+    assert exit_code(result) in (0, 3)
+
+
+def test_the_share_that_a_variable_explains_is_one_for_its_function_and_none_for_noise():
+    rng = np.random.default_rng(0)
+    values = rng.uniform(-1, 1, 4000)
+    assert explained_share(values, values**2) > 0.95
+    assert explained_share(values, rng.normal(size=4000)) < 0.02
+    assert explained_share(values, np.zeros(4000)) == 0.0
+
+
+def test_chances_that_underflow_are_not_printed_as_nothing():
+    assert chance(0.0) == 'below 10⁻⁹⁹'
+    assert chance(0.02) == '0.020'
