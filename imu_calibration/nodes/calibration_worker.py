@@ -167,7 +167,8 @@ class CalibrationWorker(threading.Thread):
 
     def _solve(self):
         self._publish_solution(pending=True)
-        return ' '.join([summary(self.live.result)[0] + ':', *summary(self.live.result)[1]]).rstrip(':') + f' ({self.live.n_windows} windows)'
+        verdict, lines = summary(self.live.result)
+        return f'{verdict} ({self.live.n_windows} windows)' + ''.join(f'; {line}' for line in lines)
 
     def _save(self):
         text = self._publish_solution(pending=True)
@@ -176,7 +177,7 @@ class CalibrationWorker(threading.Thread):
         return f'written: {self.save_file} and {self.accumulator_file.name}'
 
     def _save_accumulator(self, pending):
-        write_whole(self.accumulator_file, accumulator_state.to_bytes(self.live.gathered(pending), self.live.model))
+        write_whole(self.accumulator_file, accumulator_state.to_bytes(self.live.gathered(pending), self.live.model), to_disk=pending)
         self._saved = (time.monotonic(), self.live.n_windows)
 
     def _reset(self):
@@ -204,7 +205,8 @@ class CalibrationWorker(threading.Thread):
         verdict, lines = ('', ()) if result is None else summary(result)
         values = {'windows': self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
-            lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: calibrate the recording offline']
+            lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: '
+                     'calibrate the recording offline']
         if self.state.solution != self._n_solutions or self.state.groups == [] or result is None:
             groups = self.live.groups()
         else:

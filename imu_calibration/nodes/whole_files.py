@@ -6,9 +6,16 @@ from pathlib import Path
 from imu_calibration.errors import InputError
 
 
-def write_whole(path, data):
+def write_whole(path, data, to_disk=True):
     """
-    Write bytes beside the file, bring them to the disk, and rename.
+    Write bytes beside the file and rename.
+
+    Parameters
+    ----------
+    path : path-like
+    data : bytes
+    to_disk : bool
+        Wait until the disk has them, so that they outlast a power failure; a busy disk takes seconds.
 
     Raises
     ------
@@ -22,8 +29,9 @@ def write_whole(path, data):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(beside, 'wb') as stream:
             stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
+            if to_disk:
+                stream.flush()
+                os.fsync(stream.fileno())
         os.replace(beside, path)
     except OSError as error:
         beside.unlink(missing_ok=True)
