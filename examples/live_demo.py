@@ -101,7 +101,8 @@ def run(domain_id, folder):
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with NodeProcesses(domain_id) as processes:
         print(f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, compensator_node and simulator_node')
-        calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'calibration.yaml', 'solve_share': 0.3})
+        calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'calibration.yaml',
+                                                                'solve_share': 0.3})
         compensator = processes.start('compensator_node')
         simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': 'quick', 'start_time': START})
         watcher = Watcher(processes)
@@ -137,7 +138,8 @@ def calibrate(watcher, simulator, deadline):
         nonlocal told
         if len(watcher.documents) > told:
             told = len(watcher.documents)
-            groups = [s for name, s in watcher.status.items() if 'calibration_node: ' in name and name.split(': ')[1] not in ('streams', 'calibration')]
+            groups = [s for name, s in watcher.status.items() if name.startswith('calibration_node: ')
+                      and name.split(': ')[1] not in ('streams', 'calibration')]
             good = sum(status.level == b'\0' for status in groups)
             print(f'solution {told}: {good} of {len(groups)} parameter groups determined' + next(
                 (f'; {s.name.split(": ")[1]} {s.message.split("; ")[-1]}' for s in groups if 'needed' in s.message), ''))

@@ -30,7 +30,8 @@ def to_bytes(gathered, model):
 
     """
     rows, accumulator = gathered.accumulator.rows, gathered.accumulator
-    header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in _MODEL}, 'temperature_ref_c': model.temperature_ref_c,
+    header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in _MODEL},
+              'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
               'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
@@ -85,10 +86,11 @@ def _check(header, model):
     if header.get('format') != FORMAT:
         raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {header.get('format')!r}; remove it, or start without resume")
     known = _model(header)
-    same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL) and known.temperature_ref_c == model.temperature_ref_c
+    same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL)
+    same = same and known.temperature_ref_c == model.temperature_ref_c
     if not same or known.point.keys() != model.point.keys() or any(np.any(known.point[n] != model.point[n]) for n in known.point):
-        raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, asked for is '
-                            f'{_text(model)}; start without resume, or with the old model')
+        raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
+                            f'asked for is {_text(model)}; start without resume, or with the old model')
 
 
 def _text(model):

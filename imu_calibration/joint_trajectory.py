@@ -88,7 +88,8 @@ def trajectory_from(start, time, position, rate=None, acceleration=None):
     """
     time, position = np.asarray(time, float), np.asarray(position, float)
     if not len(time) or position.shape != (len(time), start.position.shape[1]):
-        raise InputError(f'a trajectory must have points with {start.position.shape[1]} positions each, got {position.shape}; name every joint of the table')
+        raise InputError(f'a trajectory must have points with {start.position.shape[1]} positions each, got {position.shape}; '
+                         'name every joint of the table')
     if np.any(np.diff(np.concatenate([[0.0], time])) <= 0):
         raise InputError('the times of a trajectory must rise from above zero, they do not; correct time_from_start')
     rate = np.zeros_like(position) if rate is None else np.asarray(rate, float)

@@ -137,7 +137,8 @@ class LiveCalibration:
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
-        self._collector = _LiveCollector(self.table, model, self.options, session, WindowStore(self.settings.store_samples, self.earlier is None))
+        store = WindowStore(self.settings.store_samples, self.earlier is None)
+        self._collector = _LiveCollector(self.table, model, self.options, session, store)
 
     def solve(self, pending=False, provenance=None):
         """

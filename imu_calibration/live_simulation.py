@@ -55,7 +55,8 @@ class LiveSimulation:
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
         noise = options.noise
-        self._wander = [_Wander(sd, noise.correlation_time, 1 / options.imu_rate, self._rng) for sd in (noise.accel_instability, noise.gyro_instability)]
+        self._wander = [_Wander(sd, noise.correlation_time, 1 / options.imu_rate, self._rng)
+                        for sd in (noise.accel_instability, noise.gyro_instability)]
 
     def take(self, until):
         """Return everything from where the last block ended to `until` (s, exclusive)."""

@@ -80,7 +80,8 @@ class StreamWatch:
         if len(silent) == 2:
             return StreamState(SILENT, 'neither Imu nor JointState messages come; check the topics imu/data_raw and joint_states', values)
         if silent:
-            missing = {'imu': 'Imu messages do not come (imu/data_raw)', 'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
+            missing = {'imu': 'Imu messages do not come (imu/data_raw)',
+                       'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
             return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9
         if self._apart_for(lead, now) > SILENT_AFTER:

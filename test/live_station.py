@@ -76,13 +76,14 @@ class Station:
     def calibration_node(self, folder, **parameters):
         """Start calibration_node with a place to save in `folder`."""
         options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
-        return self.start('calibration_node', {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 0.2, **parameters},
-                          **options)
+        fixed = {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 0.2}
+        return self.start('calibration_node', fixed | parameters, **options)
 
     def play(self, bag, rate, subscribers=1, **parameters):
         """Start bag_player_node."""
         options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
-        return self.start('bag_player_node', {'bag': bag, 'rate': float(rate), 'wait_for_subscribers': subscribers, **parameters}, **options)
+        fixed = {'bag': bag, 'rate': float(rate), 'wait_for_subscribers': subscribers}
+        return self.start('bag_player_node', fixed | parameters, **options)
 
     def publisher(self, message_type, topic, reliable=True, depth=1000):
         """Return a publisher of the station's node."""
@@ -106,7 +107,8 @@ class Station:
 
         from imu_calibration.nodes.qos import latched_qos
         documents = []
-        self.subscriptions.append(self.node.create_subscription(String, topic, lambda message: documents.append(message.data), latched_qos()))
+        note = self.node.create_subscription(String, topic, lambda message: documents.append(message.data), latched_qos())
+        self.subscriptions.append(note)
         return documents
 
     def watch_diagnostics(self):
@@ -132,7 +134,8 @@ class Station:
         while not condition():
             for process in self.processes.running:
                 assert process.poll() in (None, 0), f'a node ended with {process.returncode} while waiting for {what}: {process.args[2]}'
-            assert time.monotonic() < deadline, f'waited in vain for {what}; last diagnostics: { {n: s.message for n, s in self.status.items()} }'
+            known = {name: status.message for name, status in self.status.items()}
+            assert time.monotonic() < deadline, f'waited in vain for {what}; last diagnostics: {known}'
             self.executor.spin_once(timeout_sec=0.05)
 
     def spin_for(self, seconds):
@@ -160,7 +163,8 @@ class Publisher:
     def __init__(self, station, imu_topic='imu/data_raw', joint_topic='joint_states', reliable=True):
         from sensor_msgs.msg import Imu, JointState
         self.station = station
-        self.imu, self.joints = (station.publisher(kind, topic, reliable, 20_000) for kind, topic in ((Imu, imu_topic), (JointState, joint_topic)))
+        self.imu, self.joints = (station.publisher(kind, topic, reliable, 20_000)
+                                 for kind, topic in ((Imu, imu_topic), (JointState, joint_topic)))
 
     def wait(self, subscribers=1):
         """Wait until both topics have subscribers."""
@@ -170,8 +174,10 @@ class Publisher:
     def send(self, imu, joints, per_second=4000):
         """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
         from msg_adapters.encode import encode_imu, encode_joints, rows
-        queue = [(k / max(len(imu), 1), self.imu, message) for k, message in enumerate(rows(encode_imu(imu)) if len(imu) else [])]
-        queue += [(k / max(len(joints), 1), self.joints, message) for k, message in enumerate(rows(encode_joints(joints)) if len(joints) else [])]
+        queue = []
+        for publisher, samples, encode in ((self.imu, imu, encode_imu), (self.joints, joints, encode_joints)):
+            messages = rows(encode(samples)) if len(samples) else []
+            queue += [(k / len(messages), publisher, message) for k, message in enumerate(messages)]
         queue.sort(key=lambda entry: entry[0])
         step = max(per_second // 50, 1)
         for start in range(0, len(queue), step):

@@ -60,7 +60,8 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
     memory = {name: [] for name in NODES}
     with Station() as station:
         station.watch_diagnostics()
-        running = {'calibration_node': station.calibration_node(folder, autosave_period=10.0), 'compensator_node': station.start('compensator_node')}
+        running = {'calibration_node': station.calibration_node(folder, autosave_period=10.0),
+                   'compensator_node': station.start('compensator_node')}
         station.until(lambda: len(station.status) > 2, 'the nodes')
         station.start('simulator_node', {'profile': 'quick', 'repeat': True, 'seed': 1, 'time_factor': factor, 'imu_rate': imu_rate,
                                          'joint_rate': joint_rate, 'wait_for_subscribers': 2})

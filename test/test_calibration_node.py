@@ -31,7 +31,8 @@ def bags(tmp_path_factory):
 
 def test_a_bag_through_both_nodes(bags, tmp_path):
     with Station() as station:
-        documents, corrected, residuals = station.watch_documents(), station.watch_imu('imu/data_corrected'), station.watch_imu('imu/residual')
+        documents = station.watch_documents()
+        corrected, residuals = station.watch_imu('imu/data_corrected'), station.watch_imu('imu/residual')
         station.watch_diagnostics()
         station.calibration_node(tmp_path, reliable=True, resume=True)
         compensator = station.start('compensator_node', {'reliable': True})

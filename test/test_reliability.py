@@ -128,7 +128,8 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     send_all(station, publisher, *halves[0])
     send_all(station, publisher, *halves[1])
     last = halves[1][0].stamp_ns[-1]
-    alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), np.repeat(imu.force_s[-1:], 250, 0), np.repeat(imu.rate_s[-1:], 250, 0), 'imu_link')
+    still = (np.repeat(values[-1:], 250, 0) for values in (imu.force_s, imu.rate_s))
+    alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), *still, 'imu_link')
     publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
     station.until(lambda: any('JointState messages do not come' in message for _, _, message in station.history), 'a warning')
     live = answer_of(station, folder)

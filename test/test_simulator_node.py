@@ -20,6 +20,7 @@ from live_sessions import TABLE, make_session
 from msg_adapters.write import write_session
 
 pytest.importorskip('rclpy')
+from imu_calibration.nodes.processes import node_command  # noqa: E402
 from live_station import ROOT, Station, taken  # noqa: E402
 
 START = 1_800_000_000
@@ -120,8 +121,8 @@ def test_a_simulator_follows_a_trajectory_with_clock_and_truth():
         station.node.create_subscription(Clock, '/clock', lambda m: clock.append(m.clock.sec + m.clock.nanosec * 1e-9), 100)
         station.node.create_subscription(JointState, 'joint_states', lambda m: angles.append(list(m.position)), 1000)
         publisher = station.publisher(JointTrajectory, 'joint_trajectory')
-        node = station.start('simulator_node', {'profile': 'none', 'clock': True, 'truth': True, 'time_factor': 5.0, 'start_time': float(START),
-                                                'imu_rate': 100.0, 'joint_rate': 50.0, 'seed': 1})
+        node = station.start('simulator_node', {'profile': 'none', 'clock': True, 'truth': True, 'time_factor': 5.0,
+                                                'start_time': float(START), 'imu_rate': 100.0, 'joint_rate': 50.0, 'seed': 1})
         station.until(lambda: publisher.get_subscription_count() and angles, 'the simulator')
         point = JointTrajectoryPoint(positions=[0.5, 0.0, -0.25], time_from_start=Duration(sec=2))
         publisher.publish(JointTrajectory(joint_names=['inner', 'outer', 'middle'], points=[point]))
@@ -150,6 +151,6 @@ def test_the_player_plays_every_message_to_the_last_bit_and_refuses_what_it_cann
         np.testing.assert_array_equal(played.stamp_ns, imu.stamp_ns)
         np.testing.assert_array_equal(played.force_s, imu.force_s)
         for parameters, message in (({}, "parameter 'bag' must name"), ({'bag': tmp_path / 'bag', 'topics': '/gps'}, 'it has no /gps')):
-            from imu_calibration.nodes.processes import node_command
-            done = subprocess.run(node_command('bag_player_node', parameters), env=station.processes.environment, capture_output=True, text=True, timeout=60)
+            command = node_command('bag_player_node', parameters)
+            done = subprocess.run(command, env=station.processes.environment, capture_output=True, text=True, timeout=60)
             assert done.returncode == 1 and message in done.stderr and done.stderr.count('\n') == 1

@@ -26,10 +26,13 @@ class PlayerSettings:
 
     bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why')
     topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing')
-    rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible', (0.0, 10000.0), 'too large: messages are lost')
-    clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
+    rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible',
+                          (0.0, 10000.0), 'too large: messages are lost')
+    clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time',
+                          symptom='nodes with use_sim_time stand still')
     loop: bool = setting(False, '', 'start again at the end; the stamps then jump back', symptom='the node ends after one round')
-    wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start', (0, 100), 'the first messages are missed')
+    wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start',
+                                        (0, 100), 'the first messages are missed')
     stop_at_end: bool = setting(True, '', 'end the node after the last message', symptom='the node does not end')
 
 
@@ -65,13 +68,15 @@ class BagPlayerNode(Node):
         asked = self.settings.topics.split()
         unknown = [name for name in asked if name not in self._bag.types]
         if unknown:
-            raise InputError(f'{self.settings.bag} must hold the topics asked for, it has no {", ".join(unknown)}; it holds {", ".join(sorted(self._bag.types))}')
+            raise InputError(f'{self.settings.bag} must hold the topics asked for, it has no {", ".join(unknown)}; '
+                             f'it holds {", ".join(sorted(self._bag.types))}')
         chosen = []
         for name in asked or sorted(self._bag.types):
             if _message_class(self._bag.types[name]) is not None:
                 chosen.append(name)
             elif asked:
-                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; leave the topic out')
+                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; '
+                                 'leave the topic out')
             else:
                 self.get_logger().warning(f'{name} is left out: its type {self._bag.types[name]} is not installed')
         if not chosen:
@@ -81,7 +86,8 @@ class BagPlayerNode(Node):
     def _publisher(self, name):
         latched = any(profile.get('durability') == 'transient_local' for profile in self._bag.qos(name))
         # Relative, so that namespaces and remappings move it.
-        return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), latched_qos() if latched else output_qos(DEPTH))
+        qos = latched_qos() if latched else output_qos(DEPTH)
+        return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), qos)
 
     def _batches(self, first_ns):
         """Yield Batch after Batch, round after round."""

@@ -42,13 +42,18 @@ class CalibrationNodeSettings:
     frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
                             symptom='every Imu message is dropped, diagnostics say so')
     reliable: bool = setting(False, '', 'subscribe reliably instead of best-effort', symptom='a best-effort publisher never connects')
-    accelerometer_model: str = setting('', '', 'named model or effect names joined by +; empty: bias+matrix, and accel_size_effect when the rotation '
-                                       'shows it', symptom='an effect that is there stays in the residuals')
-    gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix', symptom='an effect that is there stays in the residuals')
-    reference_model: str = setting('', '', "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
+    accelerometer_model: str = setting('', '',
+                                       'named model or effect names joined by +; empty: bias+matrix, and accel_size_effect '
+                                       'when the rotation shows it', symptom='an effect that is there stays in the residuals')
+    gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix',
+                                   symptom='an effect that is there stays in the residuals')
+    reference_model: str = setting('', '',
+                                   "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
                                    'azimuth is unknown', symptom='a tilted table shows as accelerometer bias')
-    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml', symptom='good parameters are called weak')
-    save_file: str = setting('calibration.yaml', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz',
+    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
+                                   symptom='good parameters are called weak')
+    save_file: str = setting('calibration.yaml', '',
+                             'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz',
                              symptom='~/save answers that the place is not writable')
     resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
                            symptom='old motion of another IMU enters the calibration')

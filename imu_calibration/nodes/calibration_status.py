@@ -26,6 +26,7 @@ def _group_status(group):
             'waiting': 'no solution yet'}[group.status]
     if group.needs:
         text += f'; still needed: {group.needs}'
-    values = {'parameter': group.parameter, f'standard error [{group.unit}]': f'{group.sd:.3g}', f'tolerance [{group.unit}]': f'{group.tolerance:.3g}',
+    values = {'parameter': group.parameter, f'standard error [{group.unit}]': f'{group.sd:.3g}',
+              f'tolerance [{group.unit}]': f'{group.tolerance:.3g}',
               'needs': group.needs, f'predicted after that motion [{group.unit}]': f'{group.predicted_sd:.3g}'}
     return make_status(level, f'{group.sensor} {group.effect}', text, values)

@@ -40,27 +40,36 @@ STRETCH = 0.2
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml', symptom='joint names are not those expected')
-    profile: str = setting('quick', '', "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until a trajectory comes on "
-                           'joint_trajectory', symptom='the node refuses and lists the names')
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml',
+                              symptom='joint names are not those expected')
+    profile: str = setting('quick', '',
+                           "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
+                           'a trajectory comes on joint_trajectory', symptom='the node refuses and lists the names')
     repeat: bool = setting(False, '', 'start the profile again at its end', symptom='the table rests after one round')
-    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting', symptom='the node does not end')
-    calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU', symptom='another IMU is simulated')
-    grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)), symptom='noise too large or small')
+    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting',
+                                symptom='the node does not end')
+    calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
+                                    symptom='another IMU is simulated')
+    grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
+                         symptom='noise too large or small')
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
     imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
-    imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time', (1.0, 20000.0), 'too large: the machine cannot keep up')
-    joint_rate: float = setting(100.0, 'Hz', 'JointState messages per second of simulated time', (1.0, 20000.0), 'too small: fast motion is not followed')
+    imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time',
+                              (1.0, 20000.0), 'too large: the machine cannot keep up')
+    joint_rate: float = setting(100.0, 'Hz', 'JointState messages per second of simulated time',
+                                (1.0, 20000.0), 'too small: fast motion is not followed')
     velocity: bool = setting(True, '', 'whether JointState holds velocities', symptom='velocities are missing')
     encoder_resolution: float = setting(0.0, 'rad', 'step of the joint positions; 0: continuous', (0.0, 0.1), 'too large: rough reference')
     stamp_jitter: float = setting(0.0, 's', 'standard deviation of the Imu stamps', (0.0, 0.01), 'too large: stamps out of order')
     temperature: bool = setting(False, '', 'publish imu/temperature, warming up from 25 C', symptom='thermal effects cannot be calibrated')
     frame_id: str = setting('imu_link', '', 'frame of the Imu messages', symptom='another frame_id')
     truth: bool = setting(False, '', 'publish imu/truth: what a perfect IMU would measure', symptom='no messages on imu/truth')
-    time_factor: float = setting(1.0, '1', 'seconds of simulated time per second; 0: as fast as possible', (0.0, 10000.0), 'too large: messages are lost')
+    time_factor: float = setting(1.0, '1', 'seconds of simulated time per second; 0: as fast as possible',
+                                 (0.0, 10000.0), 'too large: messages are lost')
     clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
     start_time: float = setting(0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day')
-    wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start', (0, 100), 'the first messages are missed')
+    wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start',
+                                        (0, 100), 'the first messages are missed')
 
 
 class SimulatorNode(Node):
@@ -148,7 +157,8 @@ class SimulatorNode(Node):
         names = list(self._table.joint_names)
         missing = [name for name in names if name not in message.joint_names]
         if missing:
-            self.get_logger().warning(f'a trajectory must name the joints {", ".join(names)}, {", ".join(missing)} are missing; it is not followed')
+            self.get_logger().warning(f'a trajectory must name the joints {", ".join(names)}, {", ".join(missing)} are missing; '
+                                      'it is not followed')
             return
         self._trajectories.put(message)
 
@@ -163,7 +173,8 @@ class SimulatorNode(Node):
 
         positions = column('positions')
         try:
-            self._motion.follow(now, times, np.zeros((0, 0)) if positions is None else positions, column('velocities'), column('accelerations'))
+            positions = np.zeros((0, 0)) if positions is None else positions
+            self._motion.follow(now, times, positions, column('velocities'), column('accelerations'))
         except ImuCalibrationError as error:
             self.get_logger().warning(f'{error}; the trajectory is not followed')
 
