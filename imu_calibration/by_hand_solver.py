@@ -121,6 +121,7 @@ def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, mem
         residual = np.concatenate([system.residual, (NOMINAL - state.values)[free]])
         noise = np.concatenate([system.noise, priors[free]**2])
         group = np.concatenate([system.component, np.full(free.sum(), -1)])
+        before = scatter.variance
         if number > 2:  # the first steps leave errors of linearisation that are not scatter
             scatter = estimate_scatter(design, residual, noise, group, scatter.variance, fallback)
         root = np.sqrt(scatter.total(noise, group))
@@ -129,7 +130,8 @@ def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, mem
         step = np.zeros(5 * count + N_PARAMS)
         step[np.concatenate([np.ones(5 * count, bool), free])] = reduced
         state = moved(state, step, count)
-        if number > 3 and np.linalg.norm(factor @ reduced) < 1e-3:  # in units of the joint sd
+        settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
+        if number > 3 and settled and np.linalg.norm(factor @ reduced) < 1e-3:  # in units of the joint sd
             break
     return state, scatter, number
 

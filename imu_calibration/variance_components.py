@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-STEPS = 4
+STEPS = 2
 """Scoring steps per call; for rows of one variance a single step is exact."""
 DOF_LEAST = 2.0
 """With fewer degrees of freedom a group's scatter is not estimated from the data."""

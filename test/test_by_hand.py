@@ -178,17 +178,17 @@ def test_noise_free_recording_gives_the_truth():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('scatter', [{'pose_sd': 0.003, 'drift_sd': 3e-4}, {'pose_sd': 0.003, 'drift_sd': 3e-4, 'sensitivity': 5e-4}])
-def test_reported_sd_are_honest(scatter):
+@pytest.mark.parametrize('seeds, sensitivity', [(100, 0.0), (40, 5e-4)])
+def test_reported_sd_are_honest(seeds, sensitivity):
     """
-    100 random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
+    Random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
 
-    With 21 (30) parameters of which about a third is independent, the mean over 100 seeds scatters by 0.04; the scatter of
+    With 21 (30) parameters of which about a third is independent, the mean over 100 seeds scatters by 0.04, over 40 by 0.06; the scatter of
     poses comes from some 10 degrees of freedom, which the report makes up for.
     """
     normalised, inside = [], []
-    for seed in range(100):
-        imu, ranges, truth = simulate(seed, n_poses=14, **scatter)
+    for seed in range(seeds):
+        imu, ranges, truth = simulate(seed, n_poses=14, pose_sd=0.003, drift_sd=3e-4, sensitivity=sensitivity)
         error, covariance = differences(calibrate_by_hand(imu, GRAVITY, ranges), truth)
         normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
         inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
