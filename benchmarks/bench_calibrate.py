@@ -7,7 +7,6 @@ repetitions. The command is run as a user runs it, imports included. Run it alon
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import time
@@ -32,6 +31,16 @@ LIMITS = {'mcap': 2.0, 'sqlite3': 4.0}
 GROWTH, GROWTH_LIMIT = 4.0, 4.4
 """Factor of the length, and the largest factor of the time that goes with it."""
 MEMORY_LIMIT_MB = 500.0
+
+
+RUNNER = '''
+import os, subprocess, sys, time
+start = time.perf_counter()
+child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+_, status, usage = os.wait4(child.pid, 0)
+print(time.perf_counter() - start, usage.ru_maxrss, os.waitstatus_to_exitcode(status))
+'''
+"""Runs a command from a small process: the peak memory of a child begins with that of its parent."""
 
 
 class Row(NamedTuple):
@@ -85,14 +94,11 @@ def calibrate(bag, output):
     """Return (seconds, peak memory in MB) of calibrating a bag in a process of its own."""
     command = [sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_three_axis.yaml')),
                '--output', str(output), '--no-report']
-    start = time.perf_counter()
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 3):
-        raise RuntimeError(f'calibrate must end with 0 or 3, it ended with {process.returncode}; run it by hand: {" ".join(command)}')
-    return seconds, usage.ru_maxrss / 1024
+    found = subprocess.run([sys.executable, '-c', RUNNER, *command], cwd=ROOT, capture_output=True, text=True, check=True)
+    seconds, kilobytes, code = found.stdout.split()
+    if int(code) not in (0, 3):
+        raise RuntimeError(f'calibrate must end with 0 or 3, it ended with {code}; run it by hand: {" ".join(command)}')
+    return float(seconds), float(kilobytes) / 1024
 
 
 def main():
