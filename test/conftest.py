@@ -18,3 +18,13 @@ def recordings():
     if not folder.is_dir():
         pytest.skip(f'real recordings not found at {folder}; set IMU_CALIBRATION_DATA')
     return folder
+
+
+def pytest_terminal_summary(terminalreporter):
+    """List the figures that passing tests printed beside what was wanted or known."""
+    lines = [line for report in terminalreporter.stats.get('passed', ()) if report.when == 'call'
+             for line in report.capstdout.splitlines() if ' wanted ' in line or '(known ' in line]
+    if lines:
+        terminalreporter.section('measured figures')
+        for line in lines:
+            terminalreporter.write_line(line)
