@@ -14,7 +14,7 @@ from imu_calibration.samples import ImuSamples
 from imu_calibration.sensor_model import coefficients, columns
 from imu_calibration.settings import setting
 from imu_calibration.window_store import WindowStore
-from imu_calibration.workflow import PASSES, SENSORS, CalibrationOptions, _needs_another_pass, _values_in, check_units, choose_model, finish
+from imu_calibration.workflow import PASSES, SENSORS, CalibrationOptions, check_units, choose_model, finish, linearise_again
 
 WAITING = 'waiting'
 """Status of a parameter group before the first solution; then 'determined', 'weak' or 'held'."""
@@ -300,8 +300,3 @@ class SolvePacer:
     def note(self, start, end):
         """Take note of a solution that was worked on from `start` to `end`."""
         self._next = start + (end - start) / self._share
-
-
-def linearise_again(model, solution):
-    """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
-    return model.at(_values_in(model, solution)) if _needs_another_pass(model, solution) else None

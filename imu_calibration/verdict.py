@@ -86,11 +86,6 @@ def _implausible(calibration):
             for line in implausible(calibration)]
 
 
-def misfits(calibration):
-    """Return a line for each sensor whose residuals in motion are far above its noise at rest."""
-    return [reason.what for reason in _misfits(calibration)]
-
-
 def _ratios(calibration, sensor):
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
     return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}

@@ -131,9 +131,10 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
         step = GatherStep(table, model, options.windows, options.nominal, names, progress)
         gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model))
         result = finish(gathered, model, table, options, provenance)
-        if not _needs_another_pass(model, result.solution):
+        again = linearise_again(model, result.solution)
+        if again is None:
             break
-        model = model.at(_values_in(model, result.solution))
+        model = again
     return result
 
 
@@ -145,6 +146,11 @@ def _first_temperature(sources, options):
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
     raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
+
+
+def linearise_again(model, solution):
+    """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
+    return model.at(_values_in(model, solution)) if _needs_another_pass(model, solution) else None
 
 
 def _needs_another_pass(model, solution):
