@@ -12,6 +12,8 @@ from imu_calibration.sensor_model import SensorModel
 from imu_calibration.stream_check import StreamCheck
 
 SENSORS = ('accelerometer', 'gyroscope')
+GRAVITY_SD = 0.02
+"""What the standard gravity may be off by where nobody knows the local one, m/s^2."""
 
 
 def read_imu(blocks):
@@ -56,19 +58,31 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
     imu, counts = read_imu(blocks)
     if nominal is not None:
         imu = nominal.apply(imu)
-    hand = calibrate_by_hand(imu, STANDARD_GRAVITY if gravity is None else gravity, gravity_sd=0.02 if gravity is None else 0.0)
+    gravity, gravity_sd = reference_gravity(gravity)
+    hand = calibrate_by_hand(imu, gravity, gravity_sd=gravity_sd)
+    gathered = Gathered(counts=counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
+                        largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()))
+    calibration, limits = document_of_hand(hand, gathered, len(imu), tolerances, provenance)
+    return calibration, hand, gathered, limits
+
+
+def reference_gravity(gravity):
+    """Return (gravity, its sd): as given, or the standard one with what it may be off by, m/s^2."""
+    return (STANDARD_GRAVITY, GRAVITY_SD) if gravity is None else (gravity, 0.0)
+
+
+def document_of_hand(hand, gathered, n_samples, tolerances=None, provenance=None):
+    """Return (Calibration, tolerances) of a HandCalibration; arguments as in `calibrate_recording_by_hand`."""
     responds = any('.gyro_g_sensitivity.' in name for name in hand.param_names)
     model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity') if responds else ('bias', 'matrix'))
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
     sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == 'held' for k in order])
     limits = tolerances_of(model, tolerances)
-    gathered = Gathered(counts=counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
-                        largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()))
-    calibration = Calibration(model, hand.values[order], covariance, statuses(model, sd, held, limits), imu.frame_id, dict(hand.gauge),
-                              tuple(dict(item) for item in hand.advice), _statistics(hand, counts, len(imu)), {}, {
+    calibration = Calibration(model, hand.values[order], covariance, statuses(model, sd, held, limits), gathered.frame_id, dict(hand.gauge),
+                              tuple(dict(item) for item in hand.advice), _statistics(hand, gathered.counts, n_samples), {}, {
                                   'software': imu_calibration.__version__, **(provenance or {})})
-    return calibration, hand, gathered, limits
+    return calibration, limits
 
 
 def _statistics(hand, counts, n_samples):

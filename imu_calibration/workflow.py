@@ -187,8 +187,12 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
     for model in (options.accelerometer_model, options.gyroscope_model):
         if model not in (None, 'bias+matrix', 'axial', 'rate'):
             raise InputError(f"calibration by hand estimates bias+matrix, '{model}' was asked for; give --table for more")
-    calibration, hand, gathered, tolerances = calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance)
-    _check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
+    return result_by_hand(*calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance), options)
+
+
+def result_by_hand(calibration, hand, gathered, tolerances, options=CalibrationOptions()):
+    """Return the CalibrationResult of a calibration by hand, after a look at its units."""
+    check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     calibration = replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity})
     return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances, options)
 
@@ -297,11 +301,12 @@ def check_units(gathered, model):
     static = [row for row in rows if row.kind == 'static']
     if static:
         length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
-        _check_force(length)
+        check_force(length)
     _check_rates([row for row in rows if row.kind != 'static'], gathered, model)
 
 
-def _check_force(length):
+def check_force(length):
+    """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
     if 0.8 < length < 1.25:
         raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
                          f'give --nominal with accelerometer_scale {1 / G:.6f}')
@@ -419,13 +424,18 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     DiagnosisResult
 
     """
-    options = replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
+    options = baseline_options(options)
     baseline = calibrate([source], table, options, provenance)
     windows = collect_windows(source(), table, options)
     diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
     tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
     calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, provenance)
     return DiagnosisResult(diagnosis, calibration, diagnosis.solution, table, tolerances, options)
+
+
+def baseline_options(options):
+    """Return the options of the model that a diagnosis starts from: what was not asked for has to prove itself."""
+    return replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
 
 
 def collect_windows(blocks, table, options=CalibrationOptions()):
