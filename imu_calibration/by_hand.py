@@ -6,23 +6,25 @@ import numpy as np
 
 from imu_calibration.by_hand_advice import missing_motion
 from imu_calibration.by_hand_poses import average_poses, collect_turns, distinct_attitudes, g_sensitivity_evidence, known_turn_data
+from imu_calibration.by_hand_model import BASE_NAMES, FIXED, HandModel, unpack
 from imu_calibration.by_hand_solver import solve_joint
-from imu_calibration.by_hand_system import (
-    ACCELEROMETER, COMPONENTS, N_PARAMS, NOMINAL, PARAM_NAMES, SENSITIVITY, Poses, State, norm_rows, unpack)
-from imu_calibration.effects import find_effect
+from imu_calibration.by_hand_system import COMPONENTS, Poses, State
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.noise import STANDARD_GRAVITY
+from imu_calibration.sensor_model import SensorModel
 from imu_calibration.settings import setting
 from imu_calibration.still_search import find_still
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
-FIXED = ('accelerometer.matrix.xy', 'accelerometer.matrix.xz', 'accelerometer.matrix.yz')
-"""Zero by the choice of axes."""
-PUBLISHED = (*PARAM_NAMES[:3], *(f'accelerometer.matrix.{a}{b}' for a in 'xyz' for b in 'xyz'), *PARAM_NAMES[9:])
-"""Order of the parameters in the result."""
+PUBLISHED = (*BASE_NAMES[:3], *(f'accelerometer.matrix.{a}{b}' for a in 'xyz' for b in 'xyz'), *BASE_NAMES[9:])
+"""Order of the parameters in the result; further effects follow."""
 POSES_LEAST = 4
 """Fewer attitudes leave even the accelerometer's biases to the prior."""
+PASSES = 4
+"""Solutions at most, when the columns of a warm-up have to be taken anew."""
+SETTLED = 0.03
+"""Relative change of a time constant below which its columns stay."""
 G_SENSITIVITY_P = 1e-3
 """The response of the gyroscope to attitude enters the model when chance would show it less often."""
 POSES_FULL = 9
@@ -91,7 +93,11 @@ class HandCalibration:
     poses: Poses
     """The poses that were used."""
     state: State
-    """Directions and drifts of the poses; its `values` hold every parameter of the equations, modelled or not."""
+    """Directions and drifts of the poses, and the parameters in the order of `model`."""
+    model: HandModel
+    """What was estimated."""
+    information: np.ndarray
+    """Information of the data alone, in the order of `model`, shape (m, m)."""
 
     @property
     def sd(self):
@@ -114,21 +120,22 @@ class HandCalibration:
     @property
     def gyroscope(self):
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
-        return unpack(self.state.values)[2:]
+        part = self.model.parts.get(('gyroscope', 'gyro_g_sensitivity'))
+        return (*unpack(self.state.values)[2:], np.zeros((3, 3)) if part is None else self.state.values[part].reshape(3, 3))
 
-    def compensate(self, force, rate):
-        """Return true specific force and rate for readings of shape (n, 3)."""
-        (bias_f, matrix_f), (bias_w, matrix_w, sensitivity) = self.accelerometer, self.gyroscope
-        true_force = np.linalg.solve(matrix_f, (force - bias_f).T).T
-        return true_force, np.linalg.solve(matrix_w, (rate - bias_w - true_force @ sensitivity.T).T).T
+    def compensate(self, force, rate, time=None, temperature_c=None):
+        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` where effects ask for them."""
+        return self.model.compensate(self.state.values, force, rate, time, temperature_c)
 
     def norm_residuals(self, force=None):
         """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
-        return norm_rows(self.state.values, self.poses.force if force is None else force, self.gravity)[0]
+        if force is None:
+            return self.model.norm_rows(self.state.values, self.poses.force, self.poses.time, self.poses.temperature_c)[0]
+        return self.model.norm_rows(self.state.values, force)[0]
 
 
 def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
-                      tolerances=None):
+                      tolerances=None, model=None, temperature_c=None):
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
@@ -151,6 +158,10 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
         Full turns by hand, beside what gravity says.
     tolerances : dict, optional
         {sensor: {effect: sd that is good enough}}; the catalogue's where not given.
+    model : SensorModel, optional
+        What to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
+    temperature_c : array, optional
+        Temperature at the samples, shape (n,).
 
     Returns
     -------
@@ -164,66 +175,71 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     """
     imu = imu if nominal is None else nominal.apply(imu)
     time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
-    poses, noise = average_poses(imu, _as_ranges(imu, stills))
+    poses, noise = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
-    turns, dropped = collect_turns(time, imu, poses, noise, settings)
-    turns += [known_turn_data(time, imu, turn, noise, settings) for turn in known_turns]
+    turns, dropped = collect_turns(time, imu, poses, noise, settings, temperature_c)
+    turns += [known_turn_data(time, imu, turn, noise, settings, temperature_c) for turn in known_turns]
     statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise}
-    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances)
+    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances, model)
 
 
-def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None):
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, model=None):
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`."""
-    goals, priors = _from_catalogue(tolerances or {})
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
-    modelled, evidence = _modelled(poses, settings)
-    found = solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback)
+    chosen, evidence = _modelled(poses, settings)
+    model = HandModel(chosen if model is None else model, gravity)
+    for _ in range(PASSES):
+        found = solve_joint(model, poses, turns, gravity_sd, fallback)
+        settled, model = _settled(model, found), model.at(found.state.values)
+        if settled:
+            break
+    goals = model.tolerances(tolerances or {})
     statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
-    advice = missing_motion(found.factor, found.state.values, statuses, PARAM_NAMES, modelled, priors, goals, gravity, pose_sd, turn_sd)
-    statistics = {**statistics, **evidence, **_statistics(found, poses, turns, gravity)}
-    names = [name for name in PUBLISHED if name in FIXED or modelled[PARAM_NAMES.index(name)]]
-    index = np.array([PARAM_NAMES.index(name) if name not in FIXED else -1 for name in names])
+    advice = missing_motion(model, found.factor, found.state.values, statuses, goals, pose_sd, turn_sd)
+    statistics = {**statistics, **evidence, **_statistics(model, found, poses, turns)}
+    names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
+    index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
-    return HandCalibration(tuple(names), np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
+    return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
                            tuple((*statuses, 'determined')[k] for k in index), np.append(goals, goals[3])[index],
-                           np.append(priors, 0.0)[index], gravity, dict(GAUGE), advice, statistics, poses, found.state)
+                           np.append(model.priors, 0.0)[index], gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
+                           found.factor.T @ found.factor)
 
 
-def _from_catalogue(tolerances):
-    """Return (tolerances, prior sds) in `PARAM_NAMES` order."""
-    names = [name.split('.')[:2] for name in PARAM_NAMES]
-    effects = [find_effect(sensor, effect) for sensor, effect in names]
-    goals = [tolerances.get(sensor, {}).get(effect, known.tolerance) for (sensor, effect), known in zip(names, effects)]
-    return np.array(goals, float), np.array([known.prior_sd for known in effects])
+def _settled(model, found):
+    """Return whether the columns of warm-ups were taken close enough to where the solution lies."""
+    for (_, name), part in model.parts.items():
+        if name.endswith('_bias_drift') and not found.held[part][-1]:
+            known = model.model.full_point()[name][-1]
+            if abs(found.state.values[part][-1] / known - 1) > SETTLED:
+                return False
+    return True
 
 
 def _modelled(poses, settings):
-    """Return (which parameters are in the model, what the poses say about g-sensitivity)."""
+    """Return (the model when none is asked for, what the poses say about g-sensitivity)."""
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
         raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
     evidence = g_sensitivity_evidence(poses)
     wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
                                                 and evidence['g_sensitivity_heldout_ratio'] < 1)
-    modelled = np.ones(N_PARAMS, bool)
-    modelled[SENSITIVITY] = wanted
-    return modelled, evidence
+    return SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity') if wanted else ('bias', 'matrix')), evidence
 
 
 def _statuses(sd, held, tolerances):
     return tuple('held' if h else 'determined' if s <= t else 'weak' for s, h, t in zip(sd, held, tolerances))
 
 
-def _statistics(found, poses, turns, gravity):
-    before = norm_rows(NOMINAL, poses.force, gravity)[0]
-    after = norm_rows(found.state.values, poses.force, gravity)[0]
+def _statistics(model, found, poses, turns):
+    before, after = (model.norm_rows(values, poses.force, poses.time, poses.temperature_c)[0] for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
-    spare = len(after) - int(np.sum(~found.held[ACCELEROMETER]))
+    spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
     result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
               'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
               'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}

@@ -4,14 +4,15 @@ import itertools
 
 import numpy as np
 
-from imu_calibration.by_hand_system import ACCELEROMETER, AXES, GYRO_BIAS, GYRO_MATRIX, N_PARAMS, norm_rows, unpack
+from imu_calibration.by_hand_model import GYRO_BIAS, GYRO_MATRIX, unpack
+from imu_calibration.effects.base import AXES
 from imu_calibration.reference import skew
 
 STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d))
 """Six faces, twelve edges and eight corners turned up."""
 
 
-def missing_motion(factor, values, statuses, param_names, modelled, priors, tolerances, gravity, pose_sd, turn_sd):
+def missing_motion(model, factor, values, statuses, tolerances, pose_sd, turn_sd):
     """
     Name the standard pose or turn that lowers the worst sd of each sensor most.
 
@@ -20,11 +21,12 @@ def missing_motion(factor, values, statuses, param_names, modelled, priors, tole
 
     Parameters
     ----------
-    factor : array, shape (30, 30)
+    model : HandModel
+    factor : array, shape (n, n)
         Weighted equations so far.
+    values : array, shape (n,)
     statuses : sequence of str
-    modelled : array of bool, shape (30,)
-        Parameters that are in the model.
+    tolerances : array, shape (n,)
     pose_sd, turn_sd : float
         Accuracy expected of one more pose (m/s^2) and turn (rad).
 
@@ -34,18 +36,17 @@ def missing_motion(factor, values, statuses, param_names, modelled, priors, tole
         {'parameters': {name: sd over tolerance}, 'needs': sentence} for each sensor that is not fully determined.
 
     """
-    advice, sure = [], np.where(modelled, priors, 1e-9 * priors)
-    groups = ((ACCELEROMETER, _pose_candidates(values, gravity, pose_sd)),
-              (slice(GYRO_BIAS.start, GYRO_MATRIX.stop), _turn_candidates(turn_sd)))
-    for group, candidates in groups:
-        index = np.arange(N_PARAMS)[group][modelled[group]]
+    advice = []
+    groups = ((model.index_of('accelerometer'), _pose_candidates(model, values, pose_sd)),
+              (model.index_of('gyroscope'), _turn_candidates(model, turn_sd)))
+    for index, candidates in groups:
         lacking = [k for k in index if statuses[k] != 'determined']
         if not lacking:
             continue
-        before = _predicted(factor, sure, tolerances)
-        scores = [(_score(_predicted(np.vstack([factor, rows]), sure, tolerances)[lacking]), needs) for rows, needs in candidates]
+        before = _predicted(factor, model.priors, tolerances)
+        scores = [(_score(_predicted(np.vstack([factor, rows]), model.priors, tolerances)[lacking]), needs) for rows, needs in candidates]
         best = min(scores, key=lambda s: s[0])
-        advice.append({'parameters': {param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
+        advice.append({'parameters': {model.param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
     return tuple(advice)
 
 
@@ -59,24 +60,25 @@ def _predicted(rows, priors, tolerances):
     return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
 
 
-def _pose_candidates(values, gravity, sd):
+def _pose_candidates(model, values, sd):
     bias, matrix, *_ = unpack(values)
     for up in STANDARD_POSES:
-        columns = norm_rows(values, (bias + gravity * matrix @ up)[None], gravity)[1]
-        yield np.pad(columns / sd, ((0, 0), (0, N_PARAMS - columns.shape[1]))), f'hold it still with {_direction(up)} up'
+        # temperature and time as at the reference point: one more pose there says nothing of thermal effects
+        rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], np.zeros(1), np.full(1, model.model.temperature_ref_c))[1]
+        yield rows / sd, f'hold it still with {_direction(up)} up'
 
 
 def _direction(up):
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
-def _turn_candidates(sd):
+def _turn_candidates(model, sd):
     """Half turns about each axis held level, gravity first along either of the other two."""
     for axis, first in itertools.permutations(range(3), 2):
         about, up = np.eye(3)[axis], np.eye(3)[first]
         carried = -up  # after half a turn about a level axis
         across = np.array([about, np.cross(about, up)])
-        rows = np.zeros((2, N_PARAMS))
+        rows = np.zeros((2, model.size))
         rows[:, GYRO_MATRIX] = (across @ skew(carried) @ _psi_by_matrix(about)).reshape(2, 9)
         yield rows / sd, (f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
                           'still before and after')

@@ -6,9 +6,11 @@ from scipy.special import fdtrc
 from imu_calibration.by_hand_system import Poses, TurnData
 
 
-def average_poses(imu, ranges):
+def average_poses(imu, ranges, temperature_c=None):
     """
     Return (Poses, noise): means over the intervals, with the sd that the noise within them leaves.
+
+    `temperature_c` is that of the samples, shape (n,), when it was recorded.
 
     The noise need not be white: means of pieces of half a second or more say by how much sums of samples scatter beyond it.
     """
@@ -19,7 +21,8 @@ def average_poses(imu, ranges):
     rate_sd, rate_colour = _pooled_noise(rate)
     start, stop = np.array(ranges).T
     poses = Poses(np.array([f.mean(0) for f in force]), np.array([w.mean(0) for w in rate]), force_sd * force_colour / np.sqrt(count),
-                  rate_sd * rate_colour / np.sqrt(count), start, stop)
+                  rate_sd * rate_colour / np.sqrt(count), start, stop, 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0]),
+                  None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges]))
     period = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
     return poses, {'force_noise_sd': force_sd.tolist(), 'rate_noise_sd': rate_sd.tolist(), 'force_noise_colour': force_colour.tolist(),
                    'rate_noise_colour': rate_colour.tolist(), 'period': period}
@@ -51,8 +54,8 @@ def distinct_attitudes(force, apart):
     return len(kept)
 
 
-def collect_turns(time, imu, poses, noise, settings):
-    """Return (turns between consecutive poses, {reason: count of those left out})."""
+def collect_turns(time, imu, poses, noise, settings, temperature_c=None):
+    """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
     limit = max(settings.gap, 5 * noise['period'])
     extreme = np.max(np.abs(rate), axis=0)
@@ -63,7 +66,8 @@ def collect_turns(time, imu, poses, noise, settings):
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
         density = np.mean((np.array(noise['rate_noise_sd']) * noise['rate_noise_colour'])**2) * noise['period']
-        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0])))
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
+                              temperature_c=None if temperature_c is None else temperature_c[piece]))
     return turns, dropped
 
 
@@ -78,7 +82,7 @@ def _unusable(time, rate, extreme, gap, longest):
     return ''
 
 
-def known_turn_data(time, imu, turn, noise, settings):
+def known_turn_data(time, imu, turn, noise, settings, temperature_c=None):
     """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
@@ -87,7 +91,7 @@ def known_turn_data(time, imu, turn, noise, settings):
     density = np.mean(np.square(noise['rate_noise_sd'])) * noise['period']
     noise_variance = density * (time[piece][-1] - time[piece][0])
     return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
-                    rotation_cov=cov)
+                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
 
 
 def g_sensitivity_evidence(poses):

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.by_hand_system import (
-    ACCELEROMETER, GYRO_BIAS, LOWER, N_PARAMS, NOMINAL, State, build_system, moved, norm_rows, unpack)
+from imu_calibration.by_hand_model import ACCELEROMETER, GYRO_BIAS, LOWER, unpack
+from imu_calibration.by_hand_system import State, build_system, moved
 from imu_calibration.variance_components import Scatter, estimate_scatter
 
 ITERATIONS = 15
@@ -22,30 +22,29 @@ class Solution:
     state: State
     """Parameters, directions and drifts."""
     covariance: np.ndarray
-    """Covariance of the parameters, shape (30, 30)."""
+    """Covariance of the parameters, shape (n, n)."""
     held: np.ndarray
-    """True where the prior's value was kept, shape (30,)."""
+    """True where the prior's value was kept, shape (n,)."""
     scatter: Scatter
     """Scatter of poses, drifts and turns beyond the noise."""
     factor: np.ndarray
-    """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (30, 30)."""
+    """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (n, n)."""
     steps: int
     """Gauss-Newton steps taken."""
 
 
-def solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback):
+def solve_joint(model, poses, turns, gravity_sd, fallback):
     """
     Estimate all parameters from poses and turns.
 
     Parameters
     ----------
+    model : HandModel
+        Parameters, priors, gravity.
     poses : Poses
     turns : list of TurnData
-    gravity, gravity_sd : float
-    modelled : array of bool, shape (30,)
-        Parameters that are part of the model; the others keep their nominal value for certain.
-    priors : array, shape (30,)
-        Sd of each parameter about its nominal value before any data.
+    gravity_sd : float
+        Sd of gravity, m/s^2.
     fallback : array, shape (3,)
         Variances of `COMPONENTS` where the data are too few to estimate them.
 
@@ -54,16 +53,16 @@ def solve_joint(poses, turns, gravity, gravity_sd, modelled, priors, fallback):
     Solution
 
     """
-    memory = {}
-    state = _first_state(poses, gravity, priors)
-    state, scatter, steps = _iterate(state, poses, turns, gravity, modelled, priors, fallback, fallback, memory)
-    held = np.zeros(N_PARAMS, bool)
-    held[modelled] = choose_held(_factor(state, poses, turns, gravity, scatter, memory)[:, modelled], priors[modelled])
-    state = State(np.where(held, NOMINAL, state.values), state.up, state.drift)
+    memory, priors = {}, model.priors
+    state = _first_state(model, poses)
+    every = np.ones(model.size, bool)
+    state, scatter, steps = _iterate(model, state, poses, turns, every, priors, fallback, fallback, memory)
+    held = choose_held(_factor(model, state, poses, turns, scatter, memory), priors)
+    state = State(np.where(held, model.nominal, state.values), state.up, state.drift)
     start = np.maximum(scatter.variance, 0.01 * fallback)
-    state, scatter, more = _iterate(state, poses, turns, gravity, modelled & ~held, LOOSE * priors, start, fallback, memory)
-    factor = _factor(state, poses, turns, gravity, scatter, memory)
-    cov = _covariance(factor, modelled & ~held, held, priors, state.values, gravity_sd / gravity)
+    state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
+    factor = _factor(model, state, poses, turns, scatter, memory)
+    cov = _covariance(factor, ~held, held, priors, state.values, gravity_sd / model.gravity)
     return Solution(state, cov, held, scatter, factor, steps + more)
 
 
@@ -93,13 +92,13 @@ def _data_sd(scaled):
     return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
 
 
-def _first_state(poses, gravity, priors):
+def _first_state(model, poses):
     """Fit the norms alone, then take directions and the gyroscope's bias from the poses."""
-    values = NOMINAL.copy()
+    values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     for _ in range(ITERATIONS):
-        residual, columns = norm_rows(values, poses.force, gravity)
-        rows = np.vstack([columns / (1e-3 * gravity), np.diag(1 / priors[ACCELEROMETER])])
-        target = np.concatenate([residual / (1e-3 * gravity), (NOMINAL - values)[ACCELEROMETER] / priors[ACCELEROMETER]])
+        residual, columns = model.norm_rows(values, poses.force, poses.time, poses.temperature_c)
+        rows = np.vstack([columns[:, ACCELEROMETER] / (1e-3 * gravity), np.diag(1 / priors[ACCELEROMETER])])
+        target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[ACCELEROMETER] / priors[ACCELEROMETER]])
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
         values[ACCELEROMETER] += step
         if np.max(np.abs(step)) < 1e-10:
@@ -110,15 +109,15 @@ def _first_state(poses, gravity, priors):
     return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
 
 
-def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, memory):
+def _iterate(model, state, poses, turns, free, priors, variance, fallback, memory):
     """Repeat steps and scatter estimates until neither moves."""
     count = len(poses.start)
     scatter = Scatter(np.array(variance, float), np.full(len(fallback), np.inf), np.full(len(fallback), np.nan))
     for number in range(1, ITERATIONS + 1):
-        system = build_system(state, poses, turns, gravity, memory)
+        system = build_system(model, state, poses, turns, memory)
         design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),
-                            np.hstack([np.zeros((free.sum(), 5 * count)), np.eye(N_PARAMS)[free][:, free]])])
-        residual = np.concatenate([system.residual, (NOMINAL - state.values)[free]])
+                            np.hstack([np.zeros((free.sum(), 5 * count)), np.eye(model.size)[free][:, free]])])
+        residual = np.concatenate([system.residual, (model.nominal - state.values)[free]])
         noise = np.concatenate([system.noise, priors[free]**2])
         group = np.concatenate([system.component, np.full(free.sum(), -1)])
         before = scatter.variance
@@ -127,7 +126,7 @@ def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, mem
         root = np.sqrt(scatter.total(noise, group))
         orthogonal, factor = np.linalg.qr(design / root[:, None])
         reduced = scipy.linalg.solve_triangular(factor, orthogonal.T @ (residual / root))
-        step = np.zeros(5 * count + N_PARAMS)
+        step = np.zeros(5 * count + model.size)
         step[np.concatenate([np.ones(5 * count, bool), free])] = reduced
         state = moved(state, step, count)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
@@ -136,9 +135,9 @@ def _iterate(state, poses, turns, gravity, free, priors, variance, fallback, mem
     return state, scatter, number
 
 
-def _factor(state, poses, turns, gravity, scatter, memory):
+def _factor(model, state, poses, turns, scatter, memory):
     """Return the triangular factor of the parameters with directions and drifts eliminated, at inflated variances."""
-    system = build_system(state, poses, turns, gravity, memory)
+    system = build_system(model, state, poses, turns, memory)
     root = np.sqrt(scatter.total(system.noise, system.component, inflated=True))
     full = np.linalg.qr(np.hstack([system.nuisance, system.main]) / root[:, None], mode='r')
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]

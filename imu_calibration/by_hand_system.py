@@ -4,20 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.by_hand_model import GYRO_BIAS, GYRO_MATRIX, LOWER, unpack
 from imu_calibration.reference import skew
 from imu_calibration.turn_integration import integrate_turn, small_rotation
 
-LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
-"""Entries of the accelerometer matrix that the gauge leaves free."""
-AXES = 'xyz'
-PARAM_NAMES = (
-    *(f'accelerometer.bias.{a}' for a in AXES), *(f'accelerometer.matrix.{AXES[i]}{AXES[j]}' for i, j in LOWER),
-    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES),
-    *(f'gyroscope.gyro_g_sensitivity.{a}{b}' for a in AXES for b in AXES))
-N_PARAMS = len(PARAM_NAMES)
-ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX, SENSITIVITY = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 30)
-NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 9], float)
-"""Zero bias, identity matrices, no g-sensitivity."""
 COMPONENTS = ('pose', 'drift', 'turn')
 """Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
 
@@ -44,6 +34,10 @@ class Poses:
     """Index of the first sample, shape (k,)."""
     stop: np.ndarray
     """Index after the last sample, shape (k,)."""
+    time: np.ndarray | None = None
+    """Middle of each interval, seconds since the first sample, shape (k,)."""
+    temperature_c: np.ndarray | None = None
+    """Mean temperature, shape (k,), when it was recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +60,8 @@ class TurnData:
     """Known rotation vector about a body axis, rad, shape (3,); None when gravity is the reference."""
     rotation_cov: np.ndarray | None = None
     """Covariance of `rotation`, shape (3, 3)."""
+    temperature_c: np.ndarray | None = None
+    """Temperature, shape (n,), when it was recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +69,7 @@ class State:
     """Everything that is estimated."""
 
     values: np.ndarray
-    """Parameters in `PARAM_NAMES` order, shape (30,)."""
+    """Parameters in the order of the `HandModel`, shape (n,)."""
     up: np.ndarray
     """True direction of the specific force in each pose, unit vectors, shape (k, 3)."""
     drift: np.ndarray
@@ -89,19 +85,11 @@ class System:
     nuisance: np.ndarray
     """Columns of directions (2 per pose) and drifts (3 per pose), shape (m, 5k)."""
     main: np.ndarray
-    """Columns of the parameters, shape (m, 30)."""
+    """Columns of the parameters, shape (m, n)."""
     noise: np.ndarray
     """Known variance of each row, shape (m,)."""
     component: np.ndarray
     """Index into `COMPONENTS`, or -1, shape (m,)."""
-
-
-def unpack(values):
-    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix, g-sensitivity)."""
-    matrix = np.zeros((3, 3))
-    for value, (i, j) in zip(values[3:9], LOWER):
-        matrix[i, j] = value
-    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3), values[SENSITIVITY].reshape(3, 3)
 
 
 def tangent(up):
@@ -120,79 +108,62 @@ def moved(state, step, n_poses):
                  state.drift + step[2 * n_poses:5 * n_poses].reshape(-1, 3))
 
 
-def norm_rows(values, force, gravity):
-    """
-    Return ``|matrix^-1 (force - bias)| - gravity`` and minus its derivative by the nine accelerometer parameters.
-
-    Parameters
-    ----------
-    values : array, shape (9,) or (30,)
-    force : array, shape (k, 3)
-        Mean readings at rest.
-    gravity : float
-
-    """
-    bias, matrix = unpack(np.concatenate([values[:9], NOMINAL[9:]]))[:2]
-    true = np.linalg.solve(matrix, (force - bias).T).T
-    norm = np.linalg.norm(true, axis=1)
-    back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
-    columns = [back] + [(back[:, i] * true[:, j])[:, None] for i, j in LOWER]
-    return norm - gravity, np.hstack(columns)
-
-
-def build_system(state, poses, turns, gravity, memory=None):
+def build_system(model, state, poses, turns, memory=None):
     """
     Stack the rows of poses, bias drifts and turns at the current state.
 
     Parameters
     ----------
+    model : HandModel
     state : State
     poses : Poses
     turns : list of TurnData
-    gravity : float
     memory : dict, optional
         Turns integrated before; near their parameters they are corrected to first order instead of being integrated anew.
 
     """
     memory = {} if memory is None else memory
     across = tangent(state.up)
-    rows = [_pose_rows(state, poses, gravity, across), _drift_rows(state, poses, gravity), _calm_rows(state, poses)]
+    rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
     for key, turn in enumerate(turns):
-        rows.append(_gravity_turn_rows(state, turn, key, memory, across) if turn.rotation is None else _known_turn_rows(state, turn))
+        rows.append(_gravity_turn_rows(model, state, turn, key, memory, across) if turn.rotation is None
+                    else _known_turn_rows(model, state, turn))
     return System(*(np.concatenate(parts) for parts in zip(*rows)))
 
 
-def _pose_rows(state, poses, gravity, across):
-    """``force = bias + matrix @ (gravity * up)``: three rows per pose, two of them spent on its direction."""
+def _pose_rows(model, state, poses, across):
+    """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them spent on its direction."""
     bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
-    true = gravity * state.up
-    residual = poses.force - bias - true @ matrix.T
-    main = np.zeros((count, 3, N_PARAMS))
+    true = model.gravity * state.up
+    more, slopes = model.further('accelerometer', state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
     for column, (i, j) in enumerate(LOWER):
         main[:, i, 3 + column] = true[:, j]
+    main[:, :, model.extra_index('accelerometer')] = slopes
     nuisance = np.zeros((count, 3, 5 * count))
-    blocks = gravity * matrix @ across
+    blocks = model.gravity * matrix @ across
     for k in range(count):
         nuisance[k, :, 2 * k:2 * k + 2] = blocks[k]
-    return _flat(residual, nuisance, main, poses.force_sem**2, 0)
+    return _flat(poses.force - bias - true @ matrix.T - more, nuisance, main, poses.force_sem**2, 0)
 
 
-def _drift_rows(state, poses, gravity):
-    """``rate = bias + sensitivity @ (gravity * up) + drift`` at rest."""
+def _drift_rows(model, state, poses):
+    """``rate = bias + further effects (gravity * up) + drift`` at rest."""
     count = len(state.up)
-    residual = poses.rate - state.values[GYRO_BIAS] - gravity * state.up @ unpack(state.values)[4].T - state.drift
-    main = np.zeros((count, 3, N_PARAMS))
+    true = model.gravity * state.up
+    more, slopes = model.further('gyroscope', state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    main = np.zeros((count, 3, model.size))
     main[:, :, GYRO_BIAS] = np.eye(3)
-    main[:, :, SENSITIVITY] = np.einsum('ip,kq->kipq', np.eye(3), gravity * state.up).reshape(count, 3, 9)
-    return _flat(residual, _drift_columns(count), main, poses.rate_sem**2, -1)
+    main[:, :, model.extra_index('gyroscope')] = slopes
+    return _flat(poses.rate - state.values[GYRO_BIAS] - more - state.drift, _drift_columns(count), main, poses.rate_sem**2, -1)
 
 
-def _calm_rows(state, poses):
+def _calm_rows(model, state, poses):
     """``0 = drift`` within its own scatter."""
     count = len(state.up)
-    return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, N_PARAMS)), (CALM * poses.rate_sem)**2, 1)
+    return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, model.size)), (CALM * poses.rate_sem)**2, 1)
 
 
 def _drift_columns(count):
@@ -202,31 +173,30 @@ def _drift_columns(count):
     return nuisance
 
 
-def _integrated(state, data, bias, key, memory):
+def _integrated(model, state, data, bias, key, memory):
     """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly moved since."""
-    _, _, _, matrix, sensitivity = unpack(state.values)
+    matrix, further = unpack(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
-        (old_bias, old_matrix, old_sensitivity), turn = memory[key]
-        psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
-               + turn.by_sensitivity.reshape(3, 9) @ (sensitivity - old_sensitivity).ravel())
+        (old_bias, old_matrix, old_further), turn = memory[key]
+        psi = turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel() + turn.by_further @ (further - old_further)
         if np.linalg.norm(psi) < NEAR:
             return small_rotation(-psi) @ turn.mat_ji, turn
-    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, _true_force(state, data))
-    memory[key] = ((bias, matrix, sensitivity), turn)
+    turn = integrate_turn(data.time, data.rate, bias, matrix, _further_of_turn(model, state, data, bias))
+    memory[key] = ((bias, matrix, further), turn)
     return turn.mat_ji, turn
 
 
-def _gravity_turn_rows(state, data, key, memory, across):
+def _gravity_turn_rows(model, state, data, key, memory, across):
     """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows."""
     count, i, j = len(state.up), data.first, data.last
-    mat_ji, turn = _integrated(state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    mat_ji, turn = _integrated(model, state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
     carried = mat_ji @ state.up[i]
     across_i, across_j = across[i], across[j]
     by_psi = across_j.T @ skew(carried)
-    main, nuisance = np.zeros((2, N_PARAMS)), np.zeros((2, 5 * count))
+    main, nuisance = np.zeros((2, model.size)), np.zeros((2, 5 * count))
     main[:, GYRO_BIAS] = by_psi @ turn.by_bias
     main[:, GYRO_MATRIX] = by_psi @ turn.by_matrix.reshape(3, 9)
-    main[:, SENSITIVITY] = by_psi @ turn.by_sensitivity.reshape(3, 9)
+    main[:, model.extra_index('gyroscope')] = by_psi @ turn.by_further
     nuisance[:, 2 * i:2 * i + 2] += across_j.T @ mat_ji @ across_i
     nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
     for pose in (i, j):
@@ -234,27 +204,29 @@ def _gravity_turn_rows(state, data, key, memory, across):
     return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2)
 
 
-def _known_turn_rows(state, data):
-    """``matrix^-1 integral(measured - bias) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
-    _, _, bias, matrix, sensitivity = unpack(state.values)
-    force = _true_force(state, data)
-    turn = integrate_turn(data.time, data.rate, bias, matrix, sensitivity, force)
-    impulse = 0.5 * np.diff(data.time) @ (force[:-1] + force[1:])
+def _known_turn_rows(model, state, data):
+    """``matrix^-1 integral(measured - bias - further effects) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
+    _, _, bias, matrix = unpack(state.values)
+    further = _further_of_turn(model, state, data, bias)
+    turn = integrate_turn(data.time, data.rate, bias, matrix, further)
     inverse = np.linalg.inv(matrix)
     rotation = inverse @ turn.integral
-    main = np.zeros((3, N_PARAMS))
+    main = np.zeros((3, model.size))
     main[:, GYRO_BIAS] = -turn.duration * inverse
     main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
-    main[:, SENSITIVITY] = -np.einsum('rp,q->rpq', inverse, impulse).reshape(3, 9)
+    impulse = np.einsum('m,mip->ip', np.diff(data.time), 0.5 * (further[1][:-1] + further[1][1:]))
+    main[:, model.extra_index('gyroscope')] = -inverse @ impulse
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
     return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
 
 
-def _true_force(state, data):
-    bias, matrix = unpack(state.values)[:2]
-    return np.linalg.solve(matrix, (data.force - bias).T).T
+def _further_of_turn(model, state, data, bias):
+    """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
+    bias_f, matrix_f, _, matrix = unpack(state.values)
+    force, rate = np.linalg.solve(matrix_f, (data.force - bias_f).T).T, np.linalg.solve(matrix, (data.rate - bias).T).T
+    return model.further('gyroscope', state.values, force, rate, data.time, data.temperature_c)
 
 
 def _flat(residual, nuisance, main, noise, component):
-    return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, N_PARAMS), noise.ravel(),
+    return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, main.shape[-1]), noise.ravel(),
             np.full(residual.size, component))

@@ -20,19 +20,19 @@ class Turn:
     """Derivative of psi by the bias, ``delta mat_ji = -[psi x] mat_ji``, shape (3, 3), s."""
     by_matrix: np.ndarray
     """Derivative of psi by the entries [row, column] of the forward matrix, shape (3, 3, 3)."""
-    by_sensitivity: np.ndarray
-    """Derivative of psi by the entries [row, column] of the g-sensitivity, shape (3, 3, 3); zeros without forces."""
+    by_further: np.ndarray
+    """Derivative of psi by the parameters of further effects, shape (3, p)."""
     integral: np.ndarray
-    """Integral of ``measured - bias - sensitivity @ force``, shape (3,), rad."""
+    """Integral of ``measured - bias - further effects``, shape (3,), rad."""
     angle: float
     """Path of the rotation: integral of the rate's length, rad."""
     duration: float
     """Seconds from first to last sample."""
 
 
-def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=None):
+def integrate_turn(time, rate_measured, bias, matrix, further=None):
     """
-    Integrate ``rate = matrix^-1 (measured - bias - sensitivity @ force)`` over one stretch of samples.
+    Integrate ``rate = matrix^-1 (measured - bias - further effects)`` over one stretch of samples.
 
     The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12 (w1' - w0') + h^2/12 w0 x w1``
     with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by
@@ -45,11 +45,9 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     rate_measured : array, shape (n, 3)
         Gyroscope readings, rad/s.
     bias, matrix : arrays, shape (3,) and (3, 3)
-        Forward model ``measured = bias + matrix @ rate + sensitivity @ force``.
-    sensitivity : array, shape (3, 3), optional
-        Response to specific force, (rad/s)/(m/s^2).
-    force : array, shape (n, 3), optional
-        Specific force, m/s^2.
+        Forward model ``measured = bias + matrix @ rate + further effects``.
+    further : tuple, optional
+        What further effects add to the readings, shape (n, 3), and its derivative by their p parameters, shape (n, 3, p).
 
     Returns
     -------
@@ -57,7 +55,7 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
 
     """
     inverse = np.linalg.inv(matrix)
-    centred = rate_measured - bias if force is None else rate_measured - bias - force @ sensitivity.T
+    centred = rate_measured - bias if further is None else rate_measured - bias - further[0]
     rate = centred @ inverse.T
     step = np.diff(time)
     first, second = rate[:-1], rate[1:]
@@ -74,10 +72,10 @@ def integrate_turn(time, rate_measured, bias, matrix, sensitivity=None, force=No
     weight = _per_sample(gain, step, first, second, slopes)
     by_inverse = np.einsum('mir,mc->irc', weight, centred)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
-    by_sensitivity = np.zeros((3, 3, 3)) if force is None else -np.einsum('mip,mq->ipq', weight @ inverse, force)
+    by_further = np.zeros((3, 0)) if further is None else -np.einsum('mij,mjp->ip', weight @ inverse, further[1])
     path = float(np.sum(0.5 * step * np.linalg.norm(first + second, axis=1)))
     integral = 0.5 * np.sum(step[:, None] * (centred[:-1] + centred[1:]), axis=0)
-    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_sensitivity, integral, path, float(time[-1] - time[0]))
+    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_further, integral, path, float(time[-1] - time[0]))
 
 
 def small_rotation(vector):

@@ -6,16 +6,20 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand import ByHandSettings, KnownTurn, calibrate_by_hand
 from imu_calibration.by_hand_poses import g_sensitivity_evidence
-from imu_calibration.by_hand_system import (
-    N_PARAMS, NOMINAL, PARAM_NAMES, SENSITIVITY, Poses, State, TurnData, build_system, moved, norm_rows, unpack)
+from imu_calibration.by_hand_model import HandModel, unpack
+from imu_calibration.by_hand_system import Poses, State, TurnData, build_system, moved
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.gathering import NominalScaling
 from imu_calibration.samples import ImuSamples
+from imu_calibration.sensor_model import SensorModel
 from imu_calibration.still_search import find_still
 from imu_calibration.turn_integration import integrate_turn
 from imu_calibration.variance_components import estimate_scatter
 
 GRAVITY = 9.81
+FULL = HandModel(SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), GRAVITY)
+"""Truths are laid out as the parameters of this model."""
+NOMINAL, PARAM_NAMES, SENSITIVITY = FULL.nominal, FULL.param_names, slice(21, 30)
 FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 
 
@@ -44,7 +48,7 @@ def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.
     """A recording held still in poses with turns between; returns (imu, ranges, true parameters)."""
     rng = np.random.default_rng(seed)
     truth = random_truth(rng, sensitivity) if truth is None else truth
-    bias_f, matrix_f, bias_w, matrix_w, response = unpack(truth)
+    (bias_f, matrix_f, bias_w, matrix_w), response = unpack(truth), truth[SENSITIVITY].reshape(3, 3)
     attitude = Rotation.random(random_state=rng) if attitudes is None else attitudes[0]
     count, force, rate, ranges, total = int(still / period), [], [], [], 0
     for pose in range(n_poses):
@@ -85,7 +89,11 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
     time = np.cumsum(rng.uniform(0.008, 0.012, 300))
     rate, force = rng.normal(0, 2, (300, 3)), rng.normal(0, 9, (300, 3))
     bias, matrix, response = rng.normal(0, 0.1, 3), np.eye(3) + rng.normal(0, 0.05, (3, 3)), rng.normal(0, 1e-3, (3, 3))
-    turn = integrate_turn(time, rate, bias, matrix, response, force)
+
+    def further(response):
+        return force @ response.T, np.einsum('ip,nq->nipq', np.eye(3), force).reshape(300, 3, 9)
+
+    turn = integrate_turn(time, rate, bias, matrix, further(response))
     true = np.linalg.solve(matrix, (rate - bias - force @ response.T).T).T
     step = np.diff(time)[:, None]
     slope = np.gradient(true, time, axis=0)
@@ -95,14 +103,14 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
         attitude = attitude * Rotation.from_rotvec(vector)
     np.testing.assert_allclose(turn.mat_ji, attitude.as_matrix().T, atol=1e-12)
 
-    def psi(*changed):
-        return -Rotation.from_matrix(integrate_turn(time, rate, *changed, force).mat_ji @ turn.mat_ji.T).as_rotvec()
+    def psi(bias, matrix, response):
+        return -Rotation.from_matrix(integrate_turn(time, rate, bias, matrix, further(response)).mat_ji @ turn.mat_ji.T).as_rotvec()
 
     def slope(make, size=1e-6):
         return np.stack([(psi(*make(size * e)) - psi(*make(-size * e))) / (2 * size) for e in np.eye(9)], axis=1)
 
     np.testing.assert_allclose(slope(lambda e: (bias + e[:3], matrix, response))[:, :3], turn.by_bias, rtol=1e-6, atol=1e-8)
-    by_matrix, by_response = turn.by_matrix.reshape(3, 9), turn.by_sensitivity.reshape(3, 9)
+    by_matrix, by_response = turn.by_matrix.reshape(3, 9), turn.by_further
     np.testing.assert_allclose(slope(lambda e: (bias, matrix + e.reshape(3, 3), response)), by_matrix, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(slope(lambda e: (bias, matrix, response + e.reshape(3, 3))), by_response, rtol=1e-6, atol=1e-6)
 
@@ -129,13 +137,13 @@ def test_system_is_the_derivative_of_its_residuals():
     data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
     known = TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))
     turns = [TurnData(*data, 0, 1), TurnData(*data, 1, 2), known]
-    system = build_system(state, poses, turns, GRAVITY)
+    system = build_system(FULL, state, poses, turns)
     design = np.hstack([system.nuisance, system.main])
     size = 1e-6
     slopes = []
     for step in size * np.eye(design.shape[1]):
         # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
-        ahead, behind = (build_system(moved(state, s * step, 3), poses, turns, GRAVITY).residual for s in (1, -1))
+        ahead, behind = (build_system(FULL, moved(state, s * step, 3), poses, turns).residual for s in (1, -1))
         slopes.append(-(ahead - behind) / (2 * size))
     slopes = np.array(slopes).T
     accelerometer = np.arange(15, 24)
@@ -150,10 +158,10 @@ def test_system_is_the_derivative_of_its_residuals():
 def test_norm_rows_are_minus_the_derivative_of_the_norm():
     rng = np.random.default_rng(3)
     values, force = random_truth(rng), rng.normal(0, 9, (5, 3))
-    columns = norm_rows(values, force, GRAVITY)[1]
+    columns = FULL.norm_rows(values, force)[1]
     for k in range(9):
-        step = 1e-6 * np.eye(N_PARAMS)[k]
-        slope = (norm_rows(values + step, force, GRAVITY)[0] - norm_rows(values - step, force, GRAVITY)[0]) / 2e-6
+        step = 1e-6 * np.eye(FULL.size)[k]
+        slope = (FULL.norm_rows(values + step, force)[0] - FULL.norm_rows(values - step, force)[0]) / 2e-6
         np.testing.assert_allclose(columns[:, k], -slope, rtol=1e-6, atol=1e-7)
 
 
@@ -315,7 +323,7 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
     tilts = [Rotation.from_rotvec([angle, 0, 0]) for angle in np.linspace(0, 5.5, 12)]
     imu, ranges, truth = simulate(15, attitudes=tilts, wobble=0.0)
     _, rate = turn_samples(Rotation.identity(), [0, 0, 2 * np.pi], [0, 0, 0], 0.02, 4.0)
-    bias_f, matrix_f, bias_w, matrix_w, _ = unpack(truth)
+    bias_f, matrix_f, bias_w, matrix_w = unpack(truth)
     extra = ImuSamples(imu.stamp_ns[-1] + 20_000_000 * np.arange(1, len(rate) + 1),
                        np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)), rate @ matrix_w.T + bias_w)
     both = ImuSamples.concatenate([imu, extra])
