@@ -1,5 +1,7 @@
 """A calibration by hand as the same document and result that a calibration on a table gives."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 import imu_calibration
@@ -8,7 +10,7 @@ from imu_calibration.calibration import Calibration, statuses, tolerances_of
 from imu_calibration.errors import InputError
 from imu_calibration.gathering import Gathered
 from imu_calibration.noise import STANDARD_GRAVITY
-from imu_calibration.sensor_model import SensorModel
+from imu_calibration.samples import ImuSamples
 from imu_calibration.stream_check import StreamCheck
 
 SENSORS = ('accelerometer', 'gyroscope')
@@ -16,9 +18,29 @@ GRAVITY_SD = 0.02
 """What the standard gravity may be off by where nobody knows the local one, m/s^2."""
 
 
-def read_imu(blocks):
+@dataclass(frozen=True, eq=False)
+class HandRecording:
+    """A recording without joints, cleaned."""
+
+    imu: ImuSamples
+    """Accepted samples."""
+    temperature_c: np.ndarray | None
+    """Temperature at the samples, degrees Celsius, shape (n,), when it was recorded."""
+    counts: dict
+    """Reason -> samples that could not be used."""
+
+    @property
+    def gathered(self):
+        """What a document says of the recording besides its parameters."""
+        imu, warm = self.imu, self.temperature_c
+        return Gathered(counts=self.counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
+                        largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()),
+                        temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
+
+
+def read_by_hand(blocks, nominal=None):
     """
-    Return (ImuSamples, counts of what was dropped) of a whole recording, cleaned.
+    Return the `HandRecording` of a whole stream of SampleBlock; `nominal` converts counts or volts.
 
     Raises
     ------
@@ -26,21 +48,33 @@ def read_imu(blocks):
         When no usable sample is left.
 
     """
-    check, parts, counts = StreamCheck(), [], {}
+    checks, parts, counts = {'imu': StreamCheck(), 'temperature': StreamCheck()}, {'imu': [], 'temperature': []}, {}
     for block in blocks:
         for reason, count in (block.dropped or {}).items():
             counts[reason] = counts.get(reason, 0) + count
-        if block.imu is not None and len(block.imu):
-            parts += check.push(block.imu)
-    parts = [samples for _, samples in parts + check.finish() if len(samples)]
-    if not parts:
+        for name, check in checks.items():
+            parts[name] += check.push(getattr(block, name))
+    for name, check in checks.items():
+        parts[name] = [samples for _, samples in parts[name] + check.finish() if len(samples)]
+    if not parts['imu']:
         raise InputError('the recording must hold Imu messages that can be used, it holds none; check the topic')
-    for reason, count in check.counts.items():
+    for reason, count in checks['imu'].counts.items():
         counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
-    return type(parts[0]).concatenate(parts), {reason: count for reason, count in counts.items() if count}
+    imu, warm = type(parts['imu'][0]).concatenate(parts['imu']), None
+    if parts['temperature']:
+        known = type(parts['temperature'][0]).concatenate(parts['temperature'])
+        start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
+        warm = np.interp((imu.stamp_ns - start).astype(float), (known.stamp_ns - start).astype(float), known.temperature_c)
+    return HandRecording(imu if nominal is None else nominal.apply(imu), warm, {reason: count for reason, count in counts.items() if count})
 
 
-def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=None, provenance=None):
+def read_imu(blocks):
+    """Return (ImuSamples, counts of what was dropped) of a whole recording, cleaned; raises as `read_by_hand`."""
+    recording = read_by_hand(blocks)
+    return recording.imu, recording.counts
+
+
+def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None):
     """
     Calibrate a recording without a table and return (Calibration, HandCalibration, Gathered, tolerances).
 
@@ -53,13 +87,18 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
         Conversion from counts or volts.
     tolerances : dict, optional
         {section: {effect: tolerance}}.
+    accelerometer, gyroscope : tuple of str, optional
+        Effects to estimate, see `calibrate_by_hand`.
 
     """
-    imu, counts = read_imu(blocks)
-    if nominal is not None:
-        imu = nominal.apply(imu)
+    recording = read_by_hand(blocks, nominal)
+    return calibrate_samples_by_hand(imu, counts, gravity, tolerances, provenance)
+
+
+def calibrate_samples_by_hand(imu, counts, gravity=None, tolerances=None, provenance=None, stills=None):
+    """Calibrate cleaned ImuSamples in SI, of which `counts` were dropped; `stills` as in `calibrate_by_hand`, the rest as above."""
     gravity, gravity_sd = reference_gravity(gravity)
-    hand = calibrate_by_hand(imu, gravity, gravity_sd=gravity_sd)
+    hand = calibrate_by_hand(imu, gravity, stills, gravity_sd=gravity_sd)
     gathered = Gathered(counts=counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
                         largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()))
     calibration, limits = document_of_hand(hand, gathered, len(imu), tolerances, provenance)
@@ -73,8 +112,7 @@ def reference_gravity(gravity):
 
 def document_of_hand(hand, gathered, n_samples, tolerances=None, provenance=None):
     """Return (Calibration, tolerances) of a HandCalibration; arguments as in `calibrate_recording_by_hand`."""
-    responds = any('.gyro_g_sensitivity.' in name for name in hand.param_names)
-    model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity') if responds else ('bias', 'matrix'))
+    model = hand.model.model
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
     sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == 'held' for k in order])
