@@ -135,7 +135,7 @@ class HandCalibration:
 
 
 def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
-                      tolerances=None, model=None, temperature_c=None):
+                      tolerances=None, accelerometer=None, gyroscope=None, temperature_c=None):
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
@@ -158,8 +158,8 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
         Full turns by hand, beside what gravity says.
     tolerances : dict, optional
         {sensor: {effect: sd that is good enough}}; the catalogue's where not given.
-    model : SensorModel, optional
-        What to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
+    accelerometer, gyroscope : tuple of str, optional
+        Effects to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
     temperature_c : array, optional
         Temperature at the samples, shape (n,).
 
@@ -184,14 +184,16 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     turns, dropped = collect_turns(time, imu, poses, noise, settings, temperature_c)
     turns += [known_turn_data(time, imu, turn, noise, settings, temperature_c) for turn in known_turns]
     statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise}
-    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances, model)
+    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances, accelerometer, gyroscope)
 
 
-def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, model=None):
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None):
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`."""
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
-    chosen, evidence = _modelled(poses, settings)
-    model = HandModel(chosen if model is None else model, gravity)
+    default, evidence = _gyroscope_effects(poses, settings)
+    reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
+    model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c), gravity)
+    _check_temperature(model, poses)
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd, fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
@@ -222,14 +224,20 @@ def _settled(model, found):
     return True
 
 
-def _modelled(poses, settings):
-    """Return (the model when none is asked for, what the poses say about g-sensitivity)."""
+def _check_temperature(model, poses):
+    thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
+    if thermal and poses.temperature_c is None:
+        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or leave it out')
+
+
+def _gyroscope_effects(poses, settings):
+    """Return (the gyroscope's effects when nothing is asked for, what the poses say about g-sensitivity)."""
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
         raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
     evidence = g_sensitivity_evidence(poses)
     wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
                                                 and evidence['g_sensitivity_heldout_ratio'] < 1)
-    return SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity') if wanted else ('bias', 'matrix')), evidence
+    return ('bias', 'matrix', 'gyro_g_sensitivity') if wanted else ('bias', 'matrix'), evidence
 
 
 def _statuses(sd, held, tolerances):

@@ -179,15 +179,14 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
     Raises
     ------
     InputError
-        When more than one recording comes, or a model with further effects is asked for.
+        When more than one recording comes, or an effect is asked for that needs a table.
 
     """
     if len(sources) != 1:
         raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
-    for model in (options.accelerometer_model, options.gyroscope_model):
-        if model not in (None, 'bias+matrix', 'axial', 'rate'):
-            raise InputError(f"calibration by hand estimates bias+matrix, '{model}' was asked for; give --table for more")
-    return result_by_hand(*calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance), options)
+    names = {sensor: None if text is None else parse_effects(sensor, text)
+             for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
+    return result_by_hand(*calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance, **names), options)
 
 
 def result_by_hand(calibration, hand, gathered, tolerances, options=CalibrationOptions()):
