@@ -92,16 +92,16 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
 
     """
     recording = read_by_hand(blocks, nominal)
-    return calibrate_samples_by_hand(imu, counts, gravity, tolerances, provenance)
+    return calibrate_samples_by_hand(recording, gravity, tolerances, provenance, accelerometer, gyroscope)
 
 
-def calibrate_samples_by_hand(imu, counts, gravity=None, tolerances=None, provenance=None, stills=None):
-    """Calibrate cleaned ImuSamples in SI, of which `counts` were dropped; `stills` as in `calibrate_by_hand`, the rest as above."""
+def calibrate_samples_by_hand(recording, gravity=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None, stills=None):
+    """Calibrate a HandRecording; `stills` as in `calibrate_by_hand`, the rest and what is returned as in `calibrate_recording_by_hand`."""
     gravity, gravity_sd = reference_gravity(gravity)
-    hand = calibrate_by_hand(imu, gravity, stills, gravity_sd=gravity_sd)
-    gathered = Gathered(counts=counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
-                        largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()))
-    calibration, limits = document_of_hand(hand, gathered, len(imu), tolerances, provenance)
+    hand = calibrate_by_hand(recording.imu, gravity, stills, gravity_sd=gravity_sd, accelerometer=accelerometer, gyroscope=gyroscope,
+                             temperature_c=recording.temperature_c)
+    gathered = recording.gathered
+    calibration, limits = document_of_hand(hand, gathered, len(recording.imu), tolerances, provenance)
     return calibration, hand, gathered, limits
 
 
