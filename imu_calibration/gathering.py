@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_calibration.least_squares import Accumulator
+from imu_calibration.preflight import Preflight
 from imu_calibration.samples import SampleBlock
 from imu_calibration.sensor_model import SensorModel
 from imu_calibration.settings import WindowSettings
@@ -42,6 +43,8 @@ class Gathered:
     """Largest measured component of specific force, m/s^2."""
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
+    findings: tuple = ()
+    """What a look at the recording found before anything was estimated (`preflight.Finding`)."""
 
     @property
     def duration(self):
@@ -151,14 +154,22 @@ def gather(blocks, table, model, settings=WindowSettings(), nominal=None, sessio
     progress : callable, optional
         Called with the number of IMU samples read so far.
 
+    Raises
+    ------
+    InputError
+        At the end of the recording, when it cannot give a right result (`preflight`).
+
     """
     collector, count = Collector(table, model, settings, nominal, session, keep), 0
-    for block in blocks:
+    preflight = Preflight(table.gravity_value, nominal)
+    for block in preflight.watch(blocks):
         collector.push(block)
         count += 0 if block.imu is None else len(block.imu)
         if progress is not None:
             progress(count)
-    return collector.finish()
+    gathered = collector.finish()
+    gathered.findings = preflight.findings
+    return gathered
 
 
 def merge(parts):
@@ -173,6 +184,7 @@ def merge(parts):
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
+        total.findings += part.findings
         ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
         total.temperature_c = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
         if part.first_stamp_ns is not None:

@@ -67,6 +67,7 @@ def join(parts, names, check):
     for session, part in enumerate(parts):
         naming(names, session)(check, part)
         if len(parts) > 1:
+            part.findings = tuple(finding.named(names[session]) for finding in part.findings)
             _require_like_the_first(parts[0], part, names[0], names[session])
     return merge(parts)
 

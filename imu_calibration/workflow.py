@@ -13,6 +13,7 @@ from imu_calibration.diagnosis import diagnose, to_mapping
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior, solve
 from imu_calibration.gathering import Gathered, restrict
+from imu_calibration.preflight import Preflight, unusable, warnings
 from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
 from imu_calibration.settings import WindowSettings
 from imu_calibration.several import GatherStep, join
@@ -186,7 +187,10 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
         raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
     names = {sensor: None if text is None else parse_effects(sensor, text)
              for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
-    return result_by_hand(*calibrate_recording_by_hand(sources[0](), gravity, options.nominal, options.tolerances, provenance, **names), options)
+    preflight = Preflight(gravity, options.nominal)
+    result = result_by_hand(*calibrate_recording_by_hand(preflight.watch(sources[0]()), gravity, options.nominal, options.tolerances, provenance, **names), options)
+    result.gathered.findings = preflight.findings
+    return replace(result, calibration=replace(result.calibration, statistics=result.calibration.statistics | preflight_statistics(preflight.findings)))
 
 
 def result_by_hand(calibration, hand, gathered, tolerances, options=CalibrationOptions()):
@@ -261,7 +265,12 @@ def statistics(solution, gathered):
     result['samples_used'] = dict(sorted(accumulator.samples.items()))
     result['dropped'] = dropped(gathered.counts)
     result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
-    return result
+    return result | preflight_statistics(gathered.findings)
+
+
+def preflight_statistics(findings):
+    """Return the part of the statistics that says what a look at the recording found."""
+    return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
 
 
 ACCEPTED = ('static', 'spin', 'dynamic', 'settling', 'not quiet', 'turn-on', 'too short', 'edge of joints')
@@ -349,7 +358,7 @@ def exit_code(result):
     """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
     calibration = result.calibration
     lacking = any(status != DETERMINED for name, status in zip(calibration.param_names, calibration.status) if requested(name))
-    return 3 if lacking or calibration.statistics.get('dropped') else 0
+    return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0
 
 
 def window_residuals(result):

@@ -8,7 +8,7 @@ from imu_calibration import documents, workflow
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.fleet_pool import jobs_for, process_mapper
 from imu_calibration.cli.progress import progress_bar
-from imu_calibration.cli.show import show_calibration
+from imu_calibration.cli.show import show_calibration, warn
 
 NAME = 'calibrate'
 HELP = 'Write calibration.yaml and report.html from one or several recordings of the same IMU.'
@@ -47,6 +47,7 @@ def _into(folder, options, settings, table):
         else:
             result = _on_table(sources, table, settings, options.bags, jobs)
         result = replace(result, calibration=replace(result.calibration, provenance=result.calibration.provenance | provenance.result()))
+    warn(result.gathered.findings)
     text = documents.calibration_to_text(result.calibration)
     if not options.no_report:
         from imu_calibration.report import calibration_report

@@ -1,6 +1,7 @@
 """What the verbs print: short tables on standard output."""
 
 from imu_calibration import workflow
+from imu_calibration.preflight import warnings
 from imu_calibration.units import for_people, with_sd
 
 
@@ -10,6 +11,13 @@ def console():
 
     from rich.console import Console
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+
+
+def warn(findings):
+    """Print what looks wrong with a recording on standard error, a line each."""
+    import sys
+    for finding in warnings(findings):
+        print(f'warning: {finding.text}', file=sys.stderr)
 
 
 def show_calibration(result, folder, report=True):

@@ -1,0 +1,67 @@
+"""Which axis is which: the exchange of axes and signs that comes closest to a matrix between two frames."""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+CLEAR = 0.8
+"""Agreement from which on an exchange of axes describes the matrix."""
+POOR = 0.6
+"""Agreement of the axes as they are below which they are wrong; a turn by 60 degrees has 0.67."""
+TIE = 0.05
+
+
+def signed_permutations():
+    """Return the 48 matrices that exchange axes and signs, the identity first, then those with few changes; shape (48, 3, 3)."""
+    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+    return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class AxisMatch:
+    """How measured axes lie to those of a reference."""
+
+    matrix: np.ndarray
+    """``measured = scale * matrix @ reference`` as closely as axes and signs can say, shape (3, 3)."""
+    agreement: float
+    """1: as `matrix` says."""
+    as_they_are: float
+    """1: every axis is that of the reference; -1: all turned round."""
+    turned: bool
+    """Whether a rotation explains it."""
+    mirrored: bool
+    """Whether a reflection explains it; with few turns both may."""
+
+    @property
+    def wrong(self):
+        """Return whether the axes are not those of the reference."""
+        return self.as_they_are < POOR
+
+    def words(self, measured, reference):
+        """Return the exchange in words."""
+        rows = [(i, int(np.argmax(np.abs(row))), row.sum()) for i, row in enumerate(self.matrix)]
+        return ', '.join(f"the {measured}'s {'xyz'[i]} is {'minus ' if sign < 0 else ''}the {reference}'s {'xyz'[j]}"
+                         for i, j, sign in rows if i != j or sign < 0)
+
+
+def match_axes(matrix, seen=np.eye(3)):
+    """
+    Return the `AxisMatch` of ``measured = matrix @ reference``.
+
+    Parameters
+    ----------
+    matrix : array, shape (3, 3)
+        Up to a common positive factor; only ``matrix @ seen`` is looked at.
+    seen : array, shape (3, 3)
+        Projector on the directions in which the reference moved.
+
+    """
+    inside = matrix @ seen
+    scale = np.sqrt((inside**2).sum() / np.trace(seen))
+    candidates = signed_permutations()
+    scores = np.einsum('kij,ij->k', candidates, inside) / (scale * np.trace(seen))
+    best = scores.max()
+    near = scores >= best - TIE
+    proper = np.linalg.det(candidates) > 0
+    return AxisMatch(candidates[np.argmax(near)], float(best), float(scores[0]), bool((near & proper).any()), bool((near & ~proper).any()))

@@ -1,0 +1,168 @@
+"""What the checks look at, gathered in one pass over the blocks in bounded memory."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.preflight.chunks import Chunks, ChunkSeries
+from imu_calibration.preflight.extremes import Extremes
+from imu_calibration.preflight.rest import find_rest
+from imu_calibration.preflight.turning import relate_turns
+from imu_calibration.stream_check import StreamCheck, StreamStatistics
+
+STREAMS = ('imu', 'joints', 'temperature')
+IRREGULAR = 0.1
+"""Steps farther than this share from the usual one count as irregular."""
+RESOLUTION_SAMPLES = 20_000
+"""First samples, in which the smallest step between readings is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """One stream of stamps."""
+
+    statistics: StreamStatistics
+    """Rates, gaps, drops."""
+    first_ns: int
+    """Smallest stamp."""
+    last_ns: int
+    """Largest stamp."""
+    irregular: float
+    """Share of the steps that are off the usual one by more than a tenth."""
+
+    @property
+    def real_rate(self):
+        """Samples per second of the time that no gap takes, 0 when unknown."""
+        s = self.statistics
+        time = s.duration - s.gap_total + s.n_gaps * s.period
+        return (s.count - 1) / time if s.count > 1 and time > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A recording as the checks see it; SI after the nominal scaling, when one was given."""
+
+    streams: dict
+    """'imu', 'joints', 'temperature' -> Stream; only those that came."""
+    chunks: Chunks
+    """Readings of the IMU in short chunks."""
+    n_samples: int
+    """IMU samples that were looked at."""
+    n_changed: np.ndarray
+    """How often each of force x, y, z, rate x, y, z differs from the sample before, shape (6,)."""
+    n_repeated: int
+    """Samples whose readings are all those of the sample before."""
+    resolution: np.ndarray
+    """Smallest step between readings of each column, shape (6,); 0 when unknown."""
+    ends: tuple
+    """Extremes of each column, (upwards, downwards) six times."""
+    temperature_c: tuple | None
+    """Lowest and highest temperature."""
+    gravity: float
+    """Local gravity, m/s^2."""
+
+    @cached_property
+    def rest(self):
+        """What was read while steady, or None."""
+        return find_rest(self.chunks)
+
+    @cached_property
+    def turning(self):
+        """How gravity turns against the rates, or None."""
+        return relate_turns(self.chunks)
+
+    @cached_property
+    def quiet_range(self):
+        """Largest minus smallest reading in a quiet chunk, shape (6,)."""
+        if self.rest is not None:
+            return self.rest.range
+        return np.quantile(self.chunks.range, 0.1, axis=0) if len(self.chunks) else np.zeros(6)
+
+    @cached_property
+    def length(self):
+        """Gravity as the accelerometer reads it, or None without samples."""
+        if self.rest is not None:
+            return self.rest.length
+        return float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1))) if len(self.chunks) else None
+
+
+class EvidenceGatherer:
+    """Takes blocks and gives the `Evidence`."""
+
+    def __init__(self, gravity, nominal=None):
+        self.gravity, self.nominal = gravity, nominal
+        self._checks = {name: StreamCheck() for name in STREAMS}
+        self._steps = {name: _Steps() for name in STREAMS}
+        self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
+        self._resolution, self._temperature_c = np.full(6, np.inf), None
+
+    def push(self, block):
+        """Take a SampleBlock."""
+        for name in STREAMS:
+            samples = getattr(block, name)
+            if samples is not None and len(samples):
+                self._take(name, self._checks[name].push(samples))
+
+    def evidence(self):
+        """Close the streams and return the Evidence."""
+        for name in STREAMS:
+            self._take(name, self._checks[name].finish())
+        streams = {name: Stream(check.statistics(), *self._steps[name].summary()) for name, check in self._checks.items()
+                   if self._steps[name].first_ns is not None}
+        resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
+        chunks, series = self._chunks.chunks(), self._chunks
+        return Evidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends, self._temperature_c, self.gravity)
+
+    def _take(self, name, pieces):
+        for epoch, samples in pieces:
+            if len(samples):
+                self._steps[name].push(samples.stamp_ns, epoch)
+                if name == 'imu':
+                    self._take_imu(samples if self.nominal is None else self.nominal.apply(samples))
+                elif name == 'temperature':
+                    low, high = self._temperature_c or (np.inf, -np.inf)
+                    self._temperature_c = (min(low, float(samples.temperature_c.min())), max(high, float(samples.temperature_c.max())))
+
+    def _take_imu(self, imu):
+        if self._chunks.n_samples < RESOLUTION_SAMPLES:
+            self._note_resolution(np.concatenate([imu.force_s, imu.rate_s], axis=1)[:RESOLUTION_SAMPLES])
+        self._chunks.push(imu)
+        for column, (upwards, downwards) in zip((*imu.force_s.T, *imu.rate_s.T), self._ends):
+            column = np.ascontiguousarray(column)
+            upwards.push(column)
+            downwards.push(-column)
+
+    def _note_resolution(self, values):
+        step = np.abs(np.diff(values, axis=0))
+        # Steps of rounding are no steps of the converter.
+        real = step > 1e-9 * np.maximum(np.abs(values).max(axis=0), 1e-12)
+        self._resolution = np.minimum(self._resolution, np.min(np.where(real, step, np.inf), axis=0, initial=np.inf))
+
+
+class _Steps:
+    """First and last stamp, and the share of irregular steps."""
+
+    def __init__(self):
+        self.first_ns = self.last_ns = self._period_ns = self._previous_ns = None
+        self._epoch, self._n_steps, self._n_irregular = 0, 0, 0
+
+    def push(self, stamp_ns, epoch):
+        """Take accepted stamps of one epoch."""
+        if self.first_ns is None:
+            self.first_ns, self.last_ns = int(stamp_ns[0]), int(stamp_ns[0])
+        self.first_ns, self.last_ns = min(self.first_ns, int(stamp_ns[0])), max(self.last_ns, int(stamp_ns[-1]))
+        step = np.diff(stamp_ns)
+        if self._previous_ns is not None and epoch == self._epoch:
+            step = np.append(stamp_ns[0] - self._previous_ns, step)
+        self._previous_ns, self._epoch = stamp_ns[-1], epoch
+        if not len(step):
+            return
+        if self._period_ns is None:
+            self._period_ns = float(np.median(step[:2000]))
+        self._n_steps += len(step)
+        self._n_irregular += int(np.count_nonzero(np.abs(step - self._period_ns) > IRREGULAR * self._period_ns))
+
+    def summary(self):
+        """Return (first stamp, last stamp, share of irregular steps)."""
+        return self.first_ns, self.last_ns, self._n_irregular / max(self._n_steps, 1)

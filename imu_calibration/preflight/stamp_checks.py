@@ -1,0 +1,103 @@
+"""Checks of the stamps: what was dropped, gaps, rates, clocks."""
+
+from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, Finding
+
+NAMES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
+"""Stream -> what people call it."""
+FAST = ('imu', 'joints')
+WHOLE_MS = 1_000_000
+ADVICE = {
+    'not finite': 'the driver sends them; they are left out',
+    'repeated stamp': 'stamp each sample when it is measured; the second of equal stamps is left out',
+    'backward stamp': 'samples that arrive late are left out; publish in order',
+    'stray stamp': 'a single stamp far from its neighbours is left out',
+    'clock reset': 'the clock was set while recording; each part is taken by itself',
+}
+GAP_SHARE = 0.01
+RATE_SHARE = 0.02
+IRREGULAR_SHARE = 0.05
+
+
+def stamps(evidence):
+    """Every sample has a stamp of its own, later than the one before, and finite readings."""
+    clean = []
+    for name, stream in evidence.streams.items():
+        found = stream.statistics
+        total = found.count + sum(count for reason, count in found.dropped.items() if reason != 'clock reset')
+        if found.count < 0.1 * total:
+            reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
+            yield Finding('stamps', REFUSE, f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
+                          f'({reasons}); correct the driver and record again')
+            continue
+        for reason, count in found.dropped.items():
+            yield Finding('stamps', WARNING, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
+                          if reason != 'clock reset' else f'{NAMES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
+        clean += [] if found.dropped else [NAMES[name]]
+    if clean:
+        yield Finding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
+
+
+def _phrase(reason):
+    return {'not finite': 'are not finite', 'repeated stamp': 'repeat the stamp before', 'backward stamp': 'step back in time',
+            'stray stamp': 'have a stray stamp'}[reason]
+
+
+def _times(count):
+    return 'once' if count == 1 else f'{count} times'
+
+
+def gaps(evidence):
+    """Nothing is missing within the streams."""
+    for name in FAST:
+        if name in evidence.streams:
+            found = evidence.streams[name].statistics
+            if found.n_gaps:
+                severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
+                yield Finding('gaps', severity, f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
+                              f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
+
+
+def rate(evidence):
+    """The samples per second are those that the step between stamps promises."""
+    for name in FAST:
+        if name in evidence.streams:
+            stream = evidence.streams[name]
+            nominal, real = stream.statistics.rate, stream.real_rate
+            if nominal and abs(real / nominal - 1) > RATE_SHARE:
+                yield Finding('rate', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
+                              'samples were lost, or stamps are made when messages arrive; look at the driver and at the load of the recorder')
+            elif nominal:
+                yield Finding('rate', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
+
+
+def jitter(evidence):
+    """Samples are evenly spaced, and stamps finer than their spacing."""
+    for name in FAST:
+        if name in evidence.streams:
+            stream = evidence.streams[name]
+            period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
+            if stream.irregular <= IRREGULAR_SHARE and not (step_ns and step_ns % WHOLE_MS == 0 and stream.irregular > 0):
+                continue
+            whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0
+            came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
+            if stream.irregular > IRREGULAR_SHARE:
+                came += (', ' if came else '') + f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
+            yield Finding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
+
+
+def clocks(evidence):
+    """IMU and joints are stamped by one clock."""
+    if not {'imu', 'joints'} <= evidence.streams.keys():
+        return
+    imu, joints = evidence.streams['imu'], evidence.streams['joints']
+    if any('clock reset' in stream.statistics.dropped for stream in (imu, joints)):
+        return
+    overlap = (min(imu.last_ns, joints.last_ns) - max(imu.first_ns, joints.first_ns)) * 1e-9
+    shorter = min(imu.statistics.duration, joints.statistics.duration)
+    late = (joints.first_ns - imu.first_ns) * 1e-9
+    if overlap <= 0 and shorter > 0:
+        yield Finding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
+                      f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on one computer')
+    elif overlap < 0.9 * shorter:
+        yield Finding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
+                      f'{"after" if late > 0 else "before"} the Imu: only what overlaps is used; are both stamped by one clock?')

@@ -1,0 +1,98 @@
+"""Gravity as seen by the accelerometer turns as the gyroscope says: unit and axes of one against the other, without any table."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.reference import skew
+
+LARGEST_TURN = 0.7
+"""Turns of gravity from chunk to chunk above it are left out, rad."""
+FORCE_BAND = 0.2
+"""Chunks whose specific force is off the usual length, or scatters, by more than this share are left out: they accelerate."""
+LEAST_TURN = 1.0
+"""Gravity must turn by this much altogether, rad."""
+LEAST_EXPLAINED = 0.5
+WIDTH = 4.0
+"""Errors of neighbouring chunks go together: standard deviations are this much larger than for independent ones."""
+SURE = 0.15
+"""A column counts when its standard deviation is below this share of its length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turning:
+    """What relates measured rates to the turn of measured gravity."""
+
+    matrix: np.ndarray
+    """``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero in columns that were not seen, shape (3, 3)."""
+    seen: np.ndarray
+    """Which columns were, shape (3,)."""
+    explained: float
+    """Share of gravity's turns that it explains."""
+
+    @property
+    def factor(self):
+        """True rate over measured rate: 1, or pi / 180 for deg/s."""
+        return float(np.median(np.linalg.norm(self.matrix[:, self.seen], axis=0)))
+
+
+def relate_turns(chunks):
+    """
+    Return the `Turning` of Chunks, or None when gravity turns too little, or otherwise than any rates explain.
+
+    ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; nothing is assumed of units, axes or bias.
+    """
+    pairs = _pairs(chunks)
+    if pairs is None:
+        return None
+    direction, change, turn_time, rate = pairs
+    spread = np.sqrt(np.mean(rate**2, axis=0))
+    if np.linalg.norm(change, axis=1).sum() < LEAST_TURN or not spread.max() > 0:
+        return None
+    seen = spread > 1e-3 * spread.max()
+    while seen.any():
+        matrix, sure, explained = _fit(direction, change, turn_time, np.where(seen, rate / np.where(seen, spread, 1.0), 0.0))
+        if explained < LEAST_EXPLAINED:
+            return None
+        if sure[seen].all():
+            return Turning(np.where(seen, matrix / np.where(seen, spread, 1.0), 0.0), seen, explained)
+        # What turns least may only be the leakage of another axis, and then spoils both.
+        seen = seen & (spread > spread[seen].min())
+    return None
+
+
+def _fit(direction, change, turn_time, rate):
+    """Return (matrix, which columns are sure, share explained) by least squares."""
+    lever = skew(direction) * turn_time[:, None, None]
+    inputs = np.column_stack([rate, np.ones(len(rate))])
+    design = (lever[:, :, :, None] * inputs[:, None, None, :]).reshape(-1, 12)
+    target = change.ravel()
+    normal = design.T @ design
+    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(12))
+    solution = inverse @ (design.T @ target)
+    rest = float(((target - design @ solution)**2).sum())
+    sd = WIDTH * np.sqrt(np.diag(inverse) * rest / max(len(target) - 12, 1)).reshape(3, 4)[:, :3]
+    matrix = solution.reshape(3, 4)[:, :3]
+    return matrix, np.linalg.norm(sd, axis=0) < SURE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
+
+
+def _pairs(chunks):
+    """Return (direction, its change, time between, rate) for neighbouring chunks in which gravity rules the accelerometer, or None."""
+    if len(chunks) < 20:
+        return None
+    length = np.linalg.norm(chunks.mean[:, :3], axis=1)
+    usual = np.median(length)
+    if not usual > 0:
+        return None
+    direction = chunks.mean[:, :3] / np.maximum(length, 1e-9 * usual)[:, None]
+    step = np.diff(chunks.time)
+    change = np.diff(direction, axis=0)
+    whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
+    whole &= (np.abs(length / usual - 1) < FORCE_BAND) & (np.linalg.norm(chunks.sd[:, :3], axis=1) < FORCE_BAND * usual)
+    good = whole[1:] & whole[:-1] & (step > 0) & (step < 1.5 * np.median(step)) & (np.linalg.norm(change, axis=1) < LARGEST_TURN)
+    if good.sum() < 20:
+        return None
+    middle = direction[1:] + direction[:-1]
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
+    rate = 0.5 * (chunks.mean[1:, 3:] + chunks.mean[:-1, 3:])[good]
+    return middle[good], change[good], step[good], rate - np.median(rate, axis=0)

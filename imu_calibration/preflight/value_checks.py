@@ -1,0 +1,196 @@
+"""Checks of the readings: units, axes, frozen and clipping outputs, gravity, resolution, temperature."""
+
+import numpy as np
+
+from imu_calibration.noise import STANDARD_GRAVITY
+from imu_calibration.preflight.axes import CLEAR, match_axes
+from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, Finding
+from imu_calibration.units import significant
+
+DEG = 180.0 / np.pi
+SENSORS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
+GRAVITY_SHARE = 0.02
+LARGE_BIAS = 0.3
+"""m/s^2."""
+FASTEST = 100.0
+"""rad/s, 5700 deg/s: hardly any gyroscope measures more."""
+MOVING = 50.0
+"""An axis beside one that moves by this many steps of the converter does not stay the same by chance."""
+LONG = 4
+"""Chunks, one second."""
+CLIP_FORCE = 1.15
+"""Times gravity; outputs pile up at gravity without being clipped."""
+CLIP_RATE = 10.0
+"""Times the range of the noise."""
+REPEATED_SHARE = 0.05
+
+
+def force_unit(evidence):
+    """Specific force is in m/s^2."""
+    length = evidence.length
+    if length is None:
+        return
+    came = f'specific force must be in m/s^2, its length {"at rest" if evidence.rest is not None else "in the middle"} is {length:.4g}: '
+    if 0.8 < length < 1.25:
+        yield Finding('force_unit', REFUSE, f'{came}it looks like g; convert it in the driver or give --nominal FILE with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}')
+    elif 800 < length < 1250:
+        yield Finding('force_unit', REFUSE, f'{came}it looks like mg; convert it in the driver or give --nominal FILE with accelerometer_scale '
+                      f'{1000 / STANDARD_GRAVITY:.6g}')
+    elif not 3.0 < length < 30.0:
+        yield Finding('force_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with accelerometer_offset and accelerometer_scale')
+    else:
+        yield Finding('force_unit', GOOD, f'specific force in m/s^2: {length:.3f} is the length of gravity')
+
+
+def rate_unit(evidence):
+    """Angular rate is in rad/s: gravity turns by what the rates add up to."""
+    turning = evidence.turning
+    largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
+    if turning is not None:
+        ratio = 1.0 / turning.factor
+        came = f'angular rates must be in rad/s, they are {significant(ratio)} times what turns the measured gravity: '
+        if 0.6 < ratio / DEG < 1.6:
+            yield Finding('rate_unit', REFUSE, f'{came}they look like deg/s; convert them in the driver or give --nominal FILE with gyroscope_scale 57.29578')
+        elif 0.6 < ratio * DEG < 1.6:
+            yield Finding('rate_unit', REFUSE, f'{came}they look as if converted from deg/s twice; convert once, or give --nominal FILE with '
+                          'gyroscope_scale 0.01745329')
+        elif not 0.5 < ratio < 2.0:
+            yield Finding('rate_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with gyroscope_offset and gyroscope_scale')
+        else:
+            yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates say (ratio {ratio:.2f}, axes {_axes(turning.seen)})')
+    elif largest > FASTEST:
+        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, the largest is {largest:.4g} ({largest * DEG:.0f} deg/s), faster than gyroscopes '
+                      'measure: deg/s, counts or volts?; convert them in the driver or give --nominal FILE with gyroscope_offset and gyroscope_scale')
+
+
+def handedness(evidence):
+    """Accelerometer and gyroscope have the same axes: gravity turns the way the rates turn."""
+    turning = evidence.turning
+    if turning is None:
+        return
+    match = match_axes(turning.matrix.T, np.eye(3)) if turning.seen.all() else match_axes(turning.matrix, np.diag(turning.seen.astype(float)))
+    if not match.wrong:
+        if turning.seen.all():
+            yield Finding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
+        return
+    what = match.words('gyroscope', 'accelerometer') if turning.seen.all() else _partial(turning, match)
+    what = what if match.agreement > CLEAR else 'no exchange of axes makes them fit'
+    kind = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}.get((match.turned, match.mirrored), 'turned or left-handed')
+    yield Finding('handedness', REFUSE, f'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: {what} ({kind}); '
+                  'correct signs and order of the axes in the driver')
+
+
+def _partial(turning, match):
+    """Return in words how the columns of the gyroscope that were seen lie."""
+    words = []
+    for j in np.flatnonzero(turning.seen):
+        i = int(np.argmax(np.abs(turning.matrix[:, j])))
+        if i != j or turning.matrix[i, j] < 0:
+            words.append(f"the gyroscope's {'xyz'[j]} is {'minus ' if turning.matrix[i, j] < 0 else ''}the accelerometer's {'xyz'[i]}")
+    return ', '.join(words)
+
+
+def frozen(evidence):
+    """No output stands still while its neighbours move."""
+    chunks, range_ = evidence.chunks, evidence.chunks.range
+    if not len(chunks):
+        return
+    for sensor, part, _ in SENSORS:
+        noisy = evidence.quiet_range[part] > 0
+        constant = evidence.n_changed[part] == 0
+        if constant.all():
+            yield Finding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
+                          'look at the sensor and its driver')
+            continue
+        for axis in np.flatnonzero(constant):
+            if noisy.any():
+                yield Finding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
+                              'look at the sensor and its driver')
+        for axis in np.flatnonzero(~constant):
+            moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
+            stuck = _in_long_runs((range_[:, part][:, axis] == 0) & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
+            if stuck.any():
+                seconds = stuck.sum() * float(np.median(chunks.duration))
+                yield Finding('frozen', WARNING, f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
+                              'and leave that time out', samples=int(stuck.sum() * chunks.size))
+
+
+def _in_long_runs(flags):
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]]))).reshape(-1, 2)
+    kept = np.zeros(len(flags), bool)
+    for start, end in edges[edges[:, 1] - edges[:, 0] >= LONG]:
+        kept[start:end] = True
+    return kept
+
+
+def clipping(evidence):
+    """No output piles up at the end of its range."""
+    for sensor, part, unit in SENSORS:
+        least = np.full(3, CLIP_FORCE * (evidence.length or 0.0)) if sensor == 'accelerometer' else CLIP_RATE * evidence.quiet_range[part]
+        words, total, level = [], 0, 0.0
+        for axis, ends in enumerate(evidence.ends[part]):
+            counts = [end.n_clipped if end.level > least[axis] else 0 for end in ends]
+            if sum(counts):
+                words.append(f'{"xyz"[axis]} {sum(counts)}')
+                total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
+        if words:
+            people = f' ({level * DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
+            yield Finding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
+                          'what is beyond is lost, move less or choose a wider range', samples=total)
+
+
+def gravity(evidence):
+    """The accelerometer reads local gravity within 2 per cent."""
+    rest = evidence.rest
+    if rest is None or not 3.0 < evidence.length < 30.0:
+        return
+    off = rest.length / evidence.gravity - 1
+    if rest.sphere is not None:
+        bias = np.linalg.norm(rest.sphere[0])
+        what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 taken out'
+    else:
+        what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
+    if abs(off) > GRAVITY_SHARE:
+        yield Finding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
+                      f'{100 * off:+.1f} %: scale or bias is far off, or the gravity given is that of another place')
+    else:
+        yield Finding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
+
+
+def repeated_readings(evidence):
+    """Every message carries a new measurement."""
+    share = evidence.n_repeated / max(evidence.n_samples, 1)
+    if share > REPEATED_SHARE and evidence.quiet_range.all():
+        yield Finding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
+                      'the sensor measures, and noise is underestimated; publish each measurement once')
+
+
+def resolution(evidence):
+    """The step of the converter is finer than the noise."""
+    if evidence.rest is None:
+        return
+    for sensor, part, unit in SENSORS:
+        step, range_ = evidence.resolution[part], evidence.rest.range[part]
+        # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
+        coarse = (step > 0) & (4 * step > range_)
+        if coarse.any():
+            size = step[coarse].max()
+            people = f'{size * DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
+            yield Finding('resolution', NOTE, f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
+                          'are rounded too')
+
+
+def temperature(evidence):
+    """Temperatures are in degrees Celsius."""
+    if evidence.temperature_c is None:
+        return
+    low, high = evidence.temperature_c
+    if low < -80 or high > 180:
+        kelvin = ': kelvin?' if 200 < low and high < 450 else ''
+        yield Finding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
+    else:
+        yield Finding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
+
+
+def _axes(flags):
+    return ', '.join(np.array(list('xyz'))[np.asarray(flags, bool)])
