@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration import observability
+from imu_calibration import accumulator_state, observability
 from imu_calibration.calibration import HELD, WEAK
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior
 from imu_calibration.gathering import Collector, Gathered, merge
+from imu_calibration.live_diagnosis import LEAST_WINDOWS, Question, RecentWindows, baseline_model
 from imu_calibration.samples import ImuSamples
 from imu_calibration.sensor_model import coefficients, columns
 from imu_calibration.settings import setting
@@ -33,6 +34,11 @@ class LiveSettings:
     store_samples: int = setting(300_000, '1', 'samples in motion kept for effects that must be linearised anew (table tilt, delays); '
                                  'about 200 bytes each', (0, 100_000_000),
                                  'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so')
+    diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth of the time '
+                                      'at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
+                                      'too small: the diagnosis takes a core from other programs')
+    diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each', (1000, 100_000_000),
+                                     'too small: effects that need the whole session are not found')
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,7 @@ class LiveCalibration:
         self._thermal = 'thermal' in (options.accelerometer_model or '') + (options.gyroscope_model or '')
         self._waiting, self._collector = [], None
         self.result = None
+        self._recent, self._open = RecentWindows(settings.diagnosis_samples), []
         if not self._thermal:
             self._begin(None)
 
@@ -119,7 +126,13 @@ class LiveCalibration:
         if self._collector is None:
             return self._push_before_temperature(block)
         self._collector.push(block)
-        return self._collector.take_completed()
+        return self._completed()
+
+    def _completed(self):
+        windows = self._collector.take_completed()
+        if self.settings.diagnosis_period:
+            self._recent.add(windows)
+        return windows
 
     def _push_before_temperature(self, block):
         self._waiting.append(block)
@@ -130,7 +143,7 @@ class LiveCalibration:
         blocks, self._waiting = self._waiting, []
         for held_back in blocks:
             self._collector.push(held_back)
-        return self._collector.take_completed()
+        return self._completed()
 
     def _begin(self, temperature_c):
         model = choose_model(self.options, self.table, temperature_c)
@@ -162,7 +175,7 @@ class LiveCalibration:
         """
         if self._collector is None:
             raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
-        gathered, store = self._collector.snapshot(pending)
+        gathered, store, self._open = self._collector.snapshot(pending)
         model = self._collector.model
         total = self._with_earlier(gathered)
         check_units(total, model)
@@ -192,6 +205,17 @@ class LiveCalibration:
         if self._collector is None:
             return self.earlier or Gathered()
         return self._with_earlier(self._collector.snapshot(pending)[0])
+
+    def question(self):
+        """Return the `live_diagnosis.Question` about the windows of the last solution, or None while there are too few."""
+        windows = self._recent.list() + self._open
+        if self.result is None or len(windows) < LEAST_WINDOWS or not self.settings.diagnosis_period:
+            return None
+        return Question(windows, self.table, baseline_model(self.options, self.table, self.result.model), self._recent.forgotten)
+
+    def saved(self, pending=False):
+        """Return everything that was gathered as bytes, for an `earlier` of another run (see `accumulator_state`)."""
+        return accumulator_state.to_bytes(self.gathered(pending), self.model)
 
     def _with_earlier(self, gathered):
         if self.earlier is None:
@@ -247,7 +271,7 @@ class _LiveCollector(Collector):
         return completed
 
     def snapshot(self, pending):
-        """Return copies of what was gathered and of the store; with `pending`, open windows are closed in the copies."""
+        """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
         twin = copy.copy(self)
         twin.gathered, twin.store, twin._completed = _copied(self.gathered), self.store.copy(), []
         if pending:
@@ -255,7 +279,7 @@ class _LiveCollector(Collector):
             twin.finish()
         else:
             twin.update_counts()
-        return twin.gathered, twin.store
+        return twin.gathered, twin.store, twin.take_completed()
 
 
 def _copied(gathered):
@@ -273,11 +297,16 @@ def group_states(result):
         part = calibration.model.slices[effect.sensor, effect.name]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
-        state = next((kind for kind in (HELD, WEAK) if kind in status), 'determined')
+        state = group_status(status)
         text, predicted = needed.get(names[worst], ('', float('nan'))) if state != 'determined' else ('', float('nan'))
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), text, predicted))
     return states
+
+
+def group_status(statuses):
+    """Return the worst of the statuses of an effect's parameters."""
+    return next((kind for kind in (HELD, WEAK) if kind in statuses), 'determined')
 
 
 def waiting_groups(model):

@@ -8,6 +8,7 @@ SILENT_AFTER = 2.0
 """Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
 RECENT = 10.0
 """Seconds for which a loss is called recent."""
+_MESSAGES = {'imu': 'Imu', 'joints': 'JointState'}
 GOOD, TROUBLE, SILENT = 'good', 'trouble', 'silent'
 
 
@@ -24,9 +25,18 @@ class StreamState:
 
 
 class StreamWatch:
-    """Takes note of every block and says how the streams are."""
+    """
+    Takes note of every block and says how the streams are.
 
-    def __init__(self):
+    Parameters
+    ----------
+    joints : bool
+        Whether joint states are needed.
+
+    """
+
+    def __init__(self, joints=True):
+        self._needed = ('imu', 'joints') if joints else ('imu',)
         self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
         self._newest = {}
         self._arrived = {}
@@ -76,18 +86,20 @@ class StreamWatch:
         values = {f'{name} messages': count for name, count in self._count.items()}
         values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
-        silent = [name for name in ('imu', 'joints') if now - self._arrived.get(name, float('-inf')) > SILENT_AFTER]
+        silent = [name for name in self._needed if now - self._arrived.get(name, float('-inf')) > SILENT_AFTER]
+        if silent and len(self._needed) == 1:
+            return StreamState(SILENT, 'Imu messages do not come; check the topic imu/data_raw', values)
         if len(silent) == 2:
             return StreamState(SILENT, 'neither Imu nor JointState messages come; check the topics imu/data_raw and joint_states', values)
         if silent:
             missing = {'imu': 'Imu messages do not come (imu/data_raw)',
                        'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
             return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
-        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9
+        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
         if self._apart_for(lead, now) > SILENT_AFTER:
             ahead = 'ahead of' if lead > 0 else 'behind'
             return StreamState(TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {ahead} the joint stamps; bring the clocks together', values)
         if self._lost_at is not None and now - self._lost_at < RECENT:
             lost = ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
             return StreamState(TROUBLE, f'dropped lately: {lost}', values)
-        return StreamState(GOOD, 'Imu and JointState messages come', values)
+        return StreamState(GOOD, f'{" and ".join(_MESSAGES[name] for name in self._needed)} messages come', values)

@@ -49,7 +49,7 @@ class WindowStore:
             self._entries.append((reduced, window.motion, temperature))
         else:
             self._n_samples += len(window)
-            self._entries.append(_owned(window))
+            self._entries.append(owned_window(window))
         if self._n_samples > self._most or self._n_static > STATIC_MOST:
             self.complete, self._entries = False, []
 
@@ -71,7 +71,7 @@ def _again(reduced, motion, temperature, model, table):
     return replace(reduced, sensors=sensors)
 
 
-def _owned(window):
+def owned_window(window):
     """Return the window in memory of its own: slices would keep the whole chunk that they were cut from."""
     motion = JointMotion(*(np.array(getattr(window.motion, name)) for name in ('time', 'position', 'rate', 'acceleration', 'jerk')))
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)

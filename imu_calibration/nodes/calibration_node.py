@@ -1,4 +1,4 @@
-"""calibration_node: calibrates an IMU on a table while the table moves."""
+"""calibration_node: calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose."""
 
 import sys
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from imu_calibration import accumulator_state
 from imu_calibration.cli import files
-from imu_calibration.errors import InputError
+from imu_calibration.live_by_hand import LiveByHand, LiveByHandSettings
 from imu_calibration.live_calibration import LiveCalibration, LiveSettings
 from imu_calibration.nodes.batches import BatchSubscription
 from imu_calibration.nodes.calibration_status import statuses_of
@@ -38,12 +38,13 @@ COMPLAINT_PERIOD = 10.0
 class CalibrationNodeSettings:
     """What the node reads, asks for and writes."""
 
-    table_file: str = setting('', '', 'table description, path; it must be given', symptom='the node refuses to start and says why')
+    table_file: str = setting('', '', 'table description, path; empty: no table, calibrate by hand from poses held still and the '
+                              'turns between them', symptom='joint states are not listened to')
     frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
                             symptom='every Imu message is dropped, diagnostics say so')
     reliable: bool = setting(False, '', 'subscribe reliably instead of best-effort', symptom='a best-effort publisher never connects')
     accelerometer_model: str = setting('', '',
-                                       'named model or effect names joined by +; empty: bias+matrix, and accel_size_effect '
+                                       'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
                                        'when the rotation shows it', symptom='an effect that is there stays in the residuals')
     gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix',
                                    symptom='an effect that is there stays in the residuals')
@@ -69,30 +70,28 @@ class CalibrationNode(Node):
         self.settings = declare_parameters(self, CalibrationNodeSettings)
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
-        self._table = self._read_table()
-        self._gatherer = LiveGatherer(self._table.joint_names, MOST_WAITING, self.settings.frame_id)
+        self._by_hand = declare_parameters(self, LiveByHandSettings)
+        self._table = files.read_table(Path(self.settings.table_file).expanduser()) if self.settings.table_file else None
+        self._gatherer = LiveGatherer(self._table and self._table.joint_names, MOST_WAITING, self.settings.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self.worker = CalibrationWorker(self._gatherer, self._make_live, self.settings.save_file, self.settings.autosave_period,
-                                        self._publish_document, self._publish_residuals, self._complain)
+                                        self._publish_document, self._publish_residuals, self._complain, self._table is None)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         for what in ('solve', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', lambda request, response, what=what: self._serve(what, response))
         qos = input_qos(self.settings.reliable, INPUT_DEPTH)
-        self._inputs = [BatchSubscription(self, kind, topic, add, qos) for kind, topic, add in (
-            (Imu, 'imu/data_raw', self._gatherer.add_imu), (JointState, 'joint_states', self._gatherer.add_joints),
-            (Temperature, 'imu/temperature', self._gatherer.add_temperature))]
+        topics = [(Imu, 'imu/data_raw', self._gatherer.add_imu), (Temperature, 'imu/temperature', self._gatherer.add_temperature)]
+        if self._table is not None:
+            topics.append((JointState, 'joint_states', self._gatherer.add_joints))
+        else:
+            self.get_logger().info("no 'table_file' was given: calibrates by hand, hold the IMU still in many attitudes and turn it in between")
+        self._inputs = [BatchSubscription(self, kind, topic, add, qos) for kind, topic, add in topics]
         self.worker.start()
 
     def close(self):
         """End the worker after what it is doing."""
         self.worker.end()
-
-    def _read_table(self):
-        if not self.settings.table_file:
-            raise InputError("parameter 'table_file' must name a table description, none was given; start with "
-                             '--ros-args -p table_file:=/path/to/table.yaml')
-        return files.read_table(Path(self.settings.table_file).expanduser())
 
     def _read_options(self, windows):
         settings = self.settings
@@ -101,15 +100,22 @@ class CalibrationNode(Node):
                                   tolerances, windows)
 
     def _make_live(self, resume):
-        live = LiveCalibration(self._table, self._options, self._live_settings)
         saved = accumulator_file(self.settings.save_file)
-        if not (resume and self.settings.resume and saved.is_file()):
-            return live
-        data = saved.read_bytes()
-        earlier = accumulator_state.from_bytes(data, live.model or accumulator_state.saved_model(data))
-        live = LiveCalibration(self._table, self._options, self._live_settings, earlier)
-        self.get_logger().info(f'goes on with {live.n_windows} windows from {saved}')
+        data = saved.read_bytes() if resume and self.settings.resume and saved.is_file() else None
+        live = self._make_by_hand(data) if self._table is None else self._make_on_table(data)
+        if data is not None:
+            self.get_logger().info(f'goes on with {live.n_windows} {"poses" if self._table is None else "windows"} from {saved}')
         return live
+
+    def _make_by_hand(self, data):
+        return LiveByHand(self._options, self._live_settings, self._by_hand, data)
+
+    def _make_on_table(self, data):
+        live = LiveCalibration(self._table, self._options, self._live_settings)
+        if data is None:
+            return live
+        earlier = accumulator_state.from_bytes(data, live.model or accumulator_state.saved_model(data))
+        return LiveCalibration(self._table, self._options, self._live_settings, earlier)
 
     def _serve(self, what, response):
         request = self.worker.ask(what)

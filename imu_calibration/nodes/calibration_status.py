@@ -1,9 +1,11 @@
-"""Diagnostics of calibration_node: one status for the streams, one for the calibration, one for each parameter group."""
+"""Diagnostics of calibration_node: a status for the streams, the calibration, the poses or the diagnosis, and each parameter group."""
 
 from imu_calibration.nodes.diagnostics import ERROR, OK, STALE, WARN, make_status
 
 _STREAM_LEVELS = {'good': OK, 'trouble': WARN, 'silent': STALE}
 _GROUP_LEVELS = {'determined': OK, 'weak': WARN, 'held': STALE, 'waiting': STALE}
+_HAND_LEVELS = {'waiting': STALE, 'weak': WARN, 'determined': OK}
+_DIAGNOSIS_LEVELS = {'nothing found': OK, 'off': OK, 'waiting': STALE, 'found': WARN, 'unexplained': WARN, 'failed': ERROR}
 _VERDICT_LEVELS = {'': STALE, 'good': OK, 'weak': WARN, 'bad': ERROR}
 
 
@@ -17,6 +19,11 @@ def statuses_of(state):
     if state.trouble:
         message, level = f'{message}; {state.trouble}', max(level, WARN) if state.verdict else STALE
     found.append(make_status(level, 'calibration', message, {'version': state.solution, **state.values}))
+    if state.hand is not None:
+        found.append(make_status(_HAND_LEVELS[state.hand.word], 'poses', state.hand.message, state.hand.values))
+    if state.diagnosis is not None:
+        found.append(make_status(_DIAGNOSIS_LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
+                                 {'outcome': state.diagnosis.word, **state.diagnosis.values}))
     return found + [_group_status(group) for group in state.groups]
 
 

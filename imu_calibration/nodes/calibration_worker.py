@@ -3,14 +3,15 @@
 import os
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from imu_calibration import accumulator_state
 from imu_calibration.documents import calibration_to_text
 from imu_calibration.errors import ImuCalibrationError, NotObservableError
-from imu_calibration.live_calibration import LiveCalibration, SolvePacer
+from imu_calibration.live_calibration import SolvePacer
+from imu_calibration.live_diagnosis import DiagnosisState
 from imu_calibration.live_streams import StreamState, StreamWatch
+from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.whole_files import write_whole
 from imu_calibration.workflow import summary
 
@@ -38,18 +39,22 @@ class WorkerState:
     """Why there is no new solution."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
+    hand: object = None
+    """HandStatus of a calibration without a table."""
+    diagnosis: DiagnosisState | None = None
+    """What the model gets wrong; None without a table."""
 
 
 class CalibrationWorker(threading.Thread):
     """
-    Runs a LiveCalibration.
+    Runs a LiveCalibration, or a LiveByHand without a table.
 
     Parameters
     ----------
     gatherer : LiveGatherer
         Where messages are added by another thread.
     make_live : callable
-        Returns a new LiveCalibration; called at the start (with ``resume=True``) and for every reset.
+        Returns a new LiveCalibration or LiveByHand; called at the start (with ``resume=True``) and for every reset.
     save_file : str
         Path of the calibration document; the accumulator goes beside it.
     autosave_period : float
@@ -60,10 +65,12 @@ class CalibrationWorker(threading.Thread):
         Called with ImuSamples.
     on_trouble : callable
         Called with one line when something cannot be used.
+    by_hand : bool
+        Whether there is no table, and so no joint states.
 
     """
 
-    def __init__(self, gatherer, make_live, save_file, autosave_period, on_calibration, on_residuals, on_trouble):
+    def __init__(self, gatherer, make_live, save_file, autosave_period, on_calibration, on_residuals, on_trouble, by_hand=False):
         super().__init__(name='calibration', daemon=True)
         self.gatherer, self.make_live = gatherer, make_live
         self.save_file, self.autosave_period = Path(save_file).expanduser(), autosave_period
@@ -71,7 +78,9 @@ class CalibrationWorker(threading.Thread):
         self.live = make_live(resume=True)
         self.failure = None
         self.state = WorkerState(groups=self.live.groups())
-        self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch()
+        self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch(joints=not by_hand)
+        self._by_hand, self._diagnosis = by_hand, DiagnosisThread(0.0 if by_hand else self.live.settings.diagnosis_period)
+        self._diagnosed = 0
         self._asked, self._lock, self._wake, self._ending = [], threading.Lock(), threading.Event(), False
         self._n_solutions, self._new_windows, self._closed, self._saved = 0, self.live.n_windows > 0, True, (time.monotonic(), 0)
         self._trouble = ''
@@ -93,6 +102,7 @@ class CalibrationWorker(threading.Thread):
         """Let the thread finish what it does, and wait for it."""
         self._ending = True
         self._wake.set()
+        self._diagnosis.end()
         if self.is_alive():
             self.join(timeout)
 
@@ -106,6 +116,7 @@ class CalibrationWorker(threading.Thread):
                 self._answer()
                 self._solve_when_due()
                 self._autosave()
+                self._diagnose_when_due()
                 self._tell()
         except BaseException as error:
             self.failure = error
@@ -149,11 +160,19 @@ class CalibrationWorker(threading.Thread):
         self._new_windows = False
         try:
             self._publish_solution(pending=self._closed)
+            if idle:
+                self._diagnosis.want()
         except NotObservableError as error:
             self._trouble = str(error)
         except ImuCalibrationError as error:
             self._trouble = str(error)
             self._complain(str(error))
+
+    def _diagnose_when_due(self):
+        n_windows = self.live.n_windows
+        self._diagnosis.ask_when_due(self.live.question, n_windows > self._diagnosed)
+        if self._diagnosis.is_running:
+            self._diagnosed = max(n_windows, self._diagnosed)
 
     def _publish_solution(self, pending):
         start = time.monotonic()
@@ -167,8 +186,9 @@ class CalibrationWorker(threading.Thread):
 
     def _solve(self):
         self._publish_solution(pending=True)
+        self._diagnosis.want()
         verdict, lines = summary(self.live.result)
-        return f'{verdict} ({self.live.n_windows} windows)' + ''.join(f'; {line}' for line in lines)
+        return f'{verdict} ({self.live.n_windows} {"poses" if self._by_hand else "windows"})' + ''.join(f'; {line}' for line in lines)
 
     def _save(self):
         text = self._publish_solution(pending=True)
@@ -177,12 +197,13 @@ class CalibrationWorker(threading.Thread):
         return f'written: {self.save_file} and {self.accumulator_file.name}'
 
     def _save_accumulator(self, pending):
-        write_whole(self.accumulator_file, accumulator_state.to_bytes(self.live.gathered(pending), self.live.model), to_disk=pending)
+        write_whole(self.accumulator_file, self.live.saved(pending), to_disk=pending)
         self._saved = (time.monotonic(), self.live.n_windows)
 
     def _reset(self):
         self.live = self.make_live(resume=False)
-        self._new_windows, self._closed = False, True
+        self._new_windows, self._closed, self._diagnosed = False, True, 0
+        self._diagnosis.forget()
         return 'started anew; the last calibration stays published until there is another one'
 
     def _autosave(self):
@@ -203,7 +224,7 @@ class CalibrationWorker(threading.Thread):
         self._watch.note_counts(counts, now)
         result = self.live.result
         verdict, lines = ('', ()) if result is None else summary(result)
-        values = {'windows': self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
+        values = {'poses' if self._by_hand else 'windows': self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
             lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: '
                      'calibrate the recording offline']
@@ -211,7 +232,12 @@ class CalibrationWorker(threading.Thread):
             groups = self.live.groups()
         else:
             groups = self.state.groups
-        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values)
+        hand, diagnosis = (self.live.status(), None) if self._by_hand else (None, self._diagnosis_state())
+        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values, hand, diagnosis)
+
+    def _diagnosis_state(self):
+        state = self._diagnosis.state
+        return replace(state, values={**state.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
 
 
 class Request:

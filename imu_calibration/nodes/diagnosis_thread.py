@@ -1,0 +1,82 @@
+"""The thread that asks what the model gets wrong: it takes long, so neither the topics nor the solutions wait for it."""
+
+import threading
+import time
+
+from imu_calibration.live_calibration import SolvePacer
+from imu_calibration.live_diagnosis import FAILED, OFF, DiagnosisState
+
+SHARE = 0.2
+"""Share of the time that diagnosing takes at most."""
+
+
+class DiagnosisThread:
+    """
+    Answers one `live_diagnosis.Question` at a time.
+
+    Parameters
+    ----------
+    period : float
+        Seconds from one answer to the next when nobody asks; 0: never ask.
+
+    """
+
+    def __init__(self, period):
+        self.period, self._pacer, self._thread, self._ending = period, SolvePacer(SHARE), None, False
+        self._next, self._wanted = time.monotonic() + period, False
+        self.state = DiagnosisState() if period else DiagnosisState(OFF, "parameter 'diagnosis_period' is 0")
+        self.n_answers, self._session = 0, 0
+
+    @property
+    def is_running(self):
+        """Whether a question is being answered."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def want(self):
+        """Ask as soon as possible, whatever the period."""
+        self._wanted = bool(self.period)
+
+    def forget(self):
+        """Take back what was said: the session starts anew."""
+        self.state, self._wanted = DiagnosisState() if self.period else self.state, False
+        self._session += 1
+
+    def ask_when_due(self, make_question, is_news):
+        """Start answering `make_question()` (or None) when that is wanted, or when the period is over and there is news."""
+        now = time.monotonic()
+        due = self._wanted or (bool(self.period) and is_news and now >= self._next and self._pacer.due(now))
+        if not due or self.is_running or self._ending:
+            return
+        question = make_question()
+        if question is None:
+            return
+        self._wanted = False
+        self._thread = threading.Thread(target=self._answer, args=(question, now, self._session), name='diagnosis', daemon=True)
+        self._thread.start()
+
+    def _answer(self, question, start, session):
+        try:
+            state = question.answer(lambda share: self._go_on(session))
+        except _Ended:
+            return
+        except Exception as error:   # a diagnosis that fails must not end the calibration
+            state = DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}')
+        if session == self._session:
+            self.state, self.n_answers = state, self.n_answers + 1
+        end = time.monotonic()
+        self._next = end + self.period
+        self._pacer.note(start, end)
+
+    def _go_on(self, session):
+        if self._ending or session != self._session:
+            raise _Ended
+
+    def end(self, timeout=10.0):
+        """Let the answer be, and wait for the thread."""
+        self._ending = True
+        if self.is_running:
+            self._thread.join(timeout)
+
+
+class _Ended(Exception):
+    """The node is being shut down, or the session has been started anew."""

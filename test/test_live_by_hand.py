@@ -1,0 +1,205 @@
+"""By hand while it goes on: the live answer is that of the recording, poses are counted, what is missing is named. No ROS here."""
+
+import numpy as np
+import pytest
+from test_by_hand import GRAVITY, load, simulate
+
+from imu_calibration import workflow
+from imu_calibration.errors import DocumentError, NotObservableError
+from imu_calibration.live_by_hand import FACES, LiveByHand, LiveByHandSettings
+from imu_calibration.live_calibration import LiveSettings
+from imu_calibration.samples import ImuSamples, SampleBlock
+
+
+def blocks(imu, seed=0, mean=20):
+    """Cut samples into uneven blocks as they would come from a topic."""
+    edges = np.sort(np.random.default_rng(seed).integers(0, len(imu), len(imu) // mean))
+    for start, stop in zip([0, *edges], [*edges, len(imu)]):
+        yield SampleBlock(imu.select(slice(start, stop)))
+
+
+def make_live(saved=None, **by_hand):
+    """Return a LiveByHand that looks for rest as often as it can."""
+    return LiveByHand(workflow.CalibrationOptions(), LiveSettings(), LiveByHandSettings(**{'gravity': GRAVITY, **by_hand}), saved, lambda: 0.0)
+
+
+def run(live, imu, seed=0):
+    """Push samples and return the poses that were handed back."""
+    return [pose for block in blocks(imu, seed) for pose in live.push(block)]
+
+
+def offline(imu, gravity=GRAVITY):
+    """What the offline tool says."""
+    return workflow.calibrate_without_table([lambda: iter([SampleBlock(imu)])], gravity=gravity)
+
+
+def assert_same(live, expected, share=1e-6):
+    """Assert that two calibrations agree to a share of their standard deviations."""
+    a, b = live.calibration, expected.calibration
+    assert a.param_names == b.param_names and a.status == b.status
+    known = b.sd > 0
+    assert np.max(np.abs(a.values - b.values)[known] / b.sd[known]) < share
+    np.testing.assert_allclose(a.sd, b.sd, rtol=1e-6)
+
+
+@pytest.fixture(scope='module')
+def session():
+    """Twelve attitudes."""
+    return simulate(1)[0]
+
+
+@pytest.fixture(scope='module')
+def expected(session):
+    """What the offline tool says of it."""
+    return offline(session)
+
+
+def test_the_live_answer_is_that_of_the_recording(session, expected):
+    live = make_live()
+    poses = run(live, session)
+    result = live.solve(pending=True)
+    assert_same(result, expected)
+    for section in ('windows', 'samples_used', 'dropped'):
+        assert result.calibration.statistics[section] == expected.calibration.statistics[section]
+    assert result.calibration.conditions == expected.calibration.conditions
+    assert len(poses) == 11   # the last rest goes on
+    assert live.status().values['poses'] == 12 and live.status().values['turns'] == 11
+
+
+def test_solving_on_the_way_changes_nothing(session, expected):
+    live, solved = make_live(), 0
+    for number, block in enumerate(blocks(session, 3)):
+        live.push(block)
+        if number % 20 == 19 and live.found.attitudes >= 4:
+            live.solve(pending=number % 40 == 39)
+            solved += 1
+    assert solved >= 3
+    assert_same(live.solve(pending=True), expected)
+
+
+@pytest.mark.real_data
+def test_a_real_recording_live(recordings):
+    imu = load(recordings, 'mpu9150_0')
+    live = make_live(gravity=0.0)
+    run(live, imu)
+    assert_same(live.solve(pending=True), offline(imu, None))
+
+
+def test_before_any_motion_it_asks_for_attitudes():
+    live = make_live()
+    with pytest.raises(NotObservableError, match='4 different attitudes'):
+        live.solve()
+    status = live.status()
+    assert status.word == 'waiting' and 'hold it still with' in status.message and set(live.unseen()) == set(FACES)
+    assert all(group.status == 'waiting' and group.needs for group in live.groups())
+
+
+def test_the_direction_that_is_missing_is_named():
+    """Faces up one after the other: the face that is asked for has not been up."""
+    from scipy.spatial.transform import Rotation
+    ups = [FACES[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
+    attitudes = [Rotation.align_vectors([[0, 0, 1]], [up])[0] for up in ups]
+    imu = simulate(5, n_poses=6, attitudes=attitudes)[0]
+    live, asked = make_live(), {}
+    for block in blocks(imu):
+        live.push(block)
+        asked[live.found.attitudes] = live.status(), live.unseen()
+    assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACES)
+    assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACES) - {'+z'}
+    assert set(asked[2][1]) == set(FACES) - {'+z', '+x'}
+    assert asked[6][1] == []
+    status = asked[2][0]
+    assert status.values['directions of gravity not seen'].split() == asked[2][1]
+    assert f'hold it still with {asked[2][1][0]} up' in status.message and '2 poses in 2 attitudes, 1 turn' in status.message
+
+
+def test_after_a_solution_the_motion_that_helps_most_is_named(session):
+    few = session.select(slice(0, len(session) * 5 // 12))
+    live = make_live()
+    run(live, few)
+    live.solve(pending=True)
+    status, groups = live.status(), {(g.sensor, g.effect): g for g in live.groups()}
+    assert status.word == 'weak' and 'next: hold it still with' in status.message
+    assert groups['accelerometer', 'matrix'].status != 'determined' and 'hold it still' in groups['accelerometer', 'matrix'].needs
+
+
+def test_without_a_gravity_the_scales_ask_for_it(session):
+    live = make_live(gravity=0.0)
+    imu = simulate(2, n_poses=24, force_sd=0.002, rate_sd=1e-4, still=3.0)[0]
+    run(live, imu)
+    live.solve(pending=True)
+    assert 'gravity' in live.status().message
+
+
+def test_residuals_of_poses_are_what_the_model_leaves(session, expected):
+    live = make_live()
+    poses = run(live, session)
+    assert live.residuals(poses) is None
+    live.solve(pending=True)
+    residuals = live.residuals(poses)
+    norms = expected.solution.norm_residuals()[:len(poses)]
+    along = np.linalg.norm(residuals.force_s, axis=1)
+    np.testing.assert_allclose(along, np.abs(norms), rtol=0.1, atol=1e-6)
+    assert set(residuals.stamp_ns) <= set(session.stamp_ns)
+    assert np.all(np.abs(residuals.rate_s) < 5 * np.max(expected.solution.poses.rate_sem))
+
+
+def paused(first, second, seconds=100.0):
+    """Two recordings one after the other."""
+    shift = int(first.stamp_ns[-1] - second.stamp_ns[0] + seconds * 1e9)
+    return ImuSamples.concatenate([first, ImuSamples(second.stamp_ns + shift, second.force_s, second.rate_s, second.frame_id)])
+
+
+def test_a_session_resumed_from_its_samples_is_one_recording_with_a_pause(session):
+    half = len(session) // 2
+    parts = session.select(slice(0, half)), session.select(slice(half, None))
+    first = make_live()
+    run(first, parts[0])
+    second = make_live(first.saved())
+    assert second.n_windows >= 5
+    run(second, parts[1])
+    assert_same(second.solve(pending=True), offline(paused(*parts)))
+
+
+def test_a_clock_set_back_is_a_pause(session):
+    half = len(session) // 2
+    parts = session.select(slice(0, half)), session.select(slice(half, None))
+    live = make_live()
+    run(live, parts[0])
+    earlier = ImuSamples(parts[1].stamp_ns - 10**12, parts[1].force_s, parts[1].rate_s)
+    poses = run(live, earlier)
+    assert live.counts['imu clock reset'] == 1
+    assert_same(live.solve(pending=True), offline(paused(*parts)))
+    assert poses[-1].stamp_ns[0] in earlier.stamp_ns
+
+
+@pytest.mark.parametrize('broken', [b'', b'nothing'])
+def test_a_broken_file_is_refused(broken):
+    with pytest.raises(DocumentError, match='resume'):
+        make_live(broken)
+
+
+def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
+    """Memory stays bounded; of the long rest the inside goes, and the answer is that of what is left."""
+    rng = np.random.default_rng(6)
+    live = make_live(hand_samples=len(session) + 6000)
+    run(live, session)
+    n, largest = 16_000, 0
+    mean = session.force_s[-50:].mean(0), session.rate_s[-50:].mean(0)
+    noise = rng.normal(0, [[[0.02]], [[0.002]]], (2, n, 3))
+    still = ImuSamples(session.stamp_ns[-1] + 20_000_000 * np.arange(1, n + 1), mean[0] + noise[0], mean[1] + noise[1])
+    for block in blocks(still, mean=100):
+        live.push(block)
+        largest = max(largest, len(live._store))
+    assert largest < len(session) + 7000 and live.status().values['samples forgotten'] > 8_000
+    result = live.solve(pending=True)
+    assert live.found.attitudes == 12 and live.found.turns == 11
+    assert_same(result, offline(live._store.samples()), 1e-4)
+    assert np.all(np.abs(result.calibration.values - expected.calibration.values) < 4 * expected.calibration.sd + 1e-12)
+
+
+def test_without_a_long_rest_the_oldest_go(session):
+    live = make_live(hand_samples=len(session) * 6 // 10)
+    run(live, session)
+    assert len(live._store) <= len(session) * 6 // 10 + 100
+    assert_same(live.solve(pending=True), offline(live._store.samples()), 1e-4)
