@@ -174,6 +174,24 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
 
     """
     imu = imu if nominal is None else nominal.apply(imu)
+    data = gather_by_hand(imu, stills, settings, known_turns, temperature_c)
+    return solve_by_hand(data.poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
+
+
+@dataclass(frozen=True, eq=False)
+class HandData:
+    """What a recording without a table says: poses and turns."""
+
+    poses: Poses
+    """Means over the intervals at rest."""
+    turns: list
+    """`TurnData` between consecutive poses, then those of known angle."""
+    statistics: dict
+    """Attitudes, turns left out, noise and period of the samples."""
+
+
+def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), temperature_c=None):
+    """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     poses, noise = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
@@ -183,16 +201,16 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
     turns, dropped = collect_turns(time, imu, poses, noise, settings, temperature_c)
     turns += [known_turn_data(time, imu, turn, noise, settings, temperature_c) for turn in known_turns]
-    statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise}
-    return solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances, accelerometer, gyroscope)
+    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise})
 
 
-def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None):
-    """Estimate from poses and turns that are at hand; see `calibrate_by_hand`."""
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None,
+                  point=None):
+    """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
     default, evidence = _gyroscope_effects(poses, settings)
     reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
-    model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c), gravity)
+    model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c, point=point or {}), gravity)
     _check_temperature(model, poses)
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd, fallback)

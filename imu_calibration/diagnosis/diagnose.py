@@ -10,11 +10,11 @@ from imu_calibration.diagnosis.extended import extended_solution
 from imu_calibration.diagnosis.gain import Gain, heldout_gain, residual_traces
 from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import sentence
-from imu_calibration.diagnosis.search import FAMILY_WISE
 from imu_calibration.diagnosis.separation import separating_motion
 from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
 from imu_calibration.diagnosis.stories import Explained, sensors_of
 from imu_calibration.diagnosis.unexplained import unexplained
+from imu_calibration.diagnosis.verdicts import verdict_of
 from imu_calibration.effects import find_effect
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
@@ -177,19 +177,5 @@ def _candidates(attempt, named):
             continue
         beside = None if question.name in found else attempt.search.score(named, question)
         rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain,
-                                        beside and beside.p_value, _verdict(question.name, alone, beside, found, mates))
+                                        beside and beside.p_value, verdict_of(question.name, alone, beside, found, mates))
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
-
-
-def _verdict(name, alone, beside, found, mates):
-    if name in found:
-        return 'found'
-    if name in mates:
-        return f'as good as {mates[name]}'
-    if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
-        return 'refused: its size would be impossible'
-    if beside is not None and beside.significant:
-        return 'refused: it leaves most of the unexplained where it was'
-    if alone.significant:
-        return 'not needed beside the findings' if found else 'refused: it leaves most of the unexplained where it was'
-    return 'no evidence'

@@ -91,7 +91,7 @@ def heldout_gain(attempt, before, after, sensors):
                 best = (reduction, sensor, measure, [(s[part][attempt.locked], s[2 + part][attempt.locked]) for s in squares])
     _, sensor, measure, pair = best
     rms = [_rms(*entry) for entry in pair]
-    return Gain(sensor, measure, rms[0], rms[1], _interval(pair), int(attempt.locked.sum()))
+    return Gain(sensor, measure, rms[0], rms[1], reduction_interval(pair), int(attempt.locked.sum()))
 
 
 def _squares(attempt, choice, sensor):
@@ -114,8 +114,8 @@ def _rms(squares, number):
     return float(np.sqrt(squares.sum() / max(number.sum(), 1)))
 
 
-def _interval(pair):
-    """Return the 95 % interval of the reduction over resamples of whole windows."""
+def reduction_interval(pair):
+    """Return the 95 % interval of the reduction over resamples of whole windows, from (sums of squares, numbers) per window before and after."""
     n_windows = len(pair[0][0])
     if n_windows < 3:
         return (float('nan'), float('nan'))

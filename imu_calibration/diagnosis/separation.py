@@ -28,6 +28,11 @@ def separating_motion(solution, question, mate, gravity):
         text = _best_motion(solution, question, mate, gravity)
         if text is not None:
             return text
+    return motions_of(question, mate)
+
+
+def motions_of(question, mate):
+    """Return the motions that two effects declare as theirs."""
     own = [name for name in question.effect.motion + mate.effect.motion]
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
     return '; '.join(dict.fromkeys(texts[name] for name in own if name in texts))

@@ -60,14 +60,18 @@ def _rest(attempt, explained, sensor, excess, values):
     significant = bool(sigma > SIGNIFICANT and explained.chosen.sum() >= LEAST_WINDOWS)
     if not significant:
         return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
-    name, share = _correlate(lifted, residual / noise_sd)
-    return Rest(True, rms, float(sigma), name, share, _where(lifted, residual, noise_sd), residual, noise_sd)
+    name, share = correlate(_explanations(lifted), residual / noise_sd)
+    return Rest(True, rms, float(sigma), name, share, where_most(lifted.time, residual, noise_sd), residual, noise_sd)
 
 
-def _correlate(lifted, residual):
-    """Return (name, adjusted share of the variance) of what the residual goes with most, or (None, 0)."""
+def correlate(explanations, residual):
+    """
+    Return (name, adjusted share of the variance) of what the residual goes with most, or (None, 0).
+
+    `explanations` are (name, columns (k, m), mask of the windows where they are known).
+    """
     best = (None, 0.0)
-    for name, columns, rows in _explanations(lifted):
+    for name, columns, rows in explanations:
         if rows.sum() < 3 * columns.shape[1] + 6:
             continue
         design = np.column_stack([np.ones(rows.sum()), columns[rows]])
@@ -76,7 +80,8 @@ def _correlate(lifted, residual):
         total, rest = ((left - left.mean(axis=0))**2).sum(), ((left - fitted)**2).sum()
         k, n = columns.shape[1], rows.sum()
         share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
-        p_value = f_distribution.sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), 3 * k, 3 * (n - k - 1))
+        layers = residual.shape[1]
+        p_value = f_distribution.sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1))
         if p_value < ALPHA and share > max(best[1], 0.15):
             best = (name, float(share))
     return best
@@ -85,14 +90,7 @@ def _correlate(lifted, residual):
 def _explanations(lifted):
     """Yield (name, columns (k, m), windows where they are known)."""
     describe, every = lifted.describe, np.ones(len(lifted.kind), bool)
-    time = (describe['time'] - describe['time'].mean()) / max(np.ptp(describe['time']), 1e-9)
-    yield 'time', np.stack([time, time**2, time**3], axis=1), every
-    step = _step(time)
-    yield 'time', step, every
-    temperature = describe['temperature']
-    if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
-        warm = (temperature - temperature.mean()) / np.ptp(temperature)
-        yield 'temperature', np.stack([warm, warm**2], axis=1), every
+    yield from slow_explanations(describe['time'], describe['temperature'])
     yield 'rate', np.stack([describe['rate'], describe['rate']**2], axis=1), every
     yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
     for name in describe:
@@ -103,19 +101,30 @@ def _explanations(lifted):
     yield 'motion (moving windows against windows at rest)', (lifted.kind != 'static')[:, None].astype(float), every
 
 
+def slow_explanations(time, temperature):
+    """Yield (name, columns, mask) of time, steps in time, and temperature where it is known and changes."""
+    every = np.ones(len(time), bool)
+    time = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    yield 'time', np.stack([time, time**2, time**3], axis=1), every
+    yield 'time', _step(time), every
+    if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
+        warm = (temperature - temperature.mean()) / np.ptp(temperature)
+        yield 'temperature', np.stack([warm, warm**2], axis=1), every
+
+
 def _step(time):
     return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)
 
 
-def _where(lifted, residual, noise_sd):
+def where_most(time, residual, noise_sd):
     """Return a sentence about the shortest stretch that holds four fifths of the rest, or None when it is everywhere."""
-    order = np.argsort(lifted.time)
+    order = np.argsort(time)
     weight = np.maximum(((residual / noise_sd)**2 - 1).sum(axis=1)[order], 0.0)
     sums = np.concatenate([[0.0], np.cumsum(weight)])
     if sums[-1] <= 0:
         return None
     stop = np.searchsorted(sums, sums[:-1] + 0.8 * sums[-1])
-    time = lifted.time[order]
+    time = time[order]
     known = np.flatnonzero(stop <= len(time))
     lengths = time[np.minimum(stop[known] - 1, len(time) - 1)] - time[known]
     first = known[int(np.argmin(lengths))]

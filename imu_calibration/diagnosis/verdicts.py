@@ -1,0 +1,32 @@
+"""What is said of each effect that was asked about."""
+
+from imu_calibration.diagnosis.search import FAMILY_WISE
+
+
+def verdict_of(name, alone, beside, found, mates):
+    """
+    Return 'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or why the effect was refused.
+
+    Parameters
+    ----------
+    name : str
+        Effect.
+    alone, beside : Score
+        Evidence on top of the baseline, and on top of the findings (None for a finding).
+    found : set of str
+        Findings.
+    mates : dict
+        Effects that would do as well -> finding.
+
+    """
+    if name in found:
+        return 'found'
+    if name in mates:
+        return f'as good as {mates[name]}'
+    if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
+        return 'refused: its size would be impossible'
+    if beside is not None and beside.significant:
+        return 'refused: it leaves most of the unexplained where it was'
+    if alone.significant:
+        return 'not needed beside the findings' if found else 'refused: it leaves most of the unexplained where it was'
+    return 'no evidence'
