@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.bands import band_misfit, own_misfit, variance_along, weighed
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
 from imu_calibration.sensor_model import coefficient_jacobian, coefficients
@@ -14,6 +15,9 @@ from imu_calibration.window_statistics import triangular
 
 HELD_SHARE = 0.5
 """A parameter whose standard deviation exceeds this share of its prior's is held at the prior."""
+
+NOISE_ROUNDS = 6
+"""Times that noise and parameters are estimated in turn, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +132,13 @@ def solve(accumulator, model, allow_holding=True, prior=None, noise=None):
     values = problem.start()
     noises = noise or problem.first_noise(values)
     if noise is None:
-        # Once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
-        values = problem.minimise(values, noises, _free(model, None), enough=0.01)
-        noises = problem.update_noise(values, noises)
+        # Mostly once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
+        # Where slow and fast parts are weighed apart, the weights move the parameters and these the weights.
+        for _ in range(NOISE_ROUNDS):
+            values = problem.minimise(values, noises, _free(model, None), enough=0.01)
+            before, noises = noises, problem.update_noise(values, noises)
+            if all(noises[s].weighs_alike(before[s]) for s in SENSORS):
+                break
     values = problem.minimise(values, noises, _free(model, None))
     held = problem.undetermined(values, noises)
     _refuse(held | fixed_parameters(model), held, model, allow_holding)
@@ -190,16 +198,16 @@ class _Problem:
         return values
 
     def first_noise(self, values):
-        """Return the noise before any residual is known."""
-        return {s: self._noise_of(s, values) for s in SENSORS}
+        """Return the noise before any residual is known; fast parts wait where slow ones can be fitted better."""
+        return {s: self._with_bands(s, self._noise_of(s, values)) for s in SENSORS}
 
     def _noise_of(self, sensor, values):
         white = white_noise(self.accumulator.rows, sensor)
         if white is not None:
             return WindowNoise(*white)
         variance = np.full(3, 1e-30)
-        for kind, factor in self.within[sensor].items():
-            variance = np.maximum(variance, (self._misfit(sensor, factor, values)**2).sum(axis=0) / self.dof_within[kind])
+        for kind in self.within[sensor]:
+            variance = np.maximum(variance, self._band_misfit(sensor, kind, values).noise)
         if not self.within[sensor]:
             variance = np.full(3, self.means[sensor][:, -3:].var() + 1e-12)
         return WindowNoise(variance, np.ones(3))
@@ -224,10 +232,17 @@ class _Problem:
         factors = []
         for axis in range(3):
             parts = [white[:, axis]]
-            for kind, factor in self.within[sensor].items():
-                parts.append(factor[:, list(range(p)) + [p + axis]] / noise.within_sd(kind)[axis])
+            parts += [rows[:, list(range(p)) + [p + axis]] * weight[axis] for rows, weight in self._weighed_rows(sensor, noise)]
             factors.append(triangular(np.concatenate(parts)))
         return factors
+
+    def _weighed_rows(self, sensor, noise):
+        """Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more."""
+        for kind, factor in self.within[sensor].items():
+            yield factor, 1 / noise.within_sd(kind)
+            extra = noise.slow_weight(kind)
+            if extra.any():
+                yield self.accumulator.slow[sensor, kind], extra
 
     def rows_of(self, values, factors):
         """Return residual rows and their Jacobian over both sensors and all axes, without the prior."""
@@ -307,21 +322,35 @@ class _Problem:
         noise = noises[sensor]
         if white_noise(self.accumulator.rows, sensor) is None:
             noise = self._noise_of(sensor, values)
-        scale = {}
-        for kind, factor in self.within[sensor].items():
-            squares = (self._misfit(sensor, factor, values)**2).sum(axis=0)
-            scale[kind] = np.maximum(squares / (self.dof_within[kind] * noise.white_variance), 1.0)
-            if self.accumulator.slow_rows.get(kind, 0) > self.accumulator.windows[kind]:
-                scale[kind] = np.maximum(scale[kind], self._slow_misfit(sensor, kind, values) / (noise.white_variance * noise.inflation))
-        noise = replace(noise, kind_scale=scale)
+        noise = weighed(noise, {kind: self._judged(sensor, kind, values) for kind in self.within[sensor]})
         design, information = self._linearised(sensor, values, noise, noises)
         offsets = estimate_offsets(design, self.mean_variance(noise), self.times, self.sessions, information)
         return replace(noise, **offsets)
 
-    def _slow_misfit(self, sensor, kind, values):
-        """Return the variance per sample that the slow part of the misfit speaks of: more than the samples' own when it is correlated."""
-        squares = (self._misfit(sensor, self.accumulator.slow[sensor, kind], values)**2).sum(axis=0)
-        return squares / (self.accumulator.slow_rows[kind] - self.accumulator.windows[kind])
+    def _with_bands(self, sensor, noise):
+        """Return the noise with next to no weight for the fast parts where slow parts, each fitted alone, leave less."""
+        misfits = {kind: self._band_misfit(sensor, kind) for kind in self.within[sensor]}
+        return weighed(noise, {kind: misfit.without_fast() for kind, misfit in misfits.items() if misfit.apart.any()})
+
+    def _judged(self, sensor, kind, values):
+        """Return the BandMisfit of the centred rows of a kind, with what the fast part misses along the parameters."""
+        misfit = self._band_misfit(sensor, kind, values)
+        if not misfit.apart.any():
+            return misfit
+        dc = coefficient_jacobian(self.model, sensor, values)[:, :, ~fixed_parameters(self.model)]
+        along = np.zeros(3)
+        for axis in range(3):
+            along[axis] = variance_along(*((rows[:, :-3] @ dc[:, axis], self._misfit(sensor, rows, values)[:, axis])
+                                           for rows in (self.within[sensor][kind], self.accumulator.slow[sensor, kind])))
+        return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
+
+    def _band_misfit(self, sensor, kind, values=None):
+        """Return the BandMisfit of the centred rows of a kind at `values`; without them, of each part at its own best fit."""
+        rows, n_slow = self.within[sensor][kind], self.accumulator.slow_rows.get(kind, 0) - self.accumulator.windows[kind]
+        slow = self.accumulator.slow[sensor, kind] if n_slow > 0 else rows[:0]
+        misfits = [own_misfit(part) if values is None else self._misfit(sensor, part, values) for part in (rows, slow)]
+        total, of_slow = ((misfit**2).sum(axis=0) for misfit in misfits)
+        return band_misfit(total, self.dof_within[kind], of_slow, n_slow)
 
     def _linearised(self, sensor, values, noise, noises):
         """Return mean rows ``[design | residual]`` in the parameters, and the Gram matrix of what else is known of them."""
@@ -335,9 +364,9 @@ class _Problem:
         used = np.any(root != 0, axis=1)
         offset = self.prior.root[used] @ (self.prior.mean - values)
         parts = [np.concatenate([root[used], offset[:, None]], axis=1)]
-        for kind, factor in self.within[sensor].items():
-            sd, rest = noise.within_sd(kind), self._misfit(sensor, factor, values)
-            parts += [np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis:axis + 1]], axis=1) / sd[axis] for axis in range(3)]
+        for factor, weight in self._weighed_rows(sensor, noise):
+            rest = self._misfit(sensor, factor, values)
+            parts += [np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis:axis + 1]], axis=1) * weight[axis] for axis in range(3)]
         stacked = np.concatenate(parts)
         return rows, stacked.T @ stacked
 

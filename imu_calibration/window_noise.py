@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import lapack
 
+from imu_calibration.bands import extra_weight
+
 
 @dataclass(frozen=True, eq=False)
 class WindowNoise:
@@ -27,6 +29,8 @@ class WindowNoise:
     """Correlation time of the wander, s."""
     kind_scale: dict = field(default_factory=dict)
     """Kind -> factor on the variance of the centred rows, shape (3,): what moving windows scatter beyond the noise at rest."""
+    slow_scale: dict = field(default_factory=dict)
+    """Kind -> the same of their slow part, where that fits better than the fast part, shape (3,)."""
     session_sd: float = 0.0
     """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
     session_variance: float = 0.0
@@ -39,6 +43,27 @@ class WindowNoise:
     def within_sd(self, kind):
         """Return the standard deviation per centred row of windows of `kind`, shape (3,)."""
         return np.sqrt(self.white_variance * self.inflation * self.kind_scale.get(kind, np.ones(3)))
+
+    def slow_weight(self, kind):
+        """Return the weight of the slow part of centred rows of `kind` beside all of them at `within_sd`, shape (3,)."""
+        if kind not in self.slow_scale:
+            return np.zeros(3)
+        unit = self.white_variance * self.inflation
+        return extra_weight(unit * self.kind_scale[kind], unit * self.slow_scale[kind])
+
+    def weighs_alike(self, other, change=0.05):
+        """Return whether slow parts count no more than fast ones, or both count as with `other`, to a relative change of their variances."""
+        unit, other_unit = (noise.white_variance * noise.inflation for noise in (self, other))
+        for kind, slow in self.slow_scale.items():
+            every = self.kind_scale[kind]
+            if np.all(slow == every):
+                continue
+            if kind not in other.slow_scale:
+                return False
+            pairs = ((every, other.kind_scale[kind]), (slow, other.slow_scale[kind]))
+            if any(np.any(np.abs(unit * mine / (other_unit * its) - 1) > change) for mine, its in pairs):
+                return False
+        return True
 
 
 def white_noise(rows, sensor):
