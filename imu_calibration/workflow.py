@@ -13,7 +13,8 @@ from imu_calibration.diagnosis import diagnose, to_mapping
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior, solve
 from imu_calibration.gathering import Gathered, restrict
-from imu_calibration.preflight import Preflight, unusable, warnings
+from imu_calibration.preflight import Preflight, refuse, unusable, warnings
+from imu_calibration.preflight.joint_checks import against_joints
 from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
 from imu_calibration.settings import WindowSettings
 from imu_calibration.several import GatherStep, join
@@ -130,7 +131,7 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
     model = choose_model(options, table, _first_temperature(sources, options))
     for _ in range(PASSES):
         step = GatherStep(table, model, options.windows, options.nominal, names, progress)
-        gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model))
+        gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
         result = finish(gathered, model, table, options, provenance)
         again = linearise_again(model, result.solution)
         if again is None:
@@ -293,16 +294,16 @@ def conditions(gathered, table):
             'gravity': table.gravity_value if table is not None else None, 'duration_s': gathered.duration, 'date': date}
 
 
-def check_units(gathered, model):
+def check_units(gathered, model, table=None):
     """
-    Refuse recordings whose units are plainly not SI.
+    Refuse recordings whose units are plainly not SI, or whose axes are not those of the table.
 
-    Compares the length of the specific force at rest with gravity, and the measured rates with those of the joints.
+    Compares the length of the specific force at rest with gravity, and rates and forces with those that the joints imply.
 
     Raises
     ------
     InputError
-        Naming the likely unit.
+        Naming the likely unit, or how the axes lie.
 
     """
     rows = gathered.accumulator.rows
@@ -310,7 +311,7 @@ def check_units(gathered, model):
     if static:
         length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
         check_force(length)
-    _check_rates([row for row in rows if row.kind != 'static'], gathered, model)
+    refuse(against_joints(gathered, model, table))
 
 
 def check_force(length):
@@ -320,32 +321,6 @@ def check_force(length):
                          f'give --nominal with accelerometer_scale {1 / G:.6f}')
     if not 3.0 < length < 30.0:
         raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')
-
-
-def _check_rates(moving, gathered, model):
-    measured, reference = 0.0, 0.0
-    start = 0
-    for name, width in model.groups('gyroscope'):
-        if name == 'rate':
-            break
-        start += width
-    for (sensor, kind), factor in gathered.accumulator.within.items():
-        if sensor == 'gyroscope':
-            measured += (factor[:, -3:]**2).sum()
-            reference += (factor[:, start:start + 3]**2).sum()
-    for row in moving:
-        mean = row.sensors['gyroscope'].mean
-        measured += row.count * (mean[-3:]**2).sum()
-        reference += row.count * (mean[start:start + 3]**2).sum()
-    if reference <= 0 or measured <= 0:
-        return
-    ratio = np.sqrt(measured / reference)
-    if 40 < ratio < 80:
-        raise InputError(f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; convert them in the '
-                         'driver or give --nominal with gyroscope_scale 57.29578')
-    if 1 / 80 < ratio < 1 / 40:
-        raise InputError(f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like degrees; '
-                         'convert them in the driver of the table')
 
 
 def summary(result):

@@ -1,68 +1,96 @@
-"""``imu_calibration inspect``: what a recording holds and what it can determine."""
+"""``imu_calibration inspect``: what a recording holds, what looks wrong with it, and what it can determine."""
 
 from collections import Counter
 
 from imu_calibration import workflow
 from imu_calibration.cli import files, recordings
-from imu_calibration.cli.show import console
+from imu_calibration.cli.progress import progress_bar
+from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.preflight import REFUSE, Preflight, unusable
 from imu_calibration.stream_check import StreamCheck
 
 NAME = 'inspect'
-HELP = 'Topics, rates, gaps, stamps, units that look wrong, motions found, and which parameters the recording can determine.'
+HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions found, and which parameters the recording can determine.'
+TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic', 'temperature'))
 
 
 def add_arguments(parser):
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
-    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); with it the motions are found and judged')
+    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); with it axes and units are compared with the joints, '
+                        'and the motions are found and judged')
     recordings.add_topic_arguments(parser)
     recordings.add_model_arguments(parser)
 
 
 def run(options):
-    """Read once for the streams, and once more with the table for the motions."""
+    """Read once for streams and checks, and once more with the table for the motions."""
+    table = files.read_table(options.table) if options.table else None
+    settings = recordings.calibration_options(options)
+    preflight = Preflight(None if table is None else table.gravity_value, settings.nominal)
     out = console()
     with recordings.open_bag(options.bag, options, want_joints='optional') as recording:
-        for topic in recording.topics:
-            out.print(f'{topic.name}  {topic.type}  {topic.count}')
-        checks, drops = _read(recording)
-        lost = dict(recording.lost)
-    for name, check in checks.items():
-        statistics = check.statistics()
-        if statistics.count:
-            out.print(f'{name}: {statistics.count} samples, {statistics.rate:.2f} Hz, {statistics.duration:.1f} s, {statistics.n_gaps} gaps '
-                      f'({statistics.gap_total:.2f} s), longest step {statistics.longest_step * 1e3:.1f} ms, stamps in steps of {statistics.stamp_step_ns} ns')
-            for reason, count in statistics.dropped.items():
-                if count:
-                    drops[f'{name} {reason}'] += count
-    for reason, count in (drops + Counter(lost)).items():
-        out.print(f'dropped: {count} {reason}')
-    code = 3 if sum(drops.values()) or lost else 0
-    return _judge(options, out, code) if options.table else code
+        checks, drops = _read(recording, preflight)
+        lost = Counter(recording.lost)
+    _show_topics(out, recording, {name: check.statistics() for name, check in checks.items()})
+    show_findings(out, preflight.findings)
+    for reason, count in (drops + lost).items():
+        out.print(f'lost: {count} {reason}')
+    refused = any(finding.severity == REFUSE for finding in preflight.findings)
+    lacking = drops or lost or any(check.counts for check in checks.values())
+    code = 3 if refused or lacking or unusable(preflight.findings) else 0
+    return _judge(options, settings, table, out, code) if table is not None and not refused else code
 
 
-def _read(recording):
-    checks, drops = {name: StreamCheck() for name in ('imu', 'joints', 'temperature')}, Counter()
-    for block in recording.blocks():
-        drops.update(block.dropped or {})
-        for name, check in checks.items():
-            samples = getattr(block, name)
-            if samples is not None and len(samples):
-                check.push(samples)
+def _read(recording, preflight):
+    checks, drops = {name: StreamCheck() for _, name in TOPICS}, Counter()
+    with progress_bar('inspect', recording.message_counts.get(recording.imu_topic, 0)) as advance:
+        for block in preflight.watch(recording.blocks(), strict=False):
+            drops.update(block.dropped or {})
+            for name, check in checks.items():
+                check.push(getattr(block, name))
+            if block.imu is not None:
+                advance(len(block.imu))
     for check in checks.values():
         check.finish()
     return checks, drops
 
 
-def _judge(options, out, code):
-    table = files.read_table(options.table)
+def _show_topics(out, recording, statistics):
+    """Print the topics; those that are read come with what their stamps say."""
+    from rich.table import Table
+    used = {getattr(recording, attribute): name for attribute, name in TOPICS if getattr(recording, attribute)}
+    table = Table(box=None, pad_edge=False, header_style='dim')
+    for heading in ('topic', 'type', 'messages', 'Hz', 'seconds', 'gaps', 'stamp step', ''):
+        table.add_column(heading, justify='right' if heading in ('messages', 'Hz', 'seconds', 'gaps', 'stamp step') else 'left')
+    for topic in sorted(recording.topics, key=lambda topic: topic.name not in used):
+        found = statistics.get(used.get(topic.name))
+        if found is None or not found.count:
+            table.add_row(topic.name, topic.type, str(topic.count), style='dim')
+        else:
+            gaps = f'{found.n_gaps} ({found.gap_total:.2f} s)' if found.n_gaps else 'none'
+            table.add_row(topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps, _step(found.stamp_step_ns), 'read')
+    out.print(table)
+    out.print()
+
+
+def _step(step_ns):
+    """Return the finest difference between stamps in the largest unit that needs no fraction."""
+    for size, unit in ((10**6, 'ms'), (10**3, 'us')):
+        if step_ns and step_ns % size == 0:
+            return f'{step_ns // size} {unit}'
+    return f'{step_ns} ns' if step_ns else ''
+
+
+def _judge(options, settings, table, out, code):
     source = recordings.source_of(options.bag, options, table.joint_names)
     try:
-        result = workflow.calibrate([source], table, recordings.calibration_options(options))
+        result = workflow.calibrate([source], table, settings)
     except ImuCalibrationError as error:
-        out.print(f'not usable for calibration: {error}', soft_wrap=True)
+        out.print(f'not usable for calibration: {error}', soft_wrap=True, markup=False)
         return 3
+    out.print()
     for kind, count in result.calibration.statistics['windows'].items():
         out.print(f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]} samples')
     groups = {}

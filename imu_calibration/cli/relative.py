@@ -4,6 +4,7 @@ from imu_calibration.by_hand_document import read_imu
 from imu_calibration.cli import recordings
 from imu_calibration.cli.show import console
 from imu_calibration.errors import InputError
+from imu_calibration.preflight import Preflight
 from imu_calibration.units import with_sd
 
 
@@ -26,7 +27,8 @@ def run(options):
     for topic in options.imu_topic:
         options.joint_topic = options.temperature_topic = None
         recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
-        imus.append(read_imu(recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)())[0])
+        blocks = recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()
+        imus.append(read_imu(Preflight().watch(blocks))[0])
     result = estimate_arm(*imus)
     out = console()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

@@ -1,7 +1,7 @@
 """What the verbs print: short tables on standard output."""
 
 from imu_calibration import workflow
-from imu_calibration.preflight import warnings
+from imu_calibration.preflight import SEVERITIES
 from imu_calibration.units import for_people, with_sd
 
 
@@ -13,11 +13,27 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
 
 
-def warn(findings):
-    """Print what looks wrong with a recording on standard error, a line each."""
+def warn(calibration):
+    """Print what looked wrong with the recording on standard error, a line each."""
     import sys
-    for finding in warnings(findings):
-        print(f'warning: {finding.text}', file=sys.stderr)
+    for found in calibration.statistics.get('preflight') or ():
+        print(f'warning: {found["text"]}', file=sys.stderr)
+
+
+STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}
+
+
+def show_findings(out, findings):
+    """Print findings on a console, the worst first."""
+    from rich.table import Table
+    from rich.text import Text
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True, style='bold')
+    table.add_column(overflow='fold')
+    for finding in sorted(findings, key=lambda found: SEVERITIES.index(found.severity)):
+        table.add_row(Text(finding.severity, STYLES[finding.severity]), finding.check.replace('_', ' '), Text(finding.text))
+    out.print(table)
 
 
 def show_calibration(result, folder, report=True):

@@ -15,7 +15,7 @@ __all__ = ['CHECKS', 'GOOD', 'NOTE', 'REFUSE', 'SEVERITIES', 'WARNING', 'Finding
 CHECKS = (
     value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.handedness,
     value_checks.gravity, value_checks.clipping, value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
-    stamp_checks.rate, stamp_checks.gaps, stamp_checks.jitter,
+    stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )
 """In the order in which they refuse: a wrong unit makes much of what follows wrong as well."""
 

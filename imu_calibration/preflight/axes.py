@@ -38,11 +38,14 @@ class AxisMatch:
         """Return whether the axes are not those of the reference."""
         return self.as_they_are < POOR
 
-    def words(self, measured, reference):
-        """Return the exchange in words."""
-        rows = [(i, int(np.argmax(np.abs(row))), row.sum()) for i, row in enumerate(self.matrix)]
-        return ', '.join(f"the {measured}'s {'xyz'[i]} is {'minus ' if sign < 0 else ''}the {reference}'s {'xyz'[j]}"
-                         for i, j, sign in rows if i != j or sign < 0)
+    def exchanges(self, seen=np.eye(3)):
+        """Return (measured axis, reference axis, sign) of what is not as it should be, for the reference axes that were seen."""
+        found = []
+        for j in np.flatnonzero(np.diag(seen) > 0.5):
+            i = int(np.argmax(np.abs(self.matrix[:, j])))
+            if i != j or self.matrix[i, j] < 0:
+                found.append((i, int(j), float(self.matrix[i, j])))
+        return sorted(found)
 
 
 def match_axes(matrix, seen=np.eye(3)):

@@ -57,17 +57,17 @@ def gaps(evidence):
                               f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
-def rate(evidence):
+def sampling(evidence):
     """The samples per second are those that the step between stamps promises."""
     for name in FAST:
         if name in evidence.streams:
             stream = evidence.streams[name]
             nominal, real = stream.statistics.rate, stream.real_rate
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
-                yield Finding('rate', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
+                yield Finding('sampling', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
                               'samples were lost, or stamps are made when messages arrive; look at the driver and at the load of the recorder')
             elif nominal:
-                yield Finding('rate', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
+                yield Finding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
 
 def jitter(evidence):

@@ -39,7 +39,7 @@ def force_unit(evidence):
     elif not 3.0 < length < 30.0:
         yield Finding('force_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with accelerometer_offset and accelerometer_scale')
     else:
-        yield Finding('force_unit', GOOD, f'specific force in m/s^2: {length:.3f} is the length of gravity')
+        yield Finding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
 
 
 def rate_unit(evidence):
@@ -57,7 +57,7 @@ def rate_unit(evidence):
         elif not 0.5 < ratio < 2.0:
             yield Finding('rate_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with gyroscope_offset and gyroscope_scale')
         else:
-            yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates say (ratio {ratio:.2f}, axes {_axes(turning.seen)})')
+            yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
     elif largest > FASTEST:
         yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, the largest is {largest:.4g} ({largest * DEG:.0f} deg/s), faster than gyroscopes '
                       'measure: deg/s, counts or volts?; convert them in the driver or give --nominal FILE with gyroscope_offset and gyroscope_scale')
@@ -68,26 +68,19 @@ def handedness(evidence):
     turning = evidence.turning
     if turning is None:
         return
-    match = match_axes(turning.matrix.T, np.eye(3)) if turning.seen.all() else match_axes(turning.matrix, np.diag(turning.seen.astype(float)))
+    seen = np.diag(turning.seen.astype(float))
+    match = match_axes(turning.matrix, seen)
     if not match.wrong:
         if turning.seen.all():
             yield Finding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
         return
-    what = match.words('gyroscope', 'accelerometer') if turning.seen.all() else _partial(turning, match)
-    what = what if match.agreement > CLEAR else 'no exchange of axes makes them fit'
-    kind = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}.get((match.turned, match.mirrored), 'turned or left-handed')
-    yield Finding('handedness', REFUSE, f'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: {what} ({kind}); '
-                  'correct signs and order of the axes in the driver')
-
-
-def _partial(turning, match):
-    """Return in words how the columns of the gyroscope that were seen lie."""
-    words = []
-    for j in np.flatnonzero(turning.seen):
-        i = int(np.argmax(np.abs(turning.matrix[:, j])))
-        if i != j or turning.matrix[i, j] < 0:
-            words.append(f"the gyroscope's {'xyz'[j]} is {'minus ' if turning.matrix[i, j] < 0 else ''}the accelerometer's {'xyz'[i]}")
-    return ', '.join(words)
+    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j, sign in match.exchanges(seen))
+    if not what or match.agreement < CLEAR:
+        what = 'no exchange of axes makes them fit'
+    kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
+    kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, the recording cannot tell')
+    yield Finding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
+                  f'{what} ({kind}); correct signs and order of the axes in the driver')
 
 
 def frozen(evidence):

@@ -33,7 +33,8 @@ def origin_section(result):
     stream = statistics.get('stream') or {}
     kept_out = [(reason, count) for reason, count in stream.items() if reason not in dict(statistics.get('windows') or {}) and count]
     bags = [(bag['name'], bag['sha256']) for bag in calibration.provenance.get('bags') or []]
-    return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()), 'settings': _settings(result.options),
+    return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()),
+            'warnings': [found['text'] for found in statistics.get('preflight') or []], 'settings': _settings(result.options),
             'table': _table(result.table), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
             'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing') for sensor in ('accelerometer', 'gyroscope', 'reference')]}
 

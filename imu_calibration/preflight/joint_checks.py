@@ -1,0 +1,123 @@
+"""Checks against the table: units, signs and order of the axes, from the windows that calibration gathered anyway."""
+
+import numpy as np
+
+from imu_calibration.preflight.axes import CLEAR, match_axes
+from imu_calibration.preflight.finding import REFUSE, Finding
+
+SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
+"""Directions in which the reference has less than this share of its largest power say nothing."""
+RELATED = 0.5
+"""Smallest squared correlation from which on factors and axes are looked at."""
+LEAST_RATE = 0.02
+"""Rms of the reference's rates below which they say nothing, rad/s."""
+REFERENCE = {'accelerometer': 'force', 'gyroscope': 'rate'}
+WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'), 'gyroscope': ('angular rates', 'the rates of the joints')}
+
+
+def against_joints(gathered, model, table=None):
+    """
+    Return the findings about measured rates and forces beside those that the joints imply.
+
+    Parameters
+    ----------
+    gathered : Gathered
+        Windows of a recording.
+    model : SensorModel
+        Defines the columns.
+    table : Table, optional
+        With it the mount that would fit is named.
+
+    """
+    found = []
+    for sensor in ('gyroscope', 'accelerometer'):
+        moments = _moments(gathered.accumulator, model, sensor)
+        if moments is not None:
+            found += _rate_units(moments) if sensor == 'gyroscope' else []
+            found += _axes(sensor, moments, table)
+    return tuple(found)
+
+
+def _moments(accumulator, model, sensor):
+    """Return sums of products (measured with reference, reference with itself, measured with itself), or None."""
+    part = model.layout(sensor).rows.get(REFERENCE[sensor])
+    rows = [row for row in accumulator.rows if sensor == 'gyroscope' or row.kind == 'static']
+    if part is None or not rows:
+        return None
+    weight = np.array([row.count if sensor == 'gyroscope' else 1.0 for row in rows])
+    means = np.array([row.sensors[sensor].mean for row in rows])
+    if sensor == 'gyroscope':
+        means = means - weight @ means / weight.sum()   # the bias
+    total = (means * weight[:, None]).T @ means
+    for (name, _), factor in accumulator.within.items():
+        if name == sensor == 'gyroscope':
+            total = total + factor.T @ factor
+    if sensor == 'gyroscope':
+        samples = sum(accumulator.samples.values())
+        if np.trace(total[part, part]) < LEAST_RATE**2 * max(samples, 1):
+            return None
+    return total[-3:, part], total[part, part], total[-3:, -3:]
+
+
+def _seen(sensor, moment):
+    """Return (projector on the directions that the reference shows, inverse of its moment there)."""
+    values, vectors = np.linalg.eigh(moment)
+    shown = values > SEEN[sensor] * values.max()
+    vectors = vectors[:, shown]
+    return vectors @ vectors.T, vectors @ np.diag(1.0 / values[shown]) @ vectors.T
+
+
+def _rate_units(moments):
+    cross, reference, measured = moments
+    ratio = np.sqrt(np.trace(measured) / np.trace(reference))
+    if not ratio > 0:
+        return
+    if 40 < ratio < 80:
+        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
+                      'convert them in the driver or give --nominal FILE with gyroscope_scale 57.29578')
+    elif 1 / 80 < ratio < 1 / 40:
+        yield Finding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
+                      'degrees; convert them in the driver of the table')
+    elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
+        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
+                      'give --nominal FILE with gyroscope_offset and gyroscope_scale')
+
+
+def _axes(sensor, moments, table):
+    cross, reference, measured = moments
+    seen, inverse = _seen(sensor, reference)
+    matrix = cross @ inverse
+    if np.trace(matrix @ reference @ matrix.T) < RELATED * np.trace(measured):
+        return   # something else rules the readings, and other checks say what
+    match = match_axes(matrix, seen)
+    if not match.wrong:
+        return
+    what, whose = WORDS[sensor]
+    yield Finding('handedness', REFUSE, f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
+
+
+def _exchange(match, seen, whose):
+    known = [f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}" for i, j, sign in match.exchanges(seen)]
+    return ', '.join(known) if known and match.agreement > CLEAR else 'no exchange of axes makes them so'
+
+
+def _cause(match, matrix, seen, table):
+    if match.turned and match.mirrored:
+        return ('this recording cannot tell a turned sensor from a wrong sign; correct mount.rpy_deg or the sign of a joint axis in the table, '
+                'or the signs in the driver')
+    if match.mirrored:
+        return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
+    fits = ''
+    if table is not None and np.trace(seen) > 2.5:
+        fits = ', [' + ', '.join(f'{angle:.0f}' for angle in _mount_rpy_deg(matrix, table)) + '] would fit'
+    return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
+
+
+def _mount_rpy_deg(matrix, table):
+    """Return roll, pitch, yaw of the rotation nearest to what was measured, as `mount.rpy_deg` gives them."""
+    left, _, right = np.linalg.svd(matrix)
+    mat_ls = (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T
+    pitch = np.arctan2(-mat_ls[2, 0], np.hypot(mat_ls[2, 1], mat_ls[2, 2]))
+    if np.cos(pitch) < 1e-3:
+        return np.degrees([0.0, pitch, np.arctan2(-mat_ls[0, 1], mat_ls[1, 1])]) + 0.0
+    return np.degrees([np.arctan2(mat_ls[2, 1], mat_ls[2, 2]), pitch, np.arctan2(mat_ls[1, 0], mat_ls[0, 0])]) + 0.0
