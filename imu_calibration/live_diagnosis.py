@@ -7,7 +7,8 @@ from imu_calibration.diagnosis import diagnose
 from imu_calibration.diagnosis.diagnose import LEAST_WINDOWS
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.window_store import owned_window
-from imu_calibration.workflow import baseline_options, choose_model, diagnosis_lines, in_words
+from imu_calibration.workflow import choose_model
+from imu_calibration.workflow_diagnosis import baseline_options, diagnosis_lines, in_words
 
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = 'waiting', 'off', 'found', 'nothing found', 'unexplained', 'failed'
 

@@ -9,7 +9,6 @@ import imu_calibration
 from imu_calibration import observability
 from imu_calibration.by_hand_document import calibrate_recording_by_hand
 from imu_calibration.calibration import DETERMINED, Calibration, statuses, tolerances_of
-from imu_calibration.diagnosis import diagnose, to_mapping
 from imu_calibration.errors import InputError
 from imu_calibration.estimation import make_prior, solve
 from imu_calibration.gathering import Gathered, restrict
@@ -18,14 +17,14 @@ from imu_calibration.preflight.joint_checks import against_joints
 from imu_calibration.sensor_model import SensorModel, coefficients, parse_effects
 from imu_calibration.settings import WindowSettings
 from imu_calibration.several import GatherStep, join
-from imu_calibration.units import for_people, significant
 from imu_calibration.verdict import judge, requested
-from imu_calibration.windows import MotionGatherer
 
 SENSORS = ('accelerometer', 'gyroscope')
 G = 9.80665
-PASSES = 4
+PASSES = 6
 """Passes over a recording at most, when effects have to be linearised anew."""
+LINEAR_STEPS = 25
+"""Steps of a numerical derivative (5 ms of a delay) over which a linearisation is believed in directions that are hardly seen."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,29 @@ def _first_temperature(sources, options):
 
 def linearise_again(model, solution):
     """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
-    return model.at(_values_in(model, solution)) if _needs_another_pass(model, solution) else None
+    return model.at(_values_in(model, solution, _cautious(solution))) if _needs_another_pass(model, solution) else None
+
+
+def _cautious(solution):
+    """
+    Return values to linearise at: those of the solution, but for directions that the recording hardly shows.
+
+    At zero a lag and a delay are the same to first order. What tells them apart, and how far, is only seen from a point where both act; a full
+    step along their difference would lead anywhere. So the step is the solution's with a pull of LINEAR_STEPS towards the point.
+    """
+    model, values = solution.model, solution.values
+    move, pull = np.zeros(len(values)), np.zeros(len(values))
+    for effect in model.relinearised:
+        if effect.warp is not None:
+            part = model.slices[effect.sensor, effect.name]
+            move[part], pull[part] = values[part] - model.warp_point(effect), (LINEAR_STEPS * effect.step)**-2
+    moving = np.flatnonzero(pull)
+    if not len(moving):
+        return values
+    known = np.linalg.inv(solution.covariance[np.ix_(moving, moving)])
+    kept = values.copy()
+    kept[moving] -= np.linalg.solve(known + np.diag(pull[moving]), pull[moving] * move[moving])
+    return kept
 
 
 def _needs_another_pass(model, solution):
@@ -167,10 +188,10 @@ def _needs_another_pass(model, solution):
     return False
 
 
-def _values_in(model, solution):
+def _values_in(model, solution, known):
     values = model.start()
     for effect in solution.model.effects:
-        values[model.slices[effect.sensor, effect.name]] = solution.values[solution.model.slices[effect.sensor, effect.name]]
+        values[model.slices[effect.sensor, effect.name]] = known[solution.model.slices[effect.sensor, effect.name]]
     return values
 
 
@@ -357,109 +378,3 @@ def window_residuals(result):
         found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
                          'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class DiagnosisResult:
-    """A diagnosis with everything that is written and shown."""
-
-    diagnosis: object
-    """The Diagnosis."""
-    calibration: Calibration
-    """The extended calibration; the baseline's when nothing was found."""
-    solution: object
-    """Solution of the extended model."""
-    table: object
-    """The Table."""
-    tolerances: np.ndarray
-    """Tolerance of each parameter of the extended model."""
-    options: CalibrationOptions
-    """What was asked for."""
-
-    @property
-    def document(self):
-        """Return the content of diagnosis.json."""
-        return to_mapping(self.diagnosis)
-
-    @property
-    def lines(self):
-        """What was found, in lines for people."""
-        return diagnosis_lines(self.diagnosis)
-
-
-def diagnose_recording(source, table, options=CalibrationOptions(), provenance=None, progress=None):
-    """
-    Calibrate a recording, say what the model gets wrong and why, and extend it.
-
-    Parameters
-    ----------
-    source : callable
-        Returns an iterator of SampleBlock, twice.
-    table : Table
-    options : CalibrationOptions
-        The model to start from; where nothing is asked for, bias and matrix alone, so that everything else has to prove itself.
-    provenance : dict, optional
-    progress : callable, optional
-        Called with the percent done since the last call.
-
-    Returns
-    -------
-    DiagnosisResult
-
-    """
-    options = baseline_options(options)
-    baseline = calibrate([source], table, options, provenance)
-    windows = collect_windows(source(), table, options)
-    diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
-    tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
-    calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, provenance)
-    return DiagnosisResult(diagnosis, calibration, diagnosis.solution, table, tolerances, options)
-
-
-def baseline_options(options):
-    """Return the options of the model that a diagnosis starts from: what was not asked for has to prove itself."""
-    return replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
-
-
-def collect_windows(blocks, table, options=CalibrationOptions()):
-    """Return all windows of a recording with their samples, unused ones too."""
-    gatherer, windows = MotionGatherer(table, options.windows, keep_unused=True), []
-    for block in blocks:
-        if options.nominal is not None and block.imu is not None:
-            block = replace(block, imu=options.nominal.apply(block.imu))
-        windows += gatherer.push(block)
-    return windows + gatherer.finish()
-
-
-def _percent(advance):
-    """Return a function of the share done that calls `advance` with what was added, in percent."""
-    done = [0.0]
-
-    def report(share):
-        advance(100 * share - done[0])
-        done[0] = 100 * share
-    return report
-
-
-def diagnosis_lines(diagnosis):
-    """Return findings, what stays unexplained and what could not be tested, as lines."""
-    lines = []
-    for number, finding in enumerate(diagnosis.findings, 1):
-        lines.append(f'{number}. {finding.effect}: {finding.explanation}')
-        if finding.indistinguishable_from:
-            lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
-    if not diagnosis.findings:
-        lines.append('nothing found: no effect of the catalogue explains more than noise does')
-    for sensor, rest in diagnosis.unexplained.items():
-        if rest.significant:
-            with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
-            lines.append(f'unexplained: {in_words(rest.rms, sensor)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
-    if diagnosis.not_testable:
-        lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
-    return lines
-
-
-def in_words(value, sensor):
-    """Return a specific force or rate in people's units."""
-    factor, unit = for_people({'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
-    return f'{significant(value * factor)} {unit}'

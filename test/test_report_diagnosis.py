@@ -13,7 +13,8 @@ from imu_calibration.samples import SampleBlock
 from imu_calibration.sensor_model import SensorModel
 from imu_calibration.simulation import SimulationOptions, random_values, simulate
 from imu_calibration.turntable import Table
-from imu_calibration.workflow import CalibrationOptions, diagnose_recording, exit_code
+from imu_calibration.workflow import CalibrationOptions, exit_code
+from imu_calibration.workflow_diagnosis import diagnose_recording
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'azimuth_deg': 0.0})

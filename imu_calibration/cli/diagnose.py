@@ -2,7 +2,7 @@
 
 import json
 
-from imu_calibration import documents, workflow
+from imu_calibration import documents, workflow, workflow_diagnosis
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console
@@ -14,8 +14,9 @@ HELP = 'Show what the model gets wrong, name the cause, extend the model, and me
 def add_arguments(parser):
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
-    parser.add_argument('--table', metavar='TABLE', required=True, help='table description (YAML)')
+    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); without it: by hand, gravity as the reference')
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
+    parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for a diagnosis by hand, default 9.80665')
     recordings.add_topic_arguments(parser)
     recordings.add_model_arguments(parser)
 
@@ -23,16 +24,20 @@ def add_arguments(parser):
 def run(options):
     """Diagnose, write, print the findings."""
     settings = recordings.calibration_options(options)
-    table = files.read_table(options.table)
+    table = files.read_table(options.table) if options.table else None
     with files.output_folder(options.output) as folder:
         return _into(folder, options, settings, table)
 
 
 def _into(folder, options, settings, table):
     """Diagnose into a folder that can be written, print, return the exit code."""
-    source = recordings.source_of(options.bag, options, table.joint_names)
+    source = recordings.source_of(options.bag, options, table and table.joint_names, table is not None)
+    provenance = recordings.provenance_of([options.bag], options)
     with progress_bar('diagnose', 100, '%') as advance:
-        result = workflow.diagnose_recording(source, table, settings, recordings.provenance_of([options.bag], options), advance)
+        if table is None:
+            result = workflow_diagnosis.diagnose_without_table(source, settings, options.gravity, provenance, advance)
+        else:
+            result = workflow_diagnosis.diagnose_recording(source, table, settings, provenance, advance)
     from imu_calibration.report import diagnosis_report
     page = diagnosis_report(result)
     files.write_text(folder / 'diagnosis.json', json.dumps(result.document, indent=1) + '\n')

@@ -11,6 +11,8 @@ from imu_calibration.report.residuals import UNIT
 from imu_calibration.units import for_people
 
 BINS = 16
+FEW = 200
+"""Below this number of points the effect is drawn against its own prediction, with points that can be seen."""
 CLEAR = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
@@ -21,17 +23,18 @@ def diagnosis_report(result):
 
     Parameters
     ----------
-    result : workflow.DiagnosisResult
+    result : workflow_diagnosis.DiagnosisResult
 
     """
     diagnosis = result.diagnosis
     rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
+    by_hand = result.table is None
     word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
     return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests), lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
-                  traces=draw('traces', (8.6, 4.2), _OverTime(diagnosis.traces), 'Residuals over time before and after the extension'),
+                  traces=draw('traces', (8.6, 4.2), _OverTime(diagnosis.traces, 'of each pose' if by_hand else 'over 0.25 s'), 'Residuals over time before and after the extension'),
                   candidates=[_candidate(row) for row in diagnosis.candidates], rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
-                  not_testable=list(diagnosis.not_testable), groups=parameter_groups(result), windows=diagnosis.windows, locked=diagnosis.locked,
+                  not_testable=list(diagnosis.not_testable), groups=parameter_groups(result), by_hand=by_hand, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
 
 
@@ -119,6 +122,8 @@ def cause_of(traces, finding):
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
     kinds = next((kinds for part, kinds in CAUSES if part in finding.effect), ())
+    if len(signal) < FEW:
+        kinds = ()  # a mean over bins of so few poses says nothing
     best = max(((explained_share(values, signal[:, axis]), label, values) for label, (kind, values) in variables(traces).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
     if best[0] < CLEAR:
@@ -141,7 +146,7 @@ class _AgainstCause:
         left, right = figure.subplots(1, 2, sharey=True)
         some = slice(None, None, max(1, len(values) // 2500))
         for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
-            axes.plot(values[some], residual[some], '.', color=colour, markersize=4, alpha=0.5, mew=0)
+            axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_title(f'{title}: rms {text(float(np.sqrt(np.mean(residual**2))))} {unit}')
             axes.set_xlabel(label)
@@ -153,8 +158,15 @@ class _AgainstCause:
         left.set_ylim(-limit, limit)
 
 
+def _marker(values, many):
+    return 9 if len(values) < FEW else many
+
+
 def _curve(values, signal):
     """Return means of the fitted signal over bins of equal width of the cause, where a bin holds enough to have a mean."""
+    if len(values) < FEW:
+        order = np.argsort(values)
+        return values[order], signal[order]
     edges = np.linspace(values.min(), values.max(), BINS + 1)[1:-1]
     index = np.searchsorted(edges, values)
     count = np.bincount(index, minlength=BINS)
@@ -165,8 +177,8 @@ def _curve(values, signal):
 class _OverTime:
     """Size of the residual over time, before and after, one panel per sensor."""
 
-    def __init__(self, traces):
-        self.traces = traces
+    def __init__(self, traces, over):
+        self.traces, self.over = traces, over
 
     def __call__(self, figure):
         for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
@@ -174,8 +186,8 @@ class _OverTime:
             some = slice(None, None, max(1, len(self.traces.time) // 3000))
             for residual, colour, label in ((self.traces.before, BEFORE, 'before'), (self.traces.after, AFTER, 'after')):
                 size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
-                axes.plot(self.traces.time[some], size[some], '.', color=colour, markersize=3, alpha=0.5, mew=0, label=label)
-            axes.set_title(f'{sensor}, size of the residual over 0.25 s, {unit}')
+                axes.plot(self.traces.time[some], size[some], '.', color=colour, markersize=_marker(size, 3), alpha=0.5, mew=0, label=label)
+            axes.set_title(f'{sensor}, size of the residual {self.over}, {unit}')
             axes.set_ylim(bottom=0)
         axes.set_xlabel('time, s')
         figure.axes[0].legend(loc='upper right', markerscale=3)
