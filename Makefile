@@ -32,15 +32,15 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast test-oldest bench soak hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast test-oldest validate bench soak hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, test-oldest, bench, soak, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-fast, test-oldest, validate, bench, soak, hide-and-seek, clean'
 
 setup: $(STAMP)
 
-$(STAMP): $(wildcard constraints/*.txt) setup.py setup.cfg
+$(STAMP): $(filter-out constraints/validate.txt,$(wildcard constraints/*.txt)) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -68,6 +68,14 @@ test-fast: $(STAMP)
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
 test-oldest:
 	$(MAKE) test VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
+
+# Everything on the real recordings (IMU_CALIBRATION_DATA, default ../shared/data), beside other packages; writes docs/validation.md.
+validate: $(STAMP)-validate
+	@$(PY) validation/run.py
+
+$(STAMP)-validate: $(STAMP) constraints/validate.txt
+	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/validate.txt
+	@touch $@
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

@@ -1,0 +1,65 @@
+"""The arm between IMUs on one board, from two recordings, against the design."""
+
+from itertools import combinations
+
+import numpy as np
+
+from imu_calibration.relative_arm import estimate_arm
+from validation.figures import new_figure
+from validation.recordings import BOARD, load, reference
+from validation.section import Section, listed
+
+NAMES = ('array_2', 'array_5')
+
+
+def arms_of(folder, name, pairs):
+    """Return {(a, b): RelativeArm} of one recording."""
+    imus = {k: load(folder, name, f'/imu_{k}/data_raw') for k in sorted({k for pair in pairs for k in pair})}
+    return {(a, b): estimate_arm(imus[a], imus[b]) for a, b in pairs}
+
+
+def design_mm(folder, name, pair):
+    """Return the designed arm from the first IMU of a pair to the second, mm."""
+    positions = reference(folder, name)['positions']
+    return 1e3 * (np.array(positions[f'imu_{pair[1]}']) - positions[f'imu_{pair[0]}'])
+
+
+def run(folder, plots):
+    """Return the section."""
+    section, pairs = Section('Arms between IMUs on one board (array_2, array_5)'), list(combinations(BOARD, 2))
+    arms = {name: arms_of(folder, name, pairs) for name in NAMES}
+    errors = {name: np.array([1e3 * arms[name][pair].arm - design_mm(folder, name, pair) for pair in pairs]) for name in NAMES}
+    apart = errors[NAMES[1]] - errors[NAMES[0]]
+    worst = max(np.max(np.linalg.norm(e, axis=1)) for e in errors.values())
+    section.claim('arm of every pair against the design, length of the difference', 'within 1 mm', f'at most {worst:.2f} mm', worst < 1.0)
+    section.claim('the same arm from the two recordings, per axis', 'within 0.3 mm', f'at most {np.max(np.abs(apart)):.2f} mm', np.max(np.abs(apart)) < 0.3)
+    length = np.linalg.norm(apart, axis=1)
+    section.claim('the same, length of the difference', 'within 0.3 mm', f'at most {length.max():.2f} mm, rms {np.sqrt(np.mean(length**2)):.2f} mm',
+                  length.max() < 0.3)
+    ratios = np.array([np.linalg.norm(arms[n][p].arm) / np.linalg.norm(design_mm(folder, n, p)) * 1e3 for n in NAMES for p in pairs])
+    section.claim('baselines against the design', 'a plain derivative makes them 2 to 6 % too long',
+                  f'{100 * (ratios.min() - 1):+.1f} to {100 * (ratios.max() - 1):+.1f} %')
+    rows = []
+    for k, pair in enumerate(pairs):
+        sd = [1e3 * arms[name][pair].arm_sd for name in NAMES]
+        clipped = [f'{100 * arms[name][pair].diagnostics["clipped_share"]:.0f}' for name in NAMES]
+        rows.append((f'{pair[0]} → {pair[1]}', *(listed(errors[name][k], 2) for name in NAMES), listed(apart[k], 2),
+                     f'{max(s.max() for s in sd):.2f}', ' / '.join(clipped)))
+    section.table(('pair', 'array_2 − design, mm', 'array_5 − design, mm', 'array_5 − array_2, mm', 'largest sd, mm', 'clipped, % of moving time'), rows)
+    section.say('x, y, z in the frame of the first IMU. The design says where the packages are, not where in the package the accelerometers are. '
+                'How the bias of a differentiated gyroscope is avoided stands in [decisions/by-hand.md](decisions/by-hand.md).')
+    _draw(section, plots, pairs, errors)
+    return section
+
+
+def _draw(section, plots, pairs, errors):
+    figure, axes = new_figure(1, 3, (9, 3))
+    for axis, panel in enumerate(axes):
+        for name, marker in zip(NAMES, 'os'):
+            panel.plot(errors[name][:, axis], marker, label=name)
+        panel.axhline(0, color='grey', linewidth=0.8)
+        panel.set(title=f'{"xyz"[axis]}', ylim=(-1, 1))
+        panel.set_xticks(range(len(pairs)), [f'{a}→{b}' for a, b in pairs])
+    axes[0].set_ylabel('arm minus design, mm')
+    axes[0].legend()
+    section.plot(plots, 'boards.png', figure, 'Arms between the IMUs of the board minus the design; the limits of the axes are those that were wanted.')

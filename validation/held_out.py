@@ -1,0 +1,194 @@
+"""Who predicts better: ours, a plain gravity-norm fit and imucal on poses that took no part, the same poses for all."""
+
+import numpy as np
+from scipy.stats import t
+
+from imu_calibration.by_hand import calibrate_by_hand
+from imu_calibration.still_search import find_still
+from validation.ferraris import GRAVITY, NAME as FERRARIS, RATE_HZ, calibrate_sections, known_turns
+from validation.recordings import BY_HAND, gravity_of, label, load, reference
+from validation.second_opinions import FACES, Forward, accelerometer_of, ferraris, fit_norm, installed
+from validation.section import Section
+
+FEW, SPLITS, DRAWS, SEED = 12, 20, 10_000, 20
+"""Poses of the small training sets, how many of them, bootstrap draws, seed of both."""
+
+
+def mean_forces(imu, ranges):
+    """Return the mean readings over the poses, m/s^2, shape (k, 3)."""
+    return np.array([imu.force_s[r].mean(axis=0) for r in ranges])
+
+
+def without(imu, ranges, left_out):
+    """
+    Return (imu, ranges) as if the poses with the numbers `left_out` had never been recorded.
+
+    Their samples are cut out, so that nothing of them enters, neither as poses nor as parts of a longer turn.
+    """
+    keep = np.ones(len(imu), bool)
+    for k in left_out:
+        keep[ranges[k]] = False
+    place = np.concatenate([[0], np.cumsum(keep)])
+    return imu.select(keep), [slice(int(place[r.start]), int(place[r.stop])) for k, r in enumerate(ranges) if k not in set(left_out)]
+
+
+def ours(imu, ranges, left_out, gravity):
+    """Return our accelerometer from the other poses and the turns between them."""
+    rest, kept = without(imu, ranges, left_out)
+    return Forward(*calibrate_by_hand(rest, gravity, kept).accelerometer)
+
+
+def errors_of_splits(imu, ranges, gravity, splits):
+    """Return {'ours', 'norm fit', 'uncalibrated': list of arrays}: ``|force| - g`` of the poses that each split leaves out."""
+    force, result = mean_forces(imu, ranges), {'ours': [], 'norm fit': [], 'uncalibrated': []}
+    for left_out in splits:
+        rest = np.setdiff1d(np.arange(len(ranges)), left_out)
+        makers = {'ours': lambda out=left_out: ours(imu, ranges, out, gravity), 'norm fit': lambda kept=rest: fit_norm(force[kept], gravity),
+                  'uncalibrated': lambda: Forward(np.zeros(3), np.eye(3))}
+        for name, make in makers.items():
+            result[name].append(make().norm_errors(force[left_out], gravity))
+    return result
+
+
+def rms(errors):
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def bootstrap_difference(first, second, rng):
+    """Return the 95 % interval of rms(second) - rms(first) over the same poses, drawn again together."""
+    picks = rng.integers(len(first), size=(DRAWS, len(first)))
+    drawn = [np.sqrt(np.mean(np.square(errors)[picks], axis=1)) for errors in (first, second)]
+    return np.quantile(drawn[1] - drawn[0], [0.025, 0.975])
+
+
+def resampled_ratio(first, second, share):
+    """
+    Return (geometric mean of rms(second) / rms(first) over repeated splits of the same poses, its 95 % interval).
+
+    Splits share poses, so that the variance of the mean is taken as ``(1/J + n_test/n_train) var`` (Nadeau and Bengio 2003).
+    """
+    ratios = np.log([rms(b) / rms(a) for a, b in zip(first, second)])
+    half = t.ppf(0.975, len(ratios) - 1) * np.sqrt((1 / len(ratios) + share) * ratios.var(ddof=1))
+    return np.exp(ratios.mean()), np.exp(ratios.mean() + np.array([-half, half]))
+
+
+def leave_one_out(imu, ranges, gravity, rng):
+    """Return ({method: rms}, interval of norm fit minus ours, errors) with every pose left out once."""
+    found = errors_of_splits(imu, ranges, gravity, [np.array([k]) for k in range(len(ranges))])
+    errors = {name: np.concatenate(parts) for name, parts in found.items()}
+    return {name: rms(values) for name, values in errors.items()}, bootstrap_difference(errors['ours'], errors['norm fit'], rng), errors
+
+
+def few_poses(imu, ranges, gravity, rng):
+    """Return ({method: median rms}, (ratio of norm fit to ours, interval)) with FEW poses for the fit and the others left out."""
+    splits = [np.sort(rng.permutation(len(ranges))[FEW:]) for _ in range(SPLITS)]
+    found = errors_of_splits(imu, ranges, gravity, splits)
+    ratio = resampled_ratio(found['ours'], found['norm fit'], (len(ranges) - FEW) / FEW)
+    return {name: float(np.median([rms(e) for e in errors])) for name, errors in found.items()}, ratio
+
+
+def faces_and_the_rest(folder):
+    """
+    Return {method: errors on the rests outside the sections} for the ferraris recording, six faces and three turns for all.
+
+    Nine parameters cannot be fitted to the norm in six poses: the plain fit has biases and scale factors only.
+    """
+    imu, known = load(folder, FERRARIS), reference(folder, FERRARIS)
+    sections, angle = known['sections'], np.radians(known['turn_deg'])
+    used = np.zeros(len(imu), bool)
+    for part in sections.values():
+        used[slice(*part)] = True
+    rests = [r for r in find_still(imu) if not used[r].any()]
+    force = mean_forces(imu, rests)
+    found, _ = calibrate_sections(imu, sections, angle)
+    methods = {'ours': Forward(*found.accelerometer),
+               'norm fit': fit_norm(mean_forces(imu, [slice(*sections[name]) for name in FACES]), GRAVITY, cross_axis=False),
+               'uncalibrated': Forward(np.zeros(3), np.eye(3))}
+    if installed('imucal'):
+        sign = np.sign(known_turns(imu, sections, angle)[0].angle)
+        methods['imucal'] = accelerometer_of(ferraris(imu, sections, RATE_HZ, GRAVITY, sign * angle))
+    return {name: method.norm_errors(force, GRAVITY) for name, method in methods.items()}
+
+
+def off_faces(imu, ranges):
+    """Return the angles between the six faces and the poses nearest to them, deg, shape (6,)."""
+    force = mean_forces(imu, ranges)
+    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return np.degrees(np.arccos(np.clip(np.concatenate([directions.max(axis=0), -directions.min(axis=0)]), -1, 1)))
+
+
+def _verdict(interval, better='ours', other='norm fit'):
+    return better if interval[0] > 0 else other if interval[1] < 0 else 'no difference seen'
+
+
+def run(folder, plots):
+    """Return the section."""
+    section = Section('Who predicts better: poses that took no part')
+    rows, few, faces, everything = [], [], [], {}
+    for name, topic in BY_HAND:
+        rng, gravity, imu = np.random.default_rng(SEED), gravity_of(folder, name), load(folder, name, topic)
+        ranges = find_still(imu)
+        values, interval, everything[label(name, topic)] = leave_one_out(imu, ranges, gravity, rng)
+        rows.append(_row(label(name, topic), len(ranges), values, interval))
+        values, (ratio, interval) = few_poses(imu, ranges, gravity, rng)
+        few.append((*_start(label(name, topic), FEW, values), f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]', _verdict(np.log(interval))))
+        faces.append((label(name, topic), f'{off_faces(imu, ranges).max():.0f} deg'))
+    head = ('recording', 'poses', 'uncalibrated', 'norm fit', 'ours', 'norm fit − ours [95 %]', 'better')
+    section.say('Error of a pose: length of the compensated specific force minus gravity; figures are the rms over poses in mm/s². Every pose is left '
+                'out once; its samples are cut out of the recording, so that ours sees neither the pose nor a turn across it. The interval is of the '
+                'paired difference, from poses drawn again with replacement. "norm fit" is `scipy.optimize.least_squares` on nine parameters.')
+    section.table(head, rows)
+    section.say(f'The same with few poses: {SPLITS} times {FEW} poses drawn for the fit, all others left out; median of the rms in mm/s², and the geometric mean '
+                'of the ratio on the same split, its interval for splits that share poses (Nadeau and Bengio 2003).')
+    section.table((*head[:5], 'norm fit / ours [95 %]', 'better'), few)
+    _six_faces(section, folder)
+    section.say('imucal needs six poses that lie exactly on the faces, and three full turns. The other recordings hold neither: the pose nearest to '
+                'some face is off by ' + ', '.join(f'{angle} ({name})' for name, angle in faces) + ', and there are no full turns; a face that is '
+                'off by 10 deg changes its reading by 1.5 % of gravity, which imucal would take as scale and bias. It was not run there.')
+    _count(section, rows, few)
+    _draw(section, plots, everything)
+    return section
+
+
+def _start(name, count, values):
+    return name, str(count), f'{1e3 * values["uncalibrated"]:.0f}', *(f'{1e3 * values[key]:.2f}' for key in ('norm fit', 'ours'))
+
+
+def _row(name, count, values, interval):
+    return *_start(name, count, values), f'[{1e3 * interval[0]:+.2f}, {1e3 * interval[1]:+.2f}]', _verdict(interval)
+
+
+def _six_faces(section, folder):
+    errors, rng = faces_and_the_rest(folder), np.random.default_rng(SEED)
+    rows = []
+    for name in ('uncalibrated', 'norm fit', 'imucal', 'ours'):
+        if name in errors:
+            interval = 1e3 * bootstrap_difference(errors['ours'], errors[name], rng) if name != 'ours' else None
+            rows.append((name, f'{1e3 * rms(errors[name]):.2f}', '' if interval is None else f'[{interval[0]:+.2f}, {interval[1]:+.2f}]'))
+    section.say(f'ferraris: all methods fitted to the six faces (and, where they use them, the three turns); the errors are of the {len(errors["ours"])} '
+                'rests outside these sections, three of the six faces again. Six faces say nothing to a norm fit about angles between axes, it has '
+                'six parameters here.')
+    section.table(('method', 'rms of the rests, mm/s²', 'minus ours [95 %]'), rows)
+
+
+def _count(section, rows, few):
+    for what, table in (('every pose left out once', rows), (f'{FEW} poses for the fit', few)):
+        better = [row[-1] for row in table]
+        section.claim(f'norm fit beside ours, {what}', 'whoever predicts better',
+                      f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no difference seen in '
+                      f'{better.count("no difference seen")} of {len(better)}')
+
+
+def _draw(section, plots, everything):
+    from validation.figures import new_figure
+    figure, axes = new_figure(1, 1, (8, 4))
+    for k, (name, errors) in enumerate(everything.items()):
+        for shift, method, colour in ((-0.13, 'norm fit', 'tab:orange'), (0.13, 'ours', 'tab:blue')):
+            values = 1e3 * np.abs(errors[method])
+            axes.plot(np.full(len(values), k + shift), values, '.', color=colour, alpha=0.5, label=method if k == 0 else None)
+            axes.plot([k + shift - 0.1, k + shift + 0.1], [1e3 * rms(errors[method])] * 2, color=colour, linewidth=2)
+    axes.set(yscale='log', ylabel='error of a pose left out, mm/s²', ylim=(0.01, None))
+    axes.set_xticks(range(len(everything)), everything, rotation=30, ha='right')
+    axes.legend()
+    section.plot(plots, 'held_out.png', figure, 'Every pose left out once: errors of the poses (dots) and their rms (bars).')

@@ -1,0 +1,29 @@
+"""MPU-9150 by hand against published biases."""
+
+import numpy as np
+
+from imu_calibration.by_hand import calibrate_by_hand
+from imu_calibration.still_search import find_still
+from validation.recordings import load, reference
+from validation.section import Section, listed
+
+NAME = 'mpu9150_0'
+
+
+def figures(folder):
+    """Return (HandCalibration, bias difference from the published ones in m/s^2)."""
+    imu = load(folder, NAME)
+    found = calibrate_by_hand(imu, stills=find_still(imu), gravity_sd=0.02)
+    return found, found.accelerometer[0] - reference(folder, NAME)['published']['accelerometer_bias']
+
+
+def run(folder, plots):
+    """Return the section."""
+    section = Section('Published biases: MPU-9150 (mpu9150_0)')
+    found, difference = figures(folder)
+    section.claim('accelerometer biases against the published ones', 'within 10 mm/s²', f'{listed(1e3 * difference, 1)} mm/s²',
+                  np.max(np.abs(difference)) < 0.010)
+    section.say(f'Our standard deviations: {", ".join(f"{1e3 * sd:.1f}" for sd in found.sd[:3])} mm/s². The site\'s gravity is not stated, which '
+                f'biases do not feel. {found.statistics["poses"]} poses, {found.statistics["turns"]} turns, '
+                f'residual of the gravity norm {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s².')
+    return section

@@ -1,0 +1,100 @@
+"""Run every section on the recordings and write docs/validation.md with its plots; exit code 1 when a section could not be run."""
+
+import argparse
+import importlib
+import platform
+import sys
+import time
+import traceback
+from datetime import date
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+if __name__ == '__main__':
+    sys.path.insert(0, str(ROOT))
+
+from imu_calibration import __version__   # noqa: E402
+from imu_calibration.errors import ImuCalibrationError   # noqa: E402
+from validation.recordings import VARIABLE, data_folder   # noqa: E402
+from validation.section import Section, claims_table   # noqa: E402
+
+SECTIONS = ('shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'held_out', 'inspecting', 'diagnosing')
+PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
+INTRODUCTION = """# Validation on real recordings
+
+Written by `make validate`: every figure below comes from one run on {date}, on the recordings that `IMU_CALIBRATION_DATA` names. Nothing was
+simulated but the section that says so. A "no" in the last column is a claim that does not hold; the section says why as far as it is known.
+
+| what | version |
+| --- | --- |
+{versions}
+"""
+
+
+def versions():
+    """Return [(name, version)] of what took part."""
+    found = [('imu_calibration', __version__), ('Python', platform.python_version()), ('system', f'{platform.system()} {platform.machine()}')]
+    for name in PACKAGES:
+        try:
+            found.append((name, version(name)))
+        except PackageNotFoundError:
+            found.append((name, 'not installed'))
+    return found
+
+
+def run_section(name, folder, plots):
+    """Return (Section, whether it ran to its end)."""
+    start = time.monotonic()
+    print(f'{name} ...', end=' ', flush=True)
+    try:
+        section, whole = importlib.import_module(f'validation.{name}').run(folder, plots), True
+    except ImuCalibrationError as error:
+        section, whole = Section(name), False
+        section.say(f'Refused: {error}')
+    except Exception as error:   # one section must not cost the others
+        traceback.print_exc()
+        section, whole = Section(name), False
+        section.say(f'Could not be run: {type(error).__name__}: {error}')
+    print(f'{time.monotonic() - start:.0f} s', flush=True)
+    for row in section.rows:
+        print(f'    {row.claim}: {row.found} (wanted {row.target}){"" if row.holds in (None, True) else "  NO"}')
+    return section, whole
+
+
+def document(sections):
+    """Return the whole document."""
+    head = INTRODUCTION.format(date=date.today().isoformat(), versions='\n'.join(f'| {name} | {text} |' for name, text in versions()))
+    rows = [row for section in sections for row in section.rows if row.holds is not None]
+    missed = [row for row in rows if not row.holds]
+    count = f'{len(rows) - len(missed)} of {len(rows)} claims hold.'
+    parts = [head.rstrip(), '## In short', count + (' Those that do not:' if missed else '')]
+    if missed:
+        parts.append(claims_table(missed))
+    return '\n\n'.join(parts + [section.markdown() for section in sections]) + '\n'
+
+
+def main():
+    """Run, write, say where."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--only', action='append', choices=SECTIONS, help='run only this section and print it; may be repeated')
+    parser.add_argument('--output', type=Path, default=ROOT / 'docs', help='folder for validation.md and validation/, default docs')
+    options = parser.parse_args()
+    folder = data_folder()
+    if folder is None:
+        print(f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}', file=sys.stderr)
+        return 1
+    plots = options.output / 'validation'
+    plots.mkdir(parents=True, exist_ok=True)
+    results = [run_section(name, folder, plots) for name in options.only or SECTIONS]
+    sections = [section for section, _ in results]
+    if options.only:
+        print('\n\n'.join(section.markdown() for section in sections))
+    else:
+        (options.output / 'validation.md').write_text(document(sections))
+        print(f'written: {options.output / "validation.md"}')
+    return 0 if all(whole for _, whole in results) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

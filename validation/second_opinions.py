@@ -1,0 +1,69 @@
+"""Two other ways to calibrate by hand: a plain fit of the gravity norm, and the Ferraris method of the PyPI package imucal."""
+
+import importlib.util
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+FACES = ('x_p', 'x_a', 'y_p', 'y_a', 'z_p', 'z_a')
+TURNS = ('x_rot', 'y_rot', 'z_rot')
+
+
+def installed(name):
+    """Return whether a package that only this comparison needs is there; `make validate` installs it."""
+    return importlib.util.find_spec(name) is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Forward:
+    """``measured = bias + matrix @ true`` of an accelerometer."""
+
+    bias: np.ndarray
+    """m/s^2, shape (3,)."""
+    matrix: np.ndarray
+    """Shape (3, 3)."""
+
+    def norm_errors(self, force, gravity):
+        """Return ``|compensated force| - gravity`` of readings at rest, shape (n,)."""
+        return np.linalg.norm(np.linalg.solve(self.matrix, (np.asarray(force) - self.bias).T), axis=0) - gravity
+
+
+def fit_norm(force, gravity, cross_axis=True):
+    """
+    Fit biases and a lower triangular matrix so that the mean readings `force` (n, 3) get the length `gravity`.
+
+    Nine parameters; without `cross_axis` six, which is what six faces can tell.
+    """
+    lower = np.tril_indices(3) if cross_axis else np.diag_indices(3)
+
+    def model(values):
+        matrix = np.zeros((3, 3))
+        matrix[lower] = values[3:]
+        return Forward(values[:3], matrix)
+
+    start = np.concatenate([np.zeros(3), np.eye(3)[lower]])
+    return model(least_squares(lambda values: model(values).norm_errors(force, gravity), start, x_scale='jac').x)
+
+
+def cut(imu, sections):
+    """Return {'acc_x_p': (n, 3), ..., 'gyr_z_rot': (n, 3)}: the samples of each section, SI."""
+    names = (*FACES, *TURNS)
+    readings = (('acc', imu.force_s), ('gyr', imu.rate_s))
+    return {f'{sensor}_{name}': values[slice(*sections[name])] for name in names for sensor, values in readings}
+
+
+def ferraris(imu, sections, rate_hz, gravity, angle):
+    """
+    Return imucal's calibration of the sections in SI.
+
+    `angle` (rad) is the signed angle of all three turns. imucal's gyroscope works in deg/s by convention; given radians it stays in rad/s.
+    """
+    from imucal import FerrarisCalibration, FerrarisSignalRegions
+    regions = FerrarisSignalRegions(**cut(imu, sections))
+    return FerrarisCalibration(grav=gravity, expected_angle=angle).compute(regions, rate_hz, from_acc_unit='m/s^2', from_gyr_unit='rad/s')
+
+
+def accelerometer_of(info):
+    """Return imucal's accelerometer as a forward model: its ``true = R^-1 K^-1 (measured - b)`` turned round."""
+    return Forward(info.b_a, info.K_a @ info.R_a)
