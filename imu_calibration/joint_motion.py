@@ -178,22 +178,3 @@ def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):
     return replace(motion, position=motion.position + error, rate=rate * (1 + slope),
                    acceleration=acceleration * (1 + slope) + curvature * rate ** 2,
                    jerk=motion.jerk * (1 + slope) + 3 * curvature * rate * acceleration + third * rate ** 3)
-
-
-def shifted(motion, delay):
-    """
-    Return the motion at ``time - delay``, with `time` left as it is: what the IMU felt when its stamps are `delay` late.
-
-    Taylor series with the jerk as the last derivative: the position's error is of fourth order in `delay`.
-
-    Parameters
-    ----------
-    motion : JointMotion
-        Motion at the stamps.
-    delay : float
-        Seconds; positive when the IMU's stamps are late.
-
-    """
-    rate, acceleration, jerk = motion.rate, motion.acceleration, motion.jerk
-    return replace(motion, position=motion.position - delay * (rate - delay / 2 * (acceleration - delay / 3 * jerk)),
-                   rate=rate - delay * (acceleration - delay / 2 * jerk), acceleration=acceleration - delay * jerk)

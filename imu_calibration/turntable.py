@@ -7,7 +7,8 @@ import numpy as np
 from imu_calibration.chain import align, reference_motion, rotation
 from imu_calibration.earth import normal_gravity
 from imu_calibration.errors import InputError
-from imu_calibration.joint_motion import shifted, with_encoder_harmonics
+from imu_calibration.joint_motion import with_encoder_harmonics
+from imu_calibration.joint_shift import shifted
 
 __all__ = ['Joint', 'Table', 'axis_error_directions', 'reference_motion', 'shifted', 'tilt', 'with_axis_errors', 'with_encoder_harmonics']
 

@@ -6,7 +6,7 @@ from scipy.interpolate import BSpline
 
 from imu_calibration.bspline import Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
 from imu_calibration.errors import InputError
-from imu_calibration.joint_motion import JointMotion, fit_joint_curve, shifted, with_encoder_harmonics
+from imu_calibration.joint_motion import JointMotion, fit_joint_curve, with_encoder_harmonics
 from imu_calibration.settings import JointSettings
 from imu_calibration.smoothing import PenalisedSpline, encoder_step
 from imu_calibration.velocity_check import check_velocity
@@ -282,17 +282,6 @@ def test_encoder_harmonics_and_their_derivatives(order):
     for lower, upper in (('position', 'rate'), ('rate', 'acceleration'), ('acceleration', 'jerk')):
         # Truncation step^4 / 30 times the fifth derivative further up, some 1e3.
         np.testing.assert_allclose(first @ getattr(motion, lower), getattr(motion, upper)[2], atol=1e-9)
-
-
-def test_shifted_motion_is_that_of_earlier_instants():
-    time = np.linspace(0, 3, 50)
-    for delay, bound in ((1e-2, 2e-7), (1e-3, 2e-11)):
-        late, true = shifted(smooth_motion(time), delay), smooth_motion(time - delay)
-        # delay^4 / 24 times the fourth derivative, 300 rad/s^4.
-        np.testing.assert_allclose(late.position, true.position, atol=bound)
-        np.testing.assert_allclose(late.rate, true.rate, atol=bound * 4 / delay)
-        np.testing.assert_allclose(late.acceleration, true.acceleration, atol=bound * 12 / delay ** 2)
-        np.testing.assert_array_equal(late.time, time)
 
 
 def test_select_keeps_rows_together():
