@@ -2,78 +2,19 @@
 
 import numpy as np
 import pytest
+from hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand import ByHandSettings, KnownTurn, calibrate_by_hand
 from imu_calibration.by_hand_poses import g_sensitivity_evidence
-from imu_calibration.by_hand_model import HandModel, unpack
+from imu_calibration.by_hand_model import unpack
 from imu_calibration.by_hand_system import Poses, State, TurnData, build_system, moved
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.gathering import NominalScaling
 from imu_calibration.samples import ImuSamples
-from imu_calibration.sensor_model import SensorModel
 from imu_calibration.still_search import find_still
 from imu_calibration.turn_integration import integrate_turn
 from imu_calibration.variance_components import estimate_scatter
-
-GRAVITY = 9.81
-FULL = HandModel(SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), GRAVITY)
-"""Truths are laid out as the parameters of this model."""
-NOMINAL, PARAM_NAMES, SENSITIVITY = FULL.nominal, FULL.param_names, slice(21, 30)
-FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-
-
-def random_truth(rng, sensitivity=0.0):
-    truth = NOMINAL.copy()
-    truth[0:3] += rng.normal(0, 0.2, 3)
-    truth[3:9] += rng.normal(0, 0.01, 6)
-    truth[9:12] += rng.normal(0, 0.02, 3)
-    truth[12:21] += rng.normal(0, 0.01, 9)
-    truth[SENSITIVITY] += rng.normal(0, sensitivity, 9) if sensitivity else 0.0
-    return truth
-
-
-def turn_samples(start, rotvec, wobble, period, duration):
-    """Attitudes and exact body rates of a turn that starts and ends at rest; the axis wobbles on the way."""
-    s = np.arange(period, duration - 0.5 * period, period) / duration
-    share, speed = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s)**2 / duration
-    bump, bump_speed = 4 * share * (1 - share), 4 * speed * (1 - 2 * share)
-    inner = Rotation.from_rotvec(np.outer(bump, wobble))
-    attitude = start * Rotation.from_rotvec(np.outer(share, rotvec)) * inner
-    return attitude, inner.inv().apply(np.outer(speed, rotvec)) + np.outer(bump_speed, wobble)
-
-
-def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.0, drift_sd=0.0,
-             sensitivity=0.0, attitudes=None, truth=None, wobble=0.4):
-    """A recording held still in poses with turns between; returns (imu, ranges, true parameters)."""
-    rng = np.random.default_rng(seed)
-    truth = random_truth(rng, sensitivity) if truth is None else truth
-    (bias_f, matrix_f, bias_w, matrix_w), response = unpack(truth), truth[SENSITIVITY].reshape(3, 3)
-    attitude = Rotation.random(random_state=rng) if attitudes is None else attitudes[0]
-    count, force, rate, ranges, total = int(still / period), [], [], [], 0
-    for pose in range(n_poses):
-        up = attitude.inv().apply([0, 0, GRAVITY])
-        drift = rng.normal(0, drift_sd, 3)
-        force.append(np.tile(matrix_f @ up + bias_f + rng.normal(0, pose_sd, 3), (count, 1)))
-        rate.append(np.tile(bias_w + drift + response @ up, (count, 1)))
-        ranges.append(slice(total, total + count))
-        if pose == n_poses - 1:
-            break
-        rotvec = rng.normal(size=3)
-        rotvec *= rng.uniform(1.2, 2.6) / np.linalg.norm(rotvec)
-        if attitudes is not None:
-            rotvec = (attitude.inv() * attitudes[pose + 1]).as_rotvec()
-        on_the_way, body_rate = turn_samples(attitude, rotvec, rng.normal(0, wobble, 3), period, duration)
-        true_force = on_the_way.inv().apply([0, 0, GRAVITY])
-        force.append(true_force @ matrix_f.T + bias_f)
-        rate.append(body_rate @ matrix_w.T + bias_w + drift + true_force @ response.T)
-        total += count + len(body_rate)
-        attitude = attitude * Rotation.from_rotvec(rotvec)
-    force, rate = np.concatenate(force), np.concatenate(rate)
-    stamp_ns = 10**9 + np.round(np.arange(len(force)) * period * 1e9).astype(np.int64)
-    noisy = (force + rng.normal(0, force_sd, force.shape), rate + rng.normal(0, rate_sd, rate.shape))
-    return ImuSamples(stamp_ns, *noisy, 'imu_link'), ranges, truth
-
 
 def differences(found, truth):
     names = [n for n in found.param_names if n in PARAM_NAMES]

@@ -209,6 +209,10 @@ def in_type(sentence):
     return sentence.replace(' +- ', ' ± ').replace(' -', ' −').replace('^2', '²').replace('^3', '³')
 
 
+def _goes_with(rest):
+    return (rest.correlates_with or '–') + (f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else '')
+
+
 def _rest(sensor, rest):
     return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, UNIT[sensor]), 'sigma': text(rest.sigma, 2),
-            'with': f'{rest.correlates_with} ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with else '–', 'where': rest.where or '–'}
+            'with': _goes_with(rest), 'where': rest.where or '–'}

@@ -1,0 +1,104 @@
+"""Diagnosis without a table: causes hidden in recordings by hand by their physics, and recordings that hide nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from hand_sessions import GRAVITY, simulate
+
+from imu_calibration.by_hand import gather_by_hand
+from imu_calibration.diagnosis import to_mapping
+from imu_calibration.diagnosis.by_hand import diagnose_by_hand
+from imu_calibration.errors import NotObservableError
+
+NOTHING = np.zeros(3)
+MG, DEG = 9.80665e-3, np.pi / 180
+HIDDEN = {
+    'accel_quadratic': lambda f, w, t, k: (4 * MG / 9.8**2 * np.array([1, -0.7, 0.5]) * f**2, NOTHING),
+    'accel_scale_asymmetry': lambda f, w, t, k: (np.array([3e-3, -2e-3, 2e-3]) * np.abs(f), NOTHING),
+    'accel_bias_drift': lambda f, w, t, k: (np.outer(-np.expm1(-t / 30), [8 * MG, -5 * MG, 6 * MG]), NOTHING),
+    'gyro_g_sensitivity': lambda f, w, t, k: (NOTHING, f @ np.array([[0, 3, 0], [-4, 0, 2], [0, 0, 5]]).T * 1e-4),
+    'gyro_quadratic': lambda f, w, t, k: (NOTHING, np.array([8e-3, -6e-3, 7e-3]) * w**2),
+    'gyro_scale_asymmetry': lambda f, w, t, k: (NOTHING, np.array([1.2e-2, -1e-2, 1e-2]) * np.abs(w)),
+    'gyro_bias_drift': lambda f, w, t, k: (NOTHING, np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG])),
+}
+"""What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and number of the pose."""
+
+
+def stops(force, rate, time, pose):
+    """A bias of the accelerometer that changes at every stop: no catalogue holds it."""
+    steps = np.random.default_rng(99).normal(0, 3 * MG, (pose.max() + 1, 3))
+    return steps[pose], NOTHING
+
+
+def diagnosed(seed, spoil=None, n_poses=36, **options):
+    imu, ranges, _ = simulate(seed, n_poses=n_poses, spoil=spoil, **options)
+    return diagnose_by_hand(gather_by_hand(imu, ranges), GRAVITY)
+
+
+@pytest.mark.parametrize('name', sorted(HIDDEN))
+def test_a_hidden_effect_is_found_and_its_gain_measured(name):
+    found = diagnosed(31, HIDDEN[name]).diagnosis
+    assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
+    first = found.findings[0]
+    assert name in (first.effect, *first.indistinguishable_from)
+    assert first.gain.ci95[0] > 0 and first.gain.windows >= 35
+    assert len(found.findings) == 1
+
+
+def test_sizes_agree_with_what_was_hidden():
+    found = diagnosed(32, HIDDEN['gyro_g_sensitivity']).diagnosis
+    parameters = found.findings[0].parameters
+    for name, true in (('xy', 3e-4), ('yx', -4e-4), ('zz', 5e-4), ('xx', 0.0)):
+        value, sd, _ = parameters[f'gyroscope.gyro_g_sensitivity.{name}']
+        assert abs(value - true) < 4.5 * sd and sd < 1e-4
+
+
+@pytest.mark.slow
+def test_nothing_hidden_nothing_found():
+    """Poses and biases that scatter from pose to pose are no effect: at most one finding in 24 recordings."""
+    named = [[f.effect for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings] for seed in range(40, 64)]
+    print(f'findings where nothing is hidden: {named}')
+    assert sum(map(bool, named)) <= 1
+
+
+def test_a_cause_that_no_catalogue_holds_is_unexplained():
+    found = diagnosed(33, stops).diagnosis
+    assert not found.findings
+    assert found.unexplained['accelerometer'].significant
+    assert found.unexplained['accelerometer'].rms == pytest.approx(3 * MG, rel=0.5)
+
+
+def test_the_document_and_the_extended_model_go_together():
+    result = diagnosed(34, HIDDEN['gyro_g_sensitivity'])
+    document = to_mapping(result.diagnosis)
+    json.dumps(document)
+    assert document['findings'][0]['gain']['measure'] == 'poses'
+    assert 'gyro_g_sensitivity' in result.hand.model.model.gyroscope
+    untestable = {entry['effect'] for entry in document['not_testable']}
+    assert {'accel_size_effect', 'table_tilt', 'accel_thermal_bias', 'gyro_saturation'} <= untestable
+
+
+def test_too_few_poses_are_refused_with_their_number():
+    imu, ranges, _ = simulate(35, n_poses=10)
+    with pytest.raises(NotObservableError, match='at least 12 poses .* 10 were found'):
+        diagnose_by_hand(gather_by_hand(imu, ranges), GRAVITY)
+
+
+@pytest.mark.real_data
+def test_xsens_counts_tells_no_stories(recordings):
+    """The accelerometer scatters beyond its noise and no effect claims it; the gyroscope's answer to gravity is found and predicts."""
+    from imu_calibration.gathering import NominalScaling
+    from imu_calibration.workflow import CalibrationOptions
+    from imu_calibration.workflow_diagnosis import diagnose_without_table
+    from msg_adapters.bag import open_recording
+    options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
+    with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
+        found = diagnose_without_table(recording.blocks, options, 9.81744).diagnosis
+    assert [f.effect for f in found.findings] == ['gyro_g_sensitivity']
+    gain = found.findings[0].gain
+    rest = found.unexplained['accelerometer']
+    print(f'xsens_counts: g-sensitivity lowers held-out rates by {100 * gain.reduction:.0f} % (95 %: {100 * gain.ci95[0]:.0f} to '
+          f'{100 * gain.ci95[1]:.0f} %); accelerometer unexplained {1e3 * rest.rms:.2f} mm/s^2 rms, {rest.sigma:.0f} sd beyond noise')
+    assert gain.ci95[0] > 0.5
+    assert rest.significant and 5e-4 < rest.rms < 2e-3
