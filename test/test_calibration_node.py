@@ -1,14 +1,20 @@
 """A bag through both nodes over DDS: the live calibration is the offline one, the corrected stream is the truth."""
 
+import time
+
 import numpy as np
+import physics
 import pytest
+import yaml
 
 from imu_calibration.documents import calibration_from_text
 from imu_calibration.profiles import make_profile
-from imu_calibration.turntable import reference_motion
+from imu_calibration.turntable import Table, reference_motion
+from imu_calibration.workflow_diagnosis import diagnose_recording
 from live_sessions import OPTIONS, TABLE, assert_same, make_session
 from imu_calibration import workflow
 from imu_calibration.simulation import START_NS
+from test_by_hand import GRAVITY, simulate
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
@@ -93,3 +99,100 @@ def check_the_stream(corrected, bag):
 def means(error, length=100):
     """Means over one second at 100 Hz."""
     return error[:len(error) // length * length].reshape(-1, length, 3).mean(axis=1)
+
+
+def values_of(station, name):
+    """The details of a diagnostic status."""
+    status = station.status.get(f'calibration_node: {name}')
+    return {pair.key: pair.value for pair in status.values} if status else {}
+
+
+def test_a_hidden_effect_is_named_live(tmp_path):
+    """Quadratic terms that the model lacks: diagnostics say so, as the verb does of the same bag."""
+    session = physics.make_session(3, {'accel_quadratic': None})
+    physics.write_bag(session, tmp_path / 'bag')
+    (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
+    table = Table.from_mapping(session.table)
+    with open_recording(tmp_path / 'bag') as recording:
+        expected = diagnose_recording(lambda: recording.blocks(table.joint_names), table).diagnosis
+    first = expected.findings[0]
+    with Station() as station:
+        station.watch_diagnostics()
+        station.calibration_node(tmp_path, reliable=True, table_file=tmp_path / 'table.yaml')
+        station.until(lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting', 'the first diagnostics')
+        player = station.play(tmp_path / 'bag', 20.0, subscribers=1)
+        station.until(lambda: player.poll() is not None, 'the end of the recording')
+        asked = time.monotonic()
+        assert station.call('/calibration_node/solve').success
+        answered = time.monotonic() - asked
+        station.until(lambda: values_of(station, 'diagnosis').get('windows') == str(expected.windows), 'the diagnosis of all windows')
+        found, status = values_of(station, 'diagnosis'), station.status['calibration_node: diagnosis']
+    print(f'diagnosed live: {status.message}; solve answered after {answered:.1f} s')
+    assert first.effect == 'accel_quadratic'
+    assert found['outcome'] == 'found' and found['effect'] == first.effect and found['p-value'] == f'{first.p_value:.2g}'
+    assert found['held-out reduction'] == f'{first.gain.reduction:.3f}' and found['explanation'] == first.explanation
+    assert status.level == b'\1' and first.explanation in status.message
+
+
+@pytest.mark.real_data
+def test_a_recording_by_hand_through_the_node_is_the_recording_offline(recordings, tmp_path):
+    """No table, no joint states: poses are counted, the direction that is missing is named, the document is that of the offline tool."""
+    check_by_hand(recordings / 'mpu9150_0', tmp_path, rate=8.0)
+
+
+def test_poses_by_hand_through_the_node(tmp_path):
+    """The same with a made-up recording."""
+    imu, _, _ = simulate(1)
+    write_session(tmp_path / 'bag', imu)
+    check_by_hand(tmp_path / 'bag', tmp_path, rate=4.0, gravity=GRAVITY)
+
+
+def check_by_hand(bag, folder, rate, gravity=None):
+    """Play a bag to a node without a table."""
+    options = {'reliable': True, 'table_file': '', 'gravity': gravity or 0.0}
+    with Station() as station:
+        documents, residuals = station.watch_documents(), station.watch_imu('imu/residual')
+        corrected = station.watch_imu('imu/data_corrected')
+        station.watch_diagnostics()
+        node = station.calibration_node(folder, **options)
+        station.start('compensator_node', {'reliable': True})
+        station.until(lambda: 'calibration_node: poses' in station.status, 'the first diagnostics')
+        assert 'joint' not in station.status['calibration_node: streams'].message.lower()
+        player = station.play(bag, rate, subscribers=2)
+        station.until(lambda: player.poll() is not None, 'the end of the recording')
+        answer = station.call('/calibration_node/save')
+        assert answer.success, answer.message
+        live = calibration_from_text((folder / 'calibration.yaml').read_text())
+        with open_recording(bag, want_joints=False) as recording:
+            expected = workflow.calibrate_without_table([recording.blocks], OPTIONS, gravity).calibration
+        assert live.statistics['samples_used'] == expected.statistics['samples_used'] and live.gauge == expected.gauge
+        assert live.param_names == expected.param_names and live.status == expected.status
+        free = expected.sd > 0
+        assert np.max(np.abs(live.values - expected.values)[free] / expected.sd[free]) < 1e-6
+        check_the_poses(station, expected)
+        assert documents and len(taken(residuals)) >= 1 and len(taken(corrected)) > 100   # the compensator takes the document as it is
+        resumed(station, node, folder, options, live)
+
+
+def check_the_poses(station, expected):
+    """Diagnostics counted up to what the recording holds, and asked for directions on the way."""
+    messages = [message for name, _, message in station.history if name == 'calibration_node: poses']
+    assert any('hold it still with' in message and 'not seen yet' in message for message in messages)
+    assert any('at rest for' in message for message in messages)
+    figures = values_of(station, 'poses')
+    assert int(figures['poses']) == expected.statistics['windows']['static'] and int(figures['turns']) == expected.statistics['windows']['turns']
+    assert station.status['calibration_node: accelerometer bias'].level == b'\0'
+    print(f'by hand, live: {messages[0]} ... {messages[-1]}')
+
+
+def resumed(station, node, folder, options, live):
+    """A new node goes on with the poses that were saved; a reset forgets them."""
+    station.processes.end(node)
+    station.status.clear()
+    station.calibration_node(folder, resume=True, **options)
+    station.until(lambda: station.figure('poses', 'calibration_node: poses') == live.statistics['windows']['static'], 'the poses of before')
+    assert station.call('/calibration_node/solve').success
+    assert station.call('/calibration_node/reset').success
+    station.until(lambda: values_of(station, 'poses').get('poses') == '0', 'no poses after a reset')
+    answer = station.call('/calibration_node/solve')
+    assert not answer.success and '4 different attitudes' in answer.message
