@@ -169,12 +169,18 @@ def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):
         Amplitudes c and s, rad.
 
     """
-    phase = order * motion.position
+    cos_amplitude, sin_amplitude = (np.broadcast_to(np.asarray(a, float), motion.position.shape[1:]) for a in (cos_amplitude, sin_amplitude))
+    wrong = np.flatnonzero((cos_amplitude != 0) | (sin_amplitude != 0))
+    if not len(wrong):
+        return motion
+    phase, rate, acceleration = order * motion.position[:, wrong], motion.rate[:, wrong], motion.acceleration[:, wrong]
     cos, sin = np.cos(phase), np.sin(phase)
-    error = np.asarray(cos_amplitude) * cos + np.asarray(sin_amplitude) * sin
-    slope = order * (np.asarray(sin_amplitude) * cos - np.asarray(cos_amplitude) * sin)
+    error = cos_amplitude[wrong] * cos + sin_amplitude[wrong] * sin
+    slope = order * (sin_amplitude[wrong] * cos - cos_amplitude[wrong] * sin)
     curvature, third = -order ** 2 * error, -order ** 2 * slope
-    rate, acceleration = motion.rate, motion.acceleration
-    return replace(motion, position=motion.position + error, rate=rate * (1 + slope),
-                   acceleration=acceleration * (1 + slope) + curvature * rate ** 2,
-                   jerk=motion.jerk * (1 + slope) + 3 * curvature * rate * acceleration + third * rate ** 3)
+    moved = {name: getattr(motion, name).copy() for name in ('position', 'rate', 'acceleration', 'jerk')}
+    moved['position'][:, wrong] += error
+    moved['rate'][:, wrong] *= 1 + slope
+    moved['acceleration'][:, wrong] = acceleration * (1 + slope) + curvature * rate ** 2
+    moved['jerk'][:, wrong] = motion.jerk[:, wrong] * (1 + slope) + 3 * curvature * rate * acceleration + third * rate ** 3
+    return replace(motion, **moved)
