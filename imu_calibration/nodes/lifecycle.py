@@ -25,10 +25,13 @@ def run_node(make_node, arguments=None, spin=None):
 
     """
     # rclpy's handler, installed by init, ends the wait; without this line Python would also raise KeyboardInterrupt in mid-write.
-    signal.signal(signal.SIGINT, lambda number, frame: None)
+    early = []
+    signal.signal(signal.SIGINT, lambda number, frame: early.append(number))
     rclpy.init(args=arguments)
     node = None
     try:
+        if early:   # before rclpy could take note of it
+            return 0
         node = make_node()
         (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):

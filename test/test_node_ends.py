@@ -1,0 +1,62 @@
+"""A node that is interrupted while it is still starting ends quietly, with exit code 0."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from imu_calibration.nodes.early_end import is_node_process
+
+ROOT = Path(__file__).resolve().parents[1]
+SLOW_IMPORT = "import pathlib, time\npathlib.Path({mark!r}).touch()\ntime.sleep(60)\n"
+EARLY = '''
+import os, signal, sys
+import rclpy
+from imu_calibration.nodes.lifecycle import run_node
+init = rclpy.init
+def interrupted(args=None):
+    os.kill(os.getpid(), signal.SIGINT)
+    init(args=args)
+rclpy.init = interrupted
+def spin(node):
+    raise SystemExit('it did not end')
+sys.exit(run_node(lambda: rclpy.create_node('early'), [], spin))
+'''
+
+
+def environment(*folders):
+    """The environment of a process that imports from here."""
+    path = os.pathsep.join([*map(str, folders), str(ROOT), os.environ.get('PYTHONPATH', '')])
+    return {**os.environ, 'PYTHONPATH': path, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+
+@pytest.mark.parametrize('node', ['calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node'])
+def test_interrupted_while_importing(node, tmp_path):
+    mark = tmp_path / 'importing'
+    (tmp_path / 'rclpy').mkdir()
+    (tmp_path / 'rclpy' / '__init__.py').write_text(SLOW_IMPORT.format(mark=str(mark)))
+    process = subprocess.Popen([sys.executable, '-m', f'imu_calibration.nodes.{node}'], env=environment(tmp_path), cwd=tmp_path,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not mark.exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=20)
+    assert (process.returncode, out, error) == (0, '', '')
+
+
+def test_interrupted_while_ros_starts():
+    pytest.importorskip('rclpy')
+    done = subprocess.run([sys.executable, '-c', EARLY], env=environment(), capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_other_programs_keep_their_interrupt(monkeypatch):
+    assert not is_node_process() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.setattr(sys, 'argv', ['/opt/ros/lib/imu_calibration/calibration_node', '--ros-args'])
+    assert is_node_process()
