@@ -47,7 +47,7 @@ def _into(folder, options, settings, table):
         else:
             result = _on_table(sources, table, settings, options.bags, jobs)
         result = replace(result, calibration=replace(result.calibration, provenance=result.calibration.provenance | provenance.result()))
-    warn(result.calibration)
+    warn(result.calibration.statistics['preflight'])
     text = documents.calibration_to_text(result.calibration)
     if not options.no_report:
         from imu_calibration.report import calibration_report

@@ -2,9 +2,9 @@
 
 from imu_calibration.by_hand_document import read_imu
 from imu_calibration.cli import recordings
-from imu_calibration.cli.show import console
+from imu_calibration.cli.show import console, warn
 from imu_calibration.errors import InputError
-from imu_calibration.preflight import Preflight
+from imu_calibration.preflight import Preflight, warnings
 from imu_calibration.units import with_sd
 
 
@@ -28,7 +28,9 @@ def run(options):
         options.joint_topic = options.temperature_topic = None
         recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
         blocks = recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()
-        imus.append(read_imu(Preflight().watch(blocks))[0])
+        preflight = Preflight()
+        imus.append(read_imu(preflight.watch(blocks))[0])
+        warn({'text': f'{topic}: {finding.text}'} for finding in warnings(preflight.findings))
     result = estimate_arm(*imus)
     out = console()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

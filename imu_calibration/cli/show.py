@@ -13,11 +13,11 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
 
 
-def warn(calibration):
-    """Print what looked wrong with the recording on standard error, a line each."""
+def warn(found):
+    """Print what looks wrong with a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
     import sys
-    for found in calibration.statistics.get('preflight') or ():
-        print(f'warning: {found["text"]}', file=sys.stderr)
+    for item in found:
+        print(f'warning: {item["text"]}', file=sys.stderr)
 
 
 STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}

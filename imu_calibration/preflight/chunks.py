@@ -46,16 +46,14 @@ class ChunkSeries:
         self._rest, self._first_ns, self._last = None, None, None
         self._parts, self._n_chunks = [], 0
 
-    def push(self, imu):
-        """Take clean ImuSamples of one epoch of the clock."""
-        values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
-        self._count_changes(values)
-        stamps = imu.stamp_ns
+    def push(self, stamp_ns, columns):
+        """Take clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
+        self._count_changes(columns)
         if self._rest is not None:
-            stamps, values = np.concatenate([self._rest[0], stamps]), np.concatenate([self._rest[1], values])
-        self._rest = (stamps, values)
-        if self.size is None and len(stamps) >= FIRST:
-            self.size = _size(stamps)
+            stamp_ns, columns = np.concatenate([self._rest[0], stamp_ns]), np.concatenate([self._rest[1], columns], axis=1)
+        self._rest = (stamp_ns, columns)
+        if self.size is None and len(stamp_ns) >= FIRST:
+            self.size = _size(stamp_ns)
         if self.size is not None:
             self._cut()
 
@@ -67,24 +65,27 @@ class ChunkSeries:
         parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
         return Chunks(*(np.concatenate(column) for column in zip(*parts, strict=True)), self.size or LEAST)
 
-    def _count_changes(self, values):
-        before = values if self._last is None else np.concatenate([self._last, values])
-        changed = before[1:] != before[:-1]
-        self.n_changed += np.count_nonzero(changed, axis=0)
-        self.n_repeated += len(changed) - int(np.count_nonzero(changed.any(axis=1)))
-        self.n_samples += len(values)
-        self._last = values[-1:]
+    def _count_changes(self, columns):
+        if self._last is not None:
+            changed = columns[:, :1] != self._last
+            self.n_changed += changed[:, 0]
+            self.n_repeated += not changed.any()
+        changed = columns[:, 1:] != columns[:, :-1]
+        self.n_changed += np.count_nonzero(changed, axis=1)
+        self.n_repeated += changed.shape[1] - int(np.count_nonzero(changed.any(axis=0)))
+        self.n_samples += columns.shape[1]
+        self._last = columns[:, -1:].copy()
 
     def _cut(self):
-        stamps, values = self._rest
-        n = len(stamps) // self.size
+        stamp_ns, columns = self._rest
+        n = len(stamp_ns) // self.size
         used = n * self.size
-        self._rest = stamps[used:].copy(), values[used:].copy()
+        self._rest = stamp_ns[used:].copy(), columns[:, used:].copy()
         if not n or self._n_chunks >= CAPACITY:
             return
         if self._first_ns is None:
-            self._first_ns = stamps[0]
-        self._parts.append(_describe(((stamps[:used] - self._first_ns) * 1e-9).reshape(n, self.size), values[:used].reshape(n, self.size, 6)))
+            self._first_ns = stamp_ns[0]
+        self._parts.append(_describe(((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size), columns[:, :used].reshape(6, n, self.size)))
         self._n_chunks += n
 
 
@@ -94,10 +95,10 @@ def _size(stamps):
 
 
 def _describe(time, values):
-    values = np.ascontiguousarray(np.moveaxis(values, 2, 1))   # sums run fastest along the last axis
     start = values[:, :, :1].copy()
-    values -= start   # counts far from zero would cancel
+    values = values - start   # counts far from zero would cancel
     mean = values.mean(axis=2)
     sd = np.sqrt(np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0))
     size = time.shape[1]
-    return time.mean(axis=1), (time[:, -1] - time[:, 0]) * size / (size - 1), mean + start[:, :, 0], sd, values.max(axis=2) - values.min(axis=2)
+    spread = values.max(axis=2) - values.min(axis=2)
+    return time.mean(axis=1), (time[:, -1] - time[:, 0]) * size / (size - 1), (mean + start[:, :, 0]).T, sd.T, spread.T

@@ -125,19 +125,19 @@ class EvidenceGatherer:
                     self._temperature_c = (min(low, float(samples.temperature_c.min())), max(high, float(samples.temperature_c.max())))
 
     def _take_imu(self, imu):
+        columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
         if self._chunks.n_samples < RESOLUTION_SAMPLES:
-            self._note_resolution(np.concatenate([imu.force_s, imu.rate_s], axis=1)[:RESOLUTION_SAMPLES])
-        self._chunks.push(imu)
-        for column, (upwards, downwards) in zip((*imu.force_s.T, *imu.rate_s.T), self._ends):
-            column = np.ascontiguousarray(column)
+            self._note_resolution(columns[:, :RESOLUTION_SAMPLES])
+        self._chunks.push(imu.stamp_ns, columns)
+        for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)
             downwards.push(-column)
 
-    def _note_resolution(self, values):
-        step = np.abs(np.diff(values, axis=0))
+    def _note_resolution(self, columns):
+        step = np.abs(np.diff(columns, axis=1))
         # Steps of rounding are no steps of the converter.
-        real = step > 1e-9 * np.maximum(np.abs(values).max(axis=0), 1e-12)
-        self._resolution = np.minimum(self._resolution, np.min(np.where(real, step, np.inf), axis=0, initial=np.inf))
+        real = step > 1e-9 * np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-12)
+        self._resolution = np.minimum(self._resolution, np.min(np.where(real, step, np.inf), axis=1, initial=np.inf))
 
 
 class _Steps:

@@ -8,6 +8,8 @@ NEAR = 0.9
 """Outputs above this share of the largest are looked at."""
 CANDIDATES = 400
 LEAST_CLIPPED = 4
+JUMP = 0.01
+"""A reading that comes from farther below the largest than this share of it did not get there by noise."""
 PILE = 5.0
 """A pile has this many times the samples of the outputs just below it."""
 
@@ -16,25 +18,36 @@ class Extremes:
     """The largest distinct values of one signal with their counts, in bounded memory."""
 
     def __init__(self):
-        self.level, self.count = -np.inf, 0
-        self._below = {}
+        self.level, self.count, self.n_jumps = -np.inf, 0, 0
+        self._below, self._last = {}, np.inf
 
     def push(self, values):
         """Take values, shape (n,)."""
+        before, self._last = self._last, values[-1]
         largest = values.max()
         if largest <= 0 or largest < NEAR * self.level:
             return
         if largest > self.level:
             if np.isfinite(self.level):
                 self._below[self.level] = self.count
-            self.level, self.count = float(largest), 0
-        self.count += int(np.count_nonzero(values == self.level))
-        near = values[(values < self.level) & (values > NEAR * self.level)]
+            self.level, self.count, self.n_jumps = float(largest), 0, 0
+        near = values[values > NEAR * self.level]
+        below = near < self.level
+        self.count += len(near) - int(np.count_nonzero(below))
+        near = near[below]
+        if largest == self.level:
+            at = np.flatnonzero(values == largest)
+            self.n_jumps += int(np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest))
         if len(near) > CANDIDATES:
             near = np.partition(near, len(near) - CANDIDATES)[-CANDIDATES:]
         for value, count in zip(*np.unique(near, return_counts=True)):
             self._below[float(value)] = self._below.get(float(value), 0) + int(count)
         self._below = dict(sorted(self._below.items(), reverse=True)[:KEPT])
+
+    @property
+    def jumped(self):
+        """Whether the pile was entered from far below time and again, as no rounded reading of a constant does."""
+        return self.n_jumps >= LEAST_CLIPPED
 
     @property
     def n_clipped(self):

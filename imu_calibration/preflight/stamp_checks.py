@@ -76,9 +76,9 @@ def jitter(evidence):
         if name in evidence.streams:
             stream = evidence.streams[name]
             period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
-            if stream.irregular <= IRREGULAR_SHARE and not (step_ns and step_ns % WHOLE_MS == 0 and stream.irregular > 0):
+            whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0 and step_ns < 0.5e9 * period
+            if not whole_ms and stream.irregular <= IRREGULAR_SHARE:
                 continue
-            whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0
             came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
             if stream.irregular > IRREGULAR_SHARE:
                 came += (', ' if came else '') + f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'

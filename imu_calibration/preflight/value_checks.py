@@ -14,15 +14,21 @@ LARGE_BIAS = 0.3
 """m/s^2."""
 FASTEST = 100.0
 """rad/s, 5700 deg/s: hardly any gyroscope measures more."""
+FASTEST_DEG = 5000.0
+"""Numbers above it are no deg/s either."""
 MOVING = 50.0
 """An axis beside one that moves by this many steps of the converter does not stay the same by chance."""
 LONG = 4
 """Chunks, one second."""
 CLIP_FORCE = 1.15
-"""Times gravity; outputs pile up at gravity without being clipped."""
+"""Times gravity; outputs without visible noise pile up at gravity without being clipped."""
+FINE = 8.0
+"""Noise that spans this many steps of the converter is visible."""
 CLIP_RATE = 10.0
 """Times the range of the noise."""
 REPEATED_SHARE = 0.05
+ROUNDING = 1e-6
+"""m/s^2, rad/s; no converter is that fine."""
 
 
 def force_unit(evidence):
@@ -59,8 +65,9 @@ def rate_unit(evidence):
         else:
             yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
     elif largest > FASTEST:
-        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, the largest is {largest:.4g} ({largest * DEG:.0f} deg/s), faster than gyroscopes '
-                      'measure: deg/s, counts or volts?; convert them in the driver or give --nominal FILE with gyroscope_offset and gyroscope_scale')
+        unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
+        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
+                      'convert them in the driver or give --nominal FILE with gyroscope_offset and gyroscope_scale')
 
 
 def handedness(evidence):
@@ -101,11 +108,17 @@ def frozen(evidence):
                               'look at the sensor and its driver')
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
-            stuck = _in_long_runs((range_[:, part][:, axis] == 0) & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
+            same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
+            stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield Finding('frozen', WARNING, f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
                               'and leave that time out', samples=int(stuck.sum() * chunks.size))
+
+
+def _at_end(values, ends):
+    """Return which values are those at which an output piles up: clipped, not frozen."""
+    return np.logical_or.reduce([np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0) for sign, end in zip((1, -1), ends)])
 
 
 def _in_long_runs(flags):
@@ -119,10 +132,13 @@ def _in_long_runs(flags):
 def clipping(evidence):
     """No output piles up at the end of its range."""
     for sensor, part, unit in SENSORS:
-        least = np.full(3, CLIP_FORCE * (evidence.length or 0.0)) if sensor == 'accelerometer' else CLIP_RATE * evidence.quiet_range[part]
+        fine = evidence.quiet_range[part] > FINE * evidence.resolution[part]
+        least = CLIP_RATE * evidence.quiet_range[part]
+        if sensor == 'accelerometer':
+            least = np.where(fine, least, CLIP_FORCE * (evidence.length or 0.0))
         words, total, level = [], 0, 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            counts = [end.n_clipped if end.level > least[axis] else 0 for end in ends]
+            counts = [end.n_clipped if end.level > least[axis] and (fine[axis] or end.jumped) else 0 for end in ends]
             if sum(counts):
                 words.append(f'{"xyz"[axis]} {sum(counts)}')
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
@@ -165,7 +181,7 @@ def resolution(evidence):
     for sensor, part, unit in SENSORS:
         step, range_ = evidence.resolution[part], evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
-        coarse = (step > 0) & (4 * step > range_)
+        coarse = (step > ROUNDING) & (4 * step > range_)
         if coarse.any():
             size = step[coarse].max()
             people = f'{size * DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'

@@ -1,0 +1,446 @@
+"""Pre-flight: each fault that a driver can make is named by one check, through a real bag; good recordings are left in peace."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from physics import TABLES, make_session, write_bag
+
+from imu_calibration.cli import main
+from imu_calibration.preflight import GOOD, NOTE, REFUSE, WARNING, Preflight
+from imu_calibration.preflight.axes import match_axes, signed_permutations
+from imu_calibration.samples import SampleBlock, TemperatureSamples
+from msg_adapters.bag import open_recording
+from msg_adapters.write import write_session
+
+G = 9.80665
+
+
+@pytest.fixture(scope='module')
+def session():
+    """A session without faults: a hundred and fifty seconds on a three-axis table."""
+    return make_session(3, profile='quick', noise='realistic', grade='industrial')
+
+
+@pytest.fixture(scope='module')
+def table(tmp_path_factory, session):
+    """Its table file."""
+    path = tmp_path_factory.mktemp('preflight') / 'table.yaml'
+    path.write_text(yaml.safe_dump(session.table))
+    return path
+
+
+def findings(samples, nominal=None, gravity=None, cut=None):
+    """Look at samples as one block, or cut into pieces of `cut` samples."""
+    imu, joints, temperature = samples
+    blocks = [SampleBlock(imu, joints, temperature)]
+    if cut is not None:
+        blocks = [SampleBlock(imu.select(slice(a, a + cut))) for a in range(0, len(imu), cut)] + [SampleBlock(None, joints, temperature)]
+    preflight = Preflight(gravity, nominal)
+    for _ in preflight.watch(blocks, strict=False):
+        pass
+    return preflight.findings
+
+
+def trouble(found):
+    """The findings beyond notes, as (check, severity)."""
+    return sorted({(f.check, f.severity) for f in found if f.severity in (REFUSE, WARNING)})
+
+
+# What a driver can do wrong -----------------------------------------------------------------------------------------------------
+
+
+def in_g(imu, joints, temperature):
+    return replace(imu, force_s=imu.force_s / G), joints, temperature
+
+
+def in_mg(imu, joints, temperature):
+    return replace(imu, force_s=imu.force_s / G * 1000), joints, temperature
+
+
+def in_counts(imu, joints, temperature):
+    return replace(imu, force_s=np.round(imu.force_s * 415 + 32768), rate_s=np.round(imu.rate_s * 4770 + 32768)), joints, temperature
+
+
+def in_degrees(imu, joints, temperature):
+    return replace(imu, rate_s=np.rad2deg(imu.rate_s)), joints, temperature
+
+
+def twice_converted(imu, joints, temperature):
+    return replace(imu, rate_s=np.deg2rad(imu.rate_s)), joints, temperature
+
+
+def mirrored_gyroscope(imu, joints, temperature):
+    return replace(imu, rate_s=imu.rate_s * [1.0, -1.0, 1.0]), joints, temperature
+
+
+def gyroscope_axes_swapped(imu, joints, temperature):
+    return replace(imu, rate_s=imu.rate_s[:, [1, 0, 2]]), joints, temperature
+
+
+def gyroscope_turned(imu, joints, temperature):
+    return replace(imu, rate_s=imu.rate_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0]), joints, temperature
+
+
+def dead_axis(imu, joints, temperature):
+    return replace(imu, force_s=imu.force_s * [1.0, 0.0, 1.0]), joints, temperature
+
+
+def dead_gyroscope(imu, joints, temperature):
+    return replace(imu, rate_s=np.zeros_like(imu.rate_s)), joints, temperature
+
+
+def stuck_axis(imu, joints, temperature):
+    rate = imu.rate_s.copy()
+    moving = np.argmax(np.convolve(np.abs(rate[:, 0]), np.ones(600), 'valid'))
+    rate[moving:moving + 600, 1] = rate[moving, 1]
+    return replace(imu, rate_s=rate), joints, temperature
+
+
+def clipped_gyroscope(imu, joints, temperature):
+    return replace(imu, rate_s=np.clip(imu.rate_s, -1.0, 1.0)), joints, temperature
+
+
+def repeated_stamps(imu, joints, temperature):
+    stamps = imu.stamp_ns.copy()
+    stamps[50::100] = stamps[49::100][:len(stamps[50::100])]
+    return replace(imu, stamp_ns=stamps), joints, temperature
+
+
+def no_stamps(imu, joints, temperature):
+    return replace(imu, stamp_ns=np.zeros_like(imu.stamp_ns)), joints, temperature
+
+
+def late_samples(imu, joints, temperature):
+    stamps = imu.stamp_ns.copy()
+    stamps[100::500] -= 25_000_000
+    return replace(imu, stamp_ns=stamps), joints, temperature
+
+
+def jumping_clock(imu, joints, temperature):
+    stamps = imu.stamp_ns.copy()
+    stamps[len(stamps) // 2:] -= 20_000_000_000
+    return replace(imu, stamp_ns=stamps), joints, temperature
+
+
+def two_clocks(imu, joints, temperature):
+    return imu, replace(joints, stamp_ns=joints.stamp_ns - joints.stamp_ns[0] + 5_000_000_000), temperature
+
+
+def late_joints(imu, joints, temperature):
+    return imu, replace(joints, stamp_ns=joints.stamp_ns + 60_000_000_000), temperature
+
+
+def lost_samples(imu, joints, temperature):
+    keep = np.random.default_rng(1).random(len(imu)) > 0.1
+    return imu.select(keep), joints, temperature
+
+
+def holes(imu, joints, temperature):
+    keep = (np.arange(len(imu)) % 3000) > 300
+    return imu.select(keep), joints, temperature
+
+
+def not_finite(imu, joints, temperature):
+    force = imu.force_s.copy()
+    force[::1000, 2] = np.nan
+    return replace(imu, force_s=force), joints, temperature
+
+
+def wrong_gravity(imu, joints, temperature):
+    return replace(imu, force_s=imu.force_s * 1.05), joints, temperature
+
+
+def published_twice(imu, joints, temperature):
+    pairs = np.arange(len(imu)) // 2 * 2
+    return replace(imu, force_s=imu.force_s[pairs], rate_s=imu.rate_s[pairs]), joints, temperature
+
+
+def in_kelvin(imu, joints, temperature):
+    return imu, joints, replace(temperature, temperature_c=temperature.temperature_c + 273.15)
+
+
+FAULTS = (
+    (in_g, 'force_unit', REFUSE, ('m/s^2', 'looks like g', 'accelerometer_scale 0.101972')),
+    (in_mg, 'force_unit', REFUSE, ('mg', 'accelerometer_scale 101.972')),
+    (in_counts, 'force_unit', REFUSE, ('counts', '--nominal FILE')),
+    (in_counts, 'rate_unit', REFUSE, ('counts', '--nominal FILE')),
+    (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'look like deg/s', 'gyroscope_scale 57.29578')),
+    (twice_converted, 'rate_unit', REFUSE, ('twice',)),
+    (mirrored_gyroscope, 'handedness', REFUSE, ("the gyroscope's y is minus the accelerometer's y", 'left-handed')),
+    (gyroscope_axes_swapped, 'handedness', REFUSE, ("the gyroscope's y is the accelerometer's x", "the gyroscope's x is the accelerometer's y", 'left-handed')),
+    (gyroscope_turned, 'handedness', REFUSE, ("the gyroscope's x is the accelerometer's y", "the gyroscope's y is minus the accelerometer's x", 'turned against')),
+    (dead_axis, 'frozen', REFUSE, ('accelerometer y never changes',)),
+    (dead_gyroscope, 'frozen', REFUSE, ('the gyroscope must measure something',)),
+    (stuck_axis, 'frozen', WARNING, ('gyroscope y stands still',)),
+    (clipped_gyroscope, 'clipping', WARNING, ('gyroscope clips at 1 rad/s (57 deg/s)',)),
+    (repeated_stamps, 'stamps', WARNING, ('Imu', 'repeat the stamp before')),
+    (no_stamps, 'stamps', REFUSE, ('header stamps advance',)),
+    (late_samples, 'stamps', WARNING, ('step back in time',)),
+    (jumping_clock, 'stamps', WARNING, ('jump once',)),
+    (not_finite, 'stamps', WARNING, ('not finite',)),
+    (two_clocks, 'clocks', REFUSE, ('one clock', 'before the Imu', 'never overlap')),
+    (late_joints, 'clocks', WARNING, ('60.0 s after the Imu',)),
+    (lost_samples, 'sampling', WARNING, ('promises', 'samples were lost')),
+    (holes, 'gaps', WARNING, ('gaps', 'not used')),
+    (wrong_gravity, 'gravity', WARNING, ('within 2 %', '+4.')),
+    (published_twice, 'repeated_readings', WARNING, ('50 %', 'publishes faster')),
+    (in_kelvin, 'temperature', WARNING, ('kelvin',)),
+)
+IDS = [f'{fault.__name__}-{check}' for fault, check, *_ in FAULTS]
+
+
+@pytest.mark.parametrize(('fault', 'check', 'severity', 'words'), FAULTS, ids=IDS)
+def test_inspect_names_the_fault(capsys, tmp_path, session, fault, check, severity, words):
+    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    code = main(['inspect', str(tmp_path / 'bag')])
+    printed = ' '.join(capsys.readouterr().out.split())
+    found = [f for f in findings(fault(session.imu, session.joints, session.temperature)) if f.check == check and f.severity == severity]
+    assert found and [word for word in words if word not in ' '.join(f.text for f in found)] == []
+    assert all(f'{severity} {check.replace("_", " ")} {" ".join(f.text.split())}' in printed for f in found)
+    assert code == 3 or severity == WARNING
+
+
+@pytest.mark.parametrize('fault', sorted({fault for fault, _, severity, _ in FAULTS if severity == REFUSE}, key=lambda f: f.__name__))
+def test_calibrate_refuses_what_would_make_the_result_wrong(capsys, tmp_path, session, table, fault):
+    """One line, exit code 1, nothing written: with the table and by hand."""
+    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    for more in (['--table', str(table)], []) if fault is not two_clocks else (['--table', str(table)],):
+        capsys.readouterr()
+        assert main(['calibrate', str(tmp_path / 'bag'), *more, '--output', str(tmp_path / 'out')]) == 1
+        printed = capsys.readouterr()
+        assert printed.out == '' and len(printed.err.splitlines()) == 1
+        assert ' must ' in printed.err
+        assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(('fault', 'check', 'unusable'), ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)))
+def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, fault, check, unusable):
+    """Said on standard error, kept in the file and the report; exit code 3 when samples are unusable."""
+    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    more = [] if unusable else ['--no-report']   # one report is enough
+    code = main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out'), *more])
+    text, = (line for line in capsys.readouterr().err.splitlines() if line.startswith('warning: '))
+    statistics = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())['statistics']
+    found, = statistics['preflight']
+    assert found['check'] == check and text == f'warning: {found["text"]}'
+    assert more or found['text'].split(',')[0] in (tmp_path / 'out' / 'report.html').read_text()
+    assert (statistics['unusable'] > 0) == unusable
+    assert code in ((3,) if unusable else (0, 3))
+
+
+# Against the joints -------------------------------------------------------------------------------------------------------------
+
+
+def turned(imu):
+    """The sensor turned by 90 degrees about z: its x where the table has y."""
+    return replace(imu, force_s=imu.force_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0], rate_s=imu.rate_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0])
+
+
+def test_a_sensor_turned_against_the_table_gets_the_mount_that_fits(capsys, tmp_path, session, table):
+    write_session(str(tmp_path / 'bag'), turned(session.imu), session.joints)
+    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out')]) == 1
+    line, = capsys.readouterr().err.splitlines()
+    assert "measured x is the reference's y, measured y is minus the reference's x" in line and 'mount.rpy_deg' in line
+    fits = yaml.safe_load(line[line.index(', [') + 2:line.index('] would fit') + 1])
+    corrected = tmp_path / 'corrected.yaml'
+    corrected.write_text(yaml.safe_dump({**session.table, 'mount': {'rpy_deg': fits, 'xyz': None}}))
+    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(corrected), '--output', str(tmp_path / 'out'), '--no-report']) in (0, 3)
+
+
+def test_a_joint_that_counts_backwards_is_left_handed(capsys, tmp_path, session):
+    axes = [dict(joint, axis=[-a for a in joint['axis']]) if joint['name'] == 'inner' else joint for joint in session.table['joints']]
+    wrong = tmp_path / 'table.yaml'
+    wrong.write_text(yaml.safe_dump({**session.table, 'joints': axes}))
+    write_bag(session, str(tmp_path / 'bag'))
+    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(wrong), '--output', str(tmp_path / 'out')]) == 1
+    line, = capsys.readouterr().err.splitlines()
+    assert 'joint' in line and ('minus' in line or 'no exchange' in line)
+
+
+def test_counts_against_the_joints(capsys, tmp_path, session, table):
+    """Seven times too fast is neither deg/s nor rad/s; the joints know."""
+    from imu_calibration.preflight.joint_checks import against_joints
+    from imu_calibration.gathering import Collector
+    from imu_calibration.sensor_model import SensorModel
+    from imu_calibration.turntable import Table
+    model, description = SensorModel(joint_names=session.joints.names), Table.from_mapping(session.table)
+    for factor, expected in ((1.0, []), (7.0, ['rate_unit']), (180 / np.pi, ['rate_unit'])):
+        collector = Collector(description, model)
+        collector.push(SampleBlock(replace(session.imu, rate_s=factor * session.imu.rate_s), session.joints))
+        assert [f.check for f in against_joints(collector.finish(), model, description)] == expected
+
+
+def test_one_axis_cannot_tell_a_mirror_from_a_turn():
+    about_y = np.diag([0.0, 1.0, 0.0])
+    match = match_axes(-np.eye(3), about_y)
+    assert match.wrong and match.turned and match.mirrored
+    assert match.exchanges(about_y) == [(1, 1, -1.0)]
+    assert not match_axes(np.eye(3), about_y).wrong
+
+
+def test_every_exchange_of_axes_is_recognised():
+    for matrix in signed_permutations():
+        match = match_axes(0.017 * matrix + 1e-4)
+        assert np.array_equal(match.matrix, matrix)
+        assert match.mirrored == (np.linalg.det(matrix) < 0) and match.turned == (np.linalg.det(matrix) > 0)
+        assert match.wrong == (not np.array_equal(matrix, np.eye(3)))
+
+
+@pytest.mark.parametrize(('angle_deg', 'wrong'), ((30.0, False), (45.0, False), (90.0, True)))
+def test_a_crooked_mount_is_no_exchange_of_axes(angle_deg, wrong):
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    assert match_axes(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])).wrong == wrong
+
+
+# Good recordings ----------------------------------------------------------------------------------------------------------------
+
+
+GOOD_SESSIONS = {
+    'white': {}, 'realistic': {'noise': 'realistic'}, 'consumer': {'grade': 'consumer', 'noise': 'realistic'}, 'without noise': {'noise': 'none'},
+    'two axes': {'table': 'two_axis'}, 'centrifuge': {'table': 'centrifuge'}, 'no velocity': {'velocity': 'none'}, 'coarse encoder': {'encoder_resolution': 1e-3},
+    'late clock': {'hidden': {'time_offset': 0.05}}, 'slow gyroscope': {'hidden': {'gyro_bandwidth': None}}, 'g-sensitive': {'hidden': {'gyro_g_sensitivity': None}},
+}
+
+
+@pytest.mark.parametrize('options', GOOD_SESSIONS.values(), ids=GOOD_SESSIONS)
+def test_good_sessions_are_left_in_peace(options):
+    good = make_session(5, **{'profile': 'quick' if 'table' not in options else 'random', **options})
+    found = findings((good.imu, good.joints, good.temperature), gravity=good.truth['gravity'])
+    assert [f for f in found if f.severity != GOOD] == []
+    assert {'force_unit', 'rate_unit', 'handedness', 'gravity', 'stamps', 'sampling', 'temperature'} <= {f.check for f in found}
+
+
+def test_a_good_bag_gives_exit_code_zero_and_no_warning(capsys, tmp_path, session, table):
+    write_bag(session, str(tmp_path / 'bag'))
+    assert main(['inspect', str(tmp_path / 'bag')]) == 0
+    assert 'warning' not in capsys.readouterr().out
+    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out'), '--no-report']) in (0, 3)
+    assert capsys.readouterr().err == ''
+    assert yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())['statistics']['preflight'] == []
+
+
+def test_how_the_stream_is_cut_does_not_matter(session):
+    samples = clipped_gyroscope(session.imu, session.joints, session.temperature)
+    whole = findings(samples)
+    for cut in (7, 1000):
+        imu = samples[0].select(slice(0, 4000)) if cut == 7 else samples[0]
+        expected = whole if cut != 7 else findings((imu, *samples[1:]))
+        assert findings((imu, *samples[1:]), cut=cut) == expected
+
+
+def test_a_real_range_that_was_reached_once_is_no_clipping(session):
+    """The largest reading of a smooth motion comes once; many equal readings come from a rounded one, below it as above."""
+    rounded = replace(session.imu, force_s=np.round(session.imu.force_s, 1), rate_s=np.round(session.imu.rate_s, 2))
+    assert 'clipping' not in [f.check for f in findings((rounded, session.joints, None))]
+    assert ('resolution', NOTE) in [(f.check, f.severity) for f in findings((rounded, session.joints, None))]
+
+
+# Topics -------------------------------------------------------------------------------------------------------------------------
+
+
+def several_topics(folder, session, imu=1, joints=1, temperature=1):
+    """Write a bag with so many topics of each type, none of them by its default name, and return its path."""
+    from rosbags.rosbag2 import Reader, Writer
+    from rosbags.typesys import Stores, get_typestore
+    few = session.imu.select(slice(0, 300)), session.joints.select(slice(0, 300)), session.temperature.select(slice(0, 3))
+    write_session(str(folder / 'plain'), *few)
+    kinds = {'/imu/data_raw': ('imu', imu), '/joint_states': ('joints', joints), '/imu/temperature': ('temperature', temperature)}
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(folder / 'plain') as reader, Writer(folder / 'bag', version=9) as writer:
+        out = {c.topic: [writer.add_connection(f'/{kinds[c.topic][0]}_{k}', c.msgtype, typestore=typestore) for k in range(kinds[c.topic][1])]
+               for c in reader.connections}
+        for connection, stamp, data in reader.messages():
+            for target in out[connection.topic]:
+                writer.write(target, stamp, data)
+    return folder / 'bag'
+
+
+VERBS = {'inspect': [], 'calibrate': ['--output', 'OUT'], 'diagnose': ['--table', 'TABLE', '--output', 'OUT'],
+         'calibrate on a table': ['--table', 'TABLE', '--output', 'OUT'], 'compensate': ['--calibration', 'CALIBRATION', '--output', 'OUT']}
+
+
+@pytest.fixture(scope='module')
+def calibration(tmp_path_factory, session, table):
+    """A calibration file."""
+    folder = tmp_path_factory.mktemp('calibration')
+    write_bag(session, str(folder / 'bag'))
+    assert main(['calibrate', str(folder / 'bag'), '--table', str(table), '--output', str(folder / 'out'), '--no-report']) in (0, 3)
+    return folder / 'out' / 'calibration.yaml'
+
+
+@pytest.mark.parametrize('kind', ('imu', 'joints', 'temperature'))
+@pytest.mark.parametrize('verb', VERBS)
+def test_two_topics_of_a_type_are_refused_with_their_names(capsys, tmp_path, session, table, calibration, verb, kind):
+    bag = several_topics(tmp_path, session, **{kind: 2})
+    if kind == 'joints' and verb in ('calibrate', 'compensate'):
+        pytest.skip('does not read joints')
+    places = {'OUT': str(tmp_path / 'out'), 'TABLE': str(table), 'CALIBRATION': str(calibration)}
+    assert main([verb.split()[0], str(bag), *(places.get(word, word) for word in VERBS[verb])]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == '' and len(printed.err.splitlines()) == 1
+    assert f'/{kind}_0, /{kind}_1' in printed.err and '--' in printed.err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_the_only_topic_of_a_type_is_taken_whatever_its_name(capsys, tmp_path, session):
+    main(['inspect', str(several_topics(tmp_path, session))])
+    out = capsys.readouterr().out
+    assert [name for name in ('/imu_0', '/joints_0', '/temperature_0') if not any(name in line and 'read' in line for line in out.splitlines())] == []
+
+
+def test_a_bag_without_imu_lists_what_it_holds(capsys, tmp_path, session):
+    assert main(['inspect', str(several_topics(tmp_path, session, imu=0))]) == 1
+    line = capsys.readouterr().err
+    assert '/joints_0 (sensor_msgs/msg/JointState)' in line and '/temperature_0 (sensor_msgs/msg/Temperature)' in line
+
+
+# Real recordings ----------------------------------------------------------------------------------------------------------------
+
+
+REAL = {
+    ('shaft_pitch_slow', '/imu/data_raw'): [('stamps', WARNING)],
+    ('shaft_pitch_slow', '/imu_fixed/data_raw'): [('stamps', WARNING)],
+    ('shaft_yaw_medium', '/imu/data_raw'): [('stamps', WARNING)],
+    ('shaft_yaw_medium', '/imu_fixed/data_raw'): [('stamps', WARNING)],
+    **{(name, f'/imu_{k}/data_raw'): [('clipping', WARNING)] for name in ('array_2', 'array_5') for k in (1, 7)},
+    ('xsens_counts', None): [('force_unit', REFUSE), ('rate_unit', REFUSE)],
+    ('mpu9150_0', None): [], ('mpu9150_3', None): [], ('ferraris', None): [],
+}
+"""What is known to be true of each; everything else would be a story."""
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(('name', 'topic'), REAL, ids=lambda value: str(value))
+def test_real_recordings_get_what_is_true_of_them(recordings, name, topic):
+    preflight = Preflight()
+    with open_recording(recordings / name, imu_topic=topic, want_joints='optional') as recording:
+        for _ in preflight.watch(recording.blocks(), strict=False):
+            pass
+    assert trouble(preflight.findings) == REAL[name, topic]
+    for finding in preflight.findings:
+        if finding.check == 'clipping':
+            assert 'the gyroscope clips at 34.87 rad/s (1998 deg/s)' in finding.text
+        if name.startswith('shaft') and finding.check == 'jitter':
+            assert 'multiples of 1 ms' in finding.text
+
+
+@pytest.mark.real_data
+def test_counts_are_in_order_once_scaled(capsys, recordings, tmp_path):
+    """The factory's biases are up to 1.2 m/s^2 beside the nominal offset: taken out before gravity is compared."""
+    nominal = yaml.safe_load((recordings / 'xsens_counts' / 'reference.yaml').read_text())['nominal']
+    (tmp_path / 'nominal.yaml').write_text(yaml.safe_dump(nominal))
+    assert main(['inspect', str(recordings / 'xsens_counts'), '--nominal', str(tmp_path / 'nominal.yaml')]) == 0
+    printed = capsys.readouterr().out
+    assert 'warning' not in printed and 'refuse' not in printed
+    assert 'bias of 1.7' in printed
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_arm_warns_of_clipping_and_refuses_other_units(capsys, recordings):
+    assert main(['arm', str(recordings / 'array_2'), '--imu-topic', '/imu_1/data_raw', '--imu-topic', '/imu_7/data_raw']) == 0
+    assert capsys.readouterr().err.count('the gyroscope clips at 34.87 rad/s') == 2
+    assert main(['arm', str(recordings / 'xsens_counts'), '--imu-topic', '/imu/data_raw', '--imu-topic', '/imu/data_raw']) == 1
+    assert 'counts or volts' in capsys.readouterr().err
