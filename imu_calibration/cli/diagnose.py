@@ -5,7 +5,7 @@ import json
 from imu_calibration import documents, workflow, workflow_diagnosis
 from imu_calibration.cli import files, recordings
 from imu_calibration.cli.progress import progress_bar
-from imu_calibration.cli.show import console
+from imu_calibration.cli.show import console, warn
 
 NAME = 'diagnose'
 HELP = 'Show what the model gets wrong, name the cause, extend the model, and measure the gain on data that were not fitted.'
@@ -38,6 +38,7 @@ def _into(folder, options, settings, table):
             result = workflow_diagnosis.diagnose_without_table(source, settings, options.gravity, provenance, advance)
         else:
             result = workflow_diagnosis.diagnose_recording(source, table, settings, provenance, advance)
+    warn(result.calibration.statistics['preflight'])
     from imu_calibration.report import diagnosis_report
     page = diagnosis_report(result)
     files.write_text(folder / 'diagnosis.json', json.dumps(result.document, indent=1) + '\n')

@@ -9,7 +9,7 @@ from imu_calibration.cli import files
 from imu_calibration.cli.fleet_pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.progress import progress_bar
-from imu_calibration.cli.show import console
+from imu_calibration.cli.show import console, warn
 from imu_calibration.fleet import FleetStep, fleet_exit_code, summarise
 from imu_calibration.units import for_people, significant, with_sd
 
@@ -93,6 +93,8 @@ def show_fleet(results, spreads, folder):
     out.print(table)
     for result in results:
         out.print(f'{result.name}: {result.error or result.verdict}', soft_wrap=True, markup=False)
+        if result.calibration is not None:
+            warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
     calibrated = sum(result.calibration is not None for result in results)
     out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}', soft_wrap=True)
 
