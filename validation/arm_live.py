@@ -19,7 +19,7 @@ from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu
 from validation.figures import new_figure
 from validation.recordings import load
-from validation.section import Section
+from validation.section import Section, text
 
 NAMES = ('array_2', 'array_5')
 DOMAIN = 87
@@ -178,7 +178,8 @@ def looking_ahead(case):
     suit B's readings in this very stretch best; what even that leaves is not in the samples of the rate.
     """
     calibration, (xyz, rpy), imu = calibration_from_text(case.calibration), case.pose_of_a, case.imu_a
-    slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0) @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
+    slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0)
+    slope = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     transfer = Transfer.from_pose('imu_b', xyz, rpy)
     central = compensate(calibration, imu.force_s, imu.rate_s, slope, transfer=transfer)
     still = compensate(calibration, imu.force_s, imu.rate_s, np.zeros_like(slope), transfer=transfer)
@@ -205,14 +206,16 @@ def run(folder, plots):
         section.claim(f'{name}: B\'s accelerometer from A\'s stream, rms without and with the arm', 'falls',
                       f'{before:.2f} → {after:.2f} m/s² ({100 * (1 - after / before):.0f} % less)', after < before)
         section.claim(f'{name}: messages lost between player, nodes and listener', '0', f'{lost} of {2 * len(case.imu_a)}', lost == 0)
-        rows.append((name, str(len(found['moved'])), *(f'{rms(found[w][:, k]):.2f}' for w in ('turned', 'moved') for k in range(3)),
-                     *(f'{typical(found[w]):.1f}' for w in ('turned', 'moved')), f'{after:.2f}', *(f'{rms(ahead[w]):.2f}' for w in ('central', 'filter'))))
+        per_axis = [f'{rms(found[which][:, k]):.2f}' for which in ('turned', 'moved') for k in range(3)]
+        lengths = [f'{typical(found[which]):.1f}' for which in ('turned', 'moved')]
+        rows.append((name, str(len(found['moved'])), *per_axis, *lengths, f'{after:.2f}', *(f'{rms(ahead[which]):.2f}' for which in ahead)))
         bins.append((name, *by_rate(case, found)))
-    section.table(('recording', 'samples', *(f'{w} {k}' for w in ('before', 'after') for k in 'xyz'), 'before, median length', 'after, median length',
-                   'after, all', 'central difference', 'best filter'), rows)
+    axes = [f'{when} {k}' for when in ('before', 'after') for k in 'xyz']
+    section.table(('recording', 'samples', *axes, 'before, median length', 'after, median length', 'after, all', 'central difference',
+                   'best filter'), rows)
     section.say('Before → after by the rate of turning, rms of components, m/s²:')
     section.table(('recording', *(f'{low} to {high} rad/s' for low, high in zip(RATES, RATES[1:]))), bins)
-    section.say(_explanation())
+    section.say(text('arm_live', a=PAIR[0], b=PAIR[1], seconds=STRETCH_S, speed=SPEED, moving=MOVING, guard=GUARD))
     _draw(section, plots, case, found)
     return section
 
@@ -229,18 +232,6 @@ def by_rate(case, found):
     return [f'{rms(found["turned"][part]):.1f} → {rms(found["moved"][part]):.1f} ({part.sum()})' for part in parts]
 
 
-def _explanation():
-    return (
-        f'A is IMU {PAIR[0]}, B is IMU {PAIR[1]}. The last {STRETCH_S:.0f} s (twisting) of A are published at {SPEED:g} times the speed of the recording to two '
-        'compensator_node processes with the calibration by hand of A: one turns the readings into B\'s frame (`target_frame`, `target_rpy`), '
-        'the other moves them to B\'s place too (`target_xyz` from the estimated arm). Compared with the calibrated accelerometer of B at the same '
-        f'moments, for samples that turn faster than {MOVING:g} rad/s and lie neither within nor up to {GUARD} samples behind clipping of A or B; rms of '
-        'components in m/s². What is left is not the delay of the node\'s derivative: a central difference, which looks one sample ahead, and even the '
-        'best filter over nine samples around, with weights fitted to this very stretch, leave about as much. It grows with the '
-        'rate and comes in single samples (the plot\'s long tails): knocks and jerks of the hand between samples 16 ms apart, which the samples of the rate '
-        'do not hold. Arm, calibrations and test share a recording; the arm of the other recording is the same within the figures above.')
-
-
 def _draw(section, plots, case, found):
     stamps = case.imu_a.stamp_ns[case.usable]
     time_s = 1e-9 * (stamps[:len(found['moved'])] - case.imu_a.stamp_ns[0])
@@ -251,4 +242,4 @@ def _draw(section, plots, case, found):
         panel.set_ylabel(f'{"xyz"[axis]}, m/s²')
     axes[0].legend()
     axes[-1].set_xlabel(f'time in the stretch of {NAMES[-1]}, s')
-    section.plot(plots, 'arm_live.png', figure, "B's accelerometer minus the node's prediction from A's stream, moving and unclipped samples.")
+    section.plot(plots, 'arm_live.png', figure, "B's accelerometer minus the node's prediction from A, moving and unclipped samples.")

@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.by_hand import KnownTurn, calibrate_by_hand
 from validation.recordings import load, reference
 from validation.second_opinions import FACES, TURNS, accelerometer_of, ferraris, installed
-from validation.section import Section
+from validation.section import Section, text
 
 NAME, RATE_HZ, GRAVITY = 'ferraris', 102.4, 9.81
 PAIRS = ((0, 1, 'xy'), (1, 2, 'yz'), (0, 2, 'xz'))
@@ -40,11 +40,16 @@ def comparable(found, info):
     theirs_f, theirs_w = accelerometer_of(info), info.K_g @ info.R_g
     rows = []
     for k, axis in enumerate('xyz'):
-        rows.append((f'accelerometer bias {axis}', 'mm/s²', 1e3 * bias_f[k], 1e3 * theirs_f.bias[k], 1e3 * found.sd_of(f'accelerometer.bias.{axis}')))
+        sd = found.sd_of(f'accelerometer.bias.{axis}')
+        rows.append(_row(f'accelerometer bias {axis}', 'mm/s²', 1e3, bias_f[k], theirs_f.bias[k], sd))
     rows += _matrix_rows('accelerometer', matrix_f, theirs_f.matrix, found)
     for k, axis in enumerate('xyz'):
-        rows.append((f'gyroscope bias {axis}', 'deg/s', np.degrees(bias_w[k]), np.degrees(info.b_g[k]), np.degrees(found.sd_of(f'gyroscope.bias.{axis}'))))
+        rows.append(_row(f'gyroscope bias {axis}', 'deg/s', 180 / np.pi, bias_w[k], info.b_g[k], found.sd_of(f'gyroscope.bias.{axis}')))
     return rows + _matrix_rows('gyroscope', matrix_w, theirs_w, found)
+
+
+def _row(name, unit, factor, *values):
+    return name, unit, *(factor * value for value in values)
 
 
 def _matrix_rows(sensor, ours, theirs, found):
@@ -91,30 +96,22 @@ def run(folder, plots):
     info = ferraris(imu, sections, RATE_HZ, GRAVITY, angle * signs.pop())
     rows = comparable(found, info)
     section.table(('parameter', 'unit', 'ours', 'our sd', 'imucal', 'difference', 'in our sd'),
-                  [(name, unit, f'{a:+.3f}', f'{sd:.3f}', f'{b:+.3f}', f'{b - a:+.3f}', f'{(b - a) / sd:+.1f}') for name, unit, a, b, sd in rows])
+                  [(name, unit, f'{a:+.3f}', f'{sd:.3f}', f'{b:+.3f}', f'{b - a:+.3f}', f'{(b - a) / sd:+.1f}')
+                   for name, unit, a, b, sd in rows])
     up = faces_as_they_lay(found, order)
     bias, matrix = imucal_from_ours(found, up)
     theirs = accelerometer_of(info)
     left = np.max(np.abs(bias - theirs.bias)), np.max(np.abs(matrix - theirs.matrix))
     apart = np.array([abs(b - a) / sd for _, _, a, b, sd in rows])
-    section.claim('all 18 parameters agree with imucal', 'within three of our sd', f'largest difference {apart.max():.1f} sd', apart.max() < 3)
-    section.claim('the accelerometer\'s differences explained: imucal\'s formulas on our sensor, with the faces as they lay, give imucal\'s result',
-                  'bias within 1 mm/s², matrix within 0.0001', f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}', left[0] < 1e-3 and left[1] < 1e-4)
-    section.say(_explanation(tilts(up), known['turn_deg'], found))
+    section.claim('all 18 parameters agree with imucal', 'within three of our sd', f'largest difference {apart.max():.1f} sd',
+                  apart.max() < 3)
+    section.claim('differences of the accelerometer explained: imucal\'s formulas on our sensor and the faces as they lay give its result',
+                  'bias within 1 mm/s², matrix within 0.0001', f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}',
+                  left[0] < 1e-3 and left[1] < 1e-4)
+    sensitivity = any('g_sensitivity' in name for name in found.param_names)
+    weak = [name for name, status in zip(found.param_names, found.statuses) if status != 'determined']
+    section.say(text('ferraris', gravity=GRAVITY, turn_deg=known['turn_deg'], tilts=', '.join(f'{t:.1f}' for t in tilts(up)),
+                     sensitivity='estimates it' if sensitivity else 'leaves it out, since six attitudes do not show it',
+                     weak=', '.join(weak) or 'nothing'))
     return section
 
-
-def _explanation(tilt, turn_deg, found):
-    weak = [name for name, status in zip(found.param_names, found.statuses) if status != 'determined']
-    return (
-        f'Both were given the same sections and gravity {GRAVITY} m/s². imucal takes each face as exactly level and each turn as exactly {turn_deg} '
-        'deg, about one axis. By the angles that the gyroscope saw and the norm of gravity, the faces were off by '
-        f'{", ".join(f"{t:.1f}" for t in tilt)} deg (x up, x down, y up, ...; some of it common to all, which is a choice of axes). imucal\'s '
-        'biases and angles between the axes of the accelerometer hold that error of the hand: a face that is off by 1 deg across and another by '
-        '-1 deg is 1 deg of angle; the half sum of a face and its opposite is the bias only if both are equally level. Its matrix also has the '
-        'case\'s faces for axes where ours takes the accelerometer\'s (lower triangular), so that lengths of rows and angles between rows are compared, '
-        'which no choice of axes changes. For the gyroscope imucal adds up the rates of a turn component by component, which is the angle only '
-        'when the axis stands still; ours integrates the attitude, takes the angle of a turn by hand as known to 1 deg (0.28 % of a turn), and '
-        'uses the ways between the faces too. imucal gives a g-sensitivity from six faces without asking whether it is noise; ours '
-        f'{"estimates" if any("g_sensitivity" in name for name in found.param_names) else "leaves it out, since six attitudes do not show it"}. '
-        f'Not determined by our own tolerances: {", ".join(weak) if weak else "nothing"}.')

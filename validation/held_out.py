@@ -8,7 +8,7 @@ from imu_calibration.still_search import find_still
 from validation.ferraris import GRAVITY, NAME as FERRARIS, RATE_HZ, calibrate_sections, known_turns
 from validation.recordings import BY_HAND, gravity_of, label, load, reference
 from validation.second_opinions import FACES, Forward, accelerometer_of, ferraris, fit_norm, installed
-from validation.section import Section
+from validation.section import Section, text
 
 FEW, SPLITS, DRAWS, SEED = 12, 20, 10_000, 20
 """Poses of the small training sets, how many of them, bootstrap draws, seed of both."""
@@ -43,10 +43,10 @@ def errors_of_splits(imu, ranges, gravity, splits):
     force, result = mean_forces(imu, ranges), {'ours': [], 'norm fit': [], 'uncalibrated': []}
     for left_out in splits:
         rest = np.setdiff1d(np.arange(len(ranges)), left_out)
-        makers = {'ours': lambda out=left_out: ours(imu, ranges, out, gravity), 'norm fit': lambda kept=rest: fit_norm(force[kept], gravity),
-                  'uncalibrated': lambda: Forward(np.zeros(3), np.eye(3))}
-        for name, make in makers.items():
-            result[name].append(make().norm_errors(force[left_out], gravity))
+        sensors = {'ours': ours(imu, ranges, left_out, gravity), 'norm fit': fit_norm(force[rest], gravity),
+                   'uncalibrated': Forward(np.zeros(3), np.eye(3))}
+        for name, sensor in sensors.items():
+            result[name].append(sensor.norm_errors(force[left_out], gravity))
     return result
 
 
@@ -132,20 +132,16 @@ def run(folder, plots):
         values, interval, everything[label(name, topic)] = leave_one_out(imu, ranges, gravity, rng)
         rows.append(_row(label(name, topic), len(ranges), values, interval))
         values, (ratio, interval) = few_poses(imu, ranges, gravity, rng)
-        few.append((*_start(label(name, topic), FEW, values), f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]', _verdict(np.log(interval))))
+        shown = f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]'
+        few.append((*_start(label(name, topic), FEW, values), shown, _verdict(np.log(interval))))
         faces.append((label(name, topic), f'{off_faces(imu, ranges).max():.0f} deg'))
     head = ('recording', 'poses', 'uncalibrated', 'norm fit', 'ours', 'norm fit − ours [95 %]', 'better')
-    section.say('Error of a pose: length of the compensated specific force minus gravity; figures are the rms over poses in mm/s². Every pose is left '
-                'out once; its samples are cut out of the recording, so that ours sees neither the pose nor a turn across it. The interval is of the '
-                'paired difference, from poses drawn again with replacement. "norm fit" is `scipy.optimize.least_squares` on nine parameters.')
+    section.say(text('held_out_errors'))
     section.table(head, rows)
-    section.say(f'The same with few poses: {SPLITS} times {FEW} poses drawn for the fit, all others left out; median of the rms in mm/s², and the geometric mean '
-                'of the ratio on the same split, its interval for splits that share poses (Nadeau and Bengio 2003).')
+    section.say(text('held_out_few', splits=SPLITS, few=FEW))
     section.table((*head[:5], 'norm fit / ours [95 %]', 'better'), few)
     _six_faces(section, folder)
-    section.say('imucal needs six poses that lie exactly on the faces, and three full turns. The other recordings hold neither: the pose nearest to '
-                'some face is off by ' + ', '.join(f'{angle} ({name})' for name, angle in faces) + ', and there are no full turns; a face that is '
-                'off by 10 deg changes its reading by 1.5 % of gravity, which imucal would take as scale and bias. It was not run there.')
+    section.say(text('held_out_imucal', faces=', '.join(f'{angle} ({name})' for name, angle in faces)))
     _count(section, rows, few)
     _draw(section, plots, everything)
     return section
@@ -166,9 +162,7 @@ def _six_faces(section, folder):
         if name in errors:
             interval = 1e3 * bootstrap_difference(errors['ours'], errors[name], rng) if name != 'ours' else None
             rows.append((name, f'{1e3 * rms(errors[name]):.2f}', '' if interval is None else f'[{interval[0]:+.2f}, {interval[1]:+.2f}]'))
-    section.say(f'ferraris: all methods fitted to the six faces (and, where they use them, the three turns); the errors are of the {len(errors["ours"])} '
-                'rests outside these sections, three of the six faces again. Six faces say nothing to a norm fit about angles between axes, it has '
-                'six parameters here.')
+    section.say(text('held_out_faces', rests=len(errors['ours'])))
     section.table(('method', 'rms of the rests, mm/s²', 'minus ours [95 %]'), rows)
 
 

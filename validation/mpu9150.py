@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.by_hand import calibrate_by_hand
 from imu_calibration.still_search import find_still
 from validation.recordings import load, reference
-from validation.section import Section, listed
+from validation.section import Section, listed, text
 
 NAME = 'mpu9150_0'
 
@@ -23,7 +23,7 @@ def run(folder, plots):
     found, difference = figures(folder)
     section.claim('accelerometer biases against the published ones', 'within 10 mm/s²', f'{listed(1e3 * difference, 1)} mm/s²',
                   np.max(np.abs(difference)) < 0.010)
-    section.say(f'Our standard deviations: {", ".join(f"{1e3 * sd:.1f}" for sd in found.sd[:3])} mm/s². The site\'s gravity is not stated, which '
-                f'biases do not feel. {found.statistics["poses"]} poses, {found.statistics["turns"]} turns, '
-                f'residual of the gravity norm {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s².')
+    statistics = found.statistics
+    section.say(text('mpu9150', sds=', '.join(f'{1e3 * sd:.1f}' for sd in found.sd[:3]), poses=statistics['poses'],
+                     turns=statistics['turns'], residual=1e3 * statistics['norm_residual_rms']))
     return section

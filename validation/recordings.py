@@ -54,4 +54,5 @@ def load(folder, name, topic=None):
 
 def label(name, topic):
     """Return a short name of one IMU of a recording."""
-    return name if topic is None else f'{name} {topic.strip("/").partition("/")[0]}'
+    first = (topic or '').strip('/').partition('/')[0]
+    return f'{name} {first}' if '_' in first else name

@@ -17,24 +17,17 @@ if __name__ == '__main__':
 from imu_calibration import __version__   # noqa: E402
 from imu_calibration.errors import ImuCalibrationError   # noqa: E402
 from validation.recordings import VARIABLE, data_folder   # noqa: E402
-from validation.section import Section, claims_table   # noqa: E402
+from validation.section import Section, claims_table, text   # noqa: E402
 
 SECTIONS = ('shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'held_out', 'inspecting', 'diagnosing')
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
-INTRODUCTION = """# Validation on real recordings
 
-Written by `make validate`: every figure below comes from one run on {date}, on the recordings that `IMU_CALIBRATION_DATA` names. Nothing was
-simulated but the section that says so. A "no" in the last column is a claim that does not hold; the section says why as far as it is known.
-
-| what | version |
-| --- | --- |
-{versions}
-"""
 
 
 def versions():
     """Return [(name, version)] of what took part."""
-    found = [('imu_calibration', __version__), ('Python', platform.python_version()), ('system', f'{platform.system()} {platform.machine()}')]
+    found = [('imu_calibration', __version__), ('Python', platform.python_version()),
+             ('system', f'{platform.system()} {platform.machine()}')]
     for name in PACKAGES:
         try:
             found.append((name, version(name)))
@@ -64,11 +57,11 @@ def run_section(name, folder, plots):
 
 def document(sections):
     """Return the whole document."""
-    head = INTRODUCTION.format(date=date.today().isoformat(), versions='\n'.join(f'| {name} | {text} |' for name, text in versions()))
+    head = text('introduction', date=date.today().isoformat(), versions='\n'.join(f'| {name} | {found} |' for name, found in versions()))
     rows = [row for section in sections for row in section.rows if row.holds is not None]
     missed = [row for row in rows if not row.holds]
     count = f'{len(rows) - len(missed)} of {len(rows)} claims hold.'
-    parts = [head.rstrip(), '## In short', count + (' Those that do not:' if missed else '')]
+    parts = [head, '## In short', count + (' Those that do not:' if missed else '')]
     if missed:
         parts.append(claims_table(missed))
     return '\n\n'.join(parts + [section.markdown() for section in sections]) + '\n'
@@ -82,7 +75,8 @@ def main():
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
-        print(f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}', file=sys.stderr)
+        print(f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}',
+              file=sys.stderr)
         return 1
     plots = options.output / 'validation'
     plots.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,9 @@
 """A section of the document: claims with their figures, tables, remarks and plots."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
+
+TEXTS = Path(__file__).parent / 'texts'
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,11 @@ class Section:
         pieces += self.parts
         pieces += [f'![{caption}](validation/{name})\n\n{caption}' for name, caption in self.plots]
         return '\n\n'.join(pieces)
+
+
+def text(name, **values):
+    """Return a text of the folder texts with its figures filled in."""
+    return (TEXTS / f'{name}.md').read_text().strip().format(**values)
 
 
 def claims_table(rows):

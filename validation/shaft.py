@@ -6,7 +6,7 @@ from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.turntable import Table
 from msg_adapters.bag import open_recording
 from validation.recordings import SHAFT
-from validation.section import Section
+from validation.section import Section, text
 
 KNOWN = {'shaft_pitch_slow': ('yy', 0.985), 'shaft_yaw_medium': ('zz', 1.005)}
 """Which entry lies along the shaft, and its known value."""
@@ -58,9 +58,7 @@ def run(folder, plots):
         entry, known = KNOWN[name]
         for what, calibration in calibrations(folder, name).items():
             _claims(section, name, what, calibration, entry, known)
-    section.say('The gain is the entry of the gyroscope matrix along the shaft. "default" is what `calibrate --table` estimates by itself, "with lag" is with '
-                '`gyro_bandwidth` and `time_offset`, whose sum is the lag of the gyroscope behind the encoder: slow sweeps do not tell the two apart. '
-                'What diagnosis finds by itself, with its gain on data held out, stands under "Diagnosis".')
+    section.say(text('shaft'))
     return section
 
 
@@ -76,6 +74,6 @@ def _claims(section, name, what, calibration, entry, known):
         groups = not_determined(calibration)
         across = [f'gyroscope.matrix.{a}{b}' for a in 'xyz' for b in 'xyz' if b != entry[1]]
         marked = [n for n in across if any(n in names for names in groups.values())]
-        section.claim(f'{name}: the rates across the shaft are marked as not determined', 'all six matrix entries', f'{len(marked)} of {len(across)}',
-                      len(marked) == len(across))
+        section.claim(f'{name}: the rates across the shaft are marked as not determined', 'all six matrix entries',
+                      f'{len(marked)} of {len(across)}', len(marked) == len(across))
         section.say(f'{name}, not determined: ' + '; '.join(f'{status}: {", ".join(names)}' for status, names in groups.items()) + '.')

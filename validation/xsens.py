@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.by_hand import calibrate_by_hand
 from imu_calibration.still_search import find_still
 from validation.recordings import gravity_of, load, nominal_of, reference
-from validation.section import Section, listed
+from validation.section import Section, listed, text
 
 NAME = 'xsens_counts'
 
@@ -34,16 +34,16 @@ def run(folder, plots):
     section = Section('Raw counts: Xsens MTi (xsens_counts)')
     found, differences = figures(folder)
     (offset, scale), (offset_w, scale_w) = differences['accelerometer'], differences['gyroscope']
-    section.claim('accelerometer offsets against the factory', 'within 10 counts', f'{listed(offset, 1)} counts', np.max(np.abs(offset)) < 10)
-    section.claim('accelerometer scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale, 2)} %', np.max(np.abs(scale)) < 0.003)
-    section.claim('gyroscope scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale_w, 2)} %', np.max(np.abs(scale_w)) < 0.003)
+    section.claim('accelerometer offsets against the factory', 'within 10 counts', f'{listed(offset, 1)} counts',
+                  np.max(np.abs(offset)) < 10)
+    section.claim('accelerometer scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale, 2)} %',
+                  np.max(np.abs(scale)) < 0.003)
+    section.claim('gyroscope scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale_w, 2)} %',
+                  np.max(np.abs(scale_w)) < 0.003)
     section.claim('gyroscope offsets against the factory', 'another turn-on', f'{listed(offset_w, 1)} counts')
     statistics = found.statistics
     section.claim('chi-square per degree of freedom of the gravity norm, white noise', 'near 13 after nine parameters',
                   f'{statistics["norm_chi2_per_dof"]:.1f}')
-    section.say(f'{statistics["poses"]} poses in {statistics["attitudes"]} attitudes, {statistics["turns"]} turns; gravity '
-                f'{gravity_of(folder, NAME)} m/s². The converter was read with the nominal offset and scale of the data sheet; the result is '
-                'converted back to counts. The factory prints its axes to 0.01, so that scale factors are compared as lengths of the matrix '
-                f'rows. Between poses the accelerometer scatters by {1e3 * statistics["pose_scatter_sd"]:.2f} mm/s² beyond its noise, which '
-                'enters every standard deviation; no term of the model claims it (see "Diagnosis").')
+    section.say(text('xsens', gravity=gravity_of(folder, NAME), scatter=1e3 * statistics['pose_scatter_sd'],
+                     **{key: statistics[key] for key in ('poses', 'attitudes', 'turns')}))
     return section
