@@ -50,7 +50,8 @@ def run(folder, plots):
                      f'{max(s.max() for s in sd):.2f}', ' / '.join(clipped)))
     section.table(('pair', 'array_2 − design, mm', 'array_5 − design, mm', 'array_5 − array_2, mm', 'largest sd, mm',
                    'clipped, % of moving time'), rows)
-    section.say(text('boards', expected=_rms(np.linalg.norm(expected, axis=1))))
+    shares = [arms[name][pair].diagnostics['clipped_share'] for name in NAMES for pair in pairs]
+    section.say(text('boards', expected=_rms(np.linalg.norm(expected, axis=1)), clipped=100 * np.mean(shares)))
     _draw(section, plots, pairs, errors)
     return section
 
