@@ -6,24 +6,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.by_hand import POSES_FULL, POSES_LEAST, ByHandSettings
+from imu_calibration.by_hand import POSES_LEAST
 from imu_calibration.by_hand_document import HandRecording, calibrate_samples_by_hand
-from imu_calibration.by_hand_poses import average_poses, collect_turns, distinct_attitudes
-from imu_calibration.errors import NotObservableError
+from imu_calibration.by_hand_model import HandModel
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.group_states import hand_group_states, waiting_groups
+from imu_calibration.hand_status import NOTHING, hand_status, look_for_poses
 from imu_calibration.hand_store import HandStore
-from imu_calibration.live_calibration import GroupState, SolvePacer, group_status, waiting_groups
+from imu_calibration.live_calibration import SolvePacer
+from imu_calibration.noise import STANDARD_GRAVITY
 from imu_calibration.samples import ImuSamples
 from imu_calibration.sensor_model import SensorModel, parse_effects
 from imu_calibration.settings import setting
-from imu_calibration.still_search import find_still
 from imu_calibration.stream_check import StreamCheck
-from imu_calibration.verdict import SCALES
 from imu_calibration.workflow import SENSORS, CalibrationOptions, result_by_hand
 
-FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
-"""The six directions that can be turned up."""
-SEEN = np.pi / 4
-"""A face counts as seen when an attitude lies within this angle of it, rad."""
+SEARCH_SHARE = 0.05
+"""Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
 SEARCH_STEP = 0.5
 """Rest is looked for after so many seconds of new samples, at the earliest."""
 _FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes', 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
@@ -42,39 +41,6 @@ class LiveByHandSettings:
                                 'too small: poses are forgotten, diagnostics say so')
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """What the search for rest found in the samples so far."""
-
-    rests: list
-    """Ranges at rest (slice)."""
-    poses: object
-    """`Poses`, or None without any rest."""
-    attitudes: int
-    """Different attitudes."""
-    turns: int
-    """Turns between consecutive poses that can be used."""
-    dropped: dict
-    """Reason -> turns that cannot be used."""
-    resting: float
-    """How long the IMU has been at rest now, s; 0 while it moves."""
-
-
-NOTHING = Findings([], None, 0, 0, {}, 0.0)
-
-
-@dataclass(frozen=True)
-class HandStatus:
-    """How far a calibration by hand has come, for people."""
-
-    word: str
-    """'waiting' before a solution is possible, 'weak' while something is missing, or 'determined'."""
-    message: str
-    """One line: what there is, and what to do next."""
-    values: dict
-    """Figures by name."""
-
-
 class LiveByHand:
     """
     One session without a table as it happens: `push` what arrives, `solve` when it is due.
@@ -88,12 +54,16 @@ class LiveByHand:
     options : CalibrationOptions
         What to estimate.
     settings : LiveSettings
-        Its `solve_share` bounds the search for rest too.
     by_hand : LiveByHandSettings
     saved : bytes, optional
         What `saved` of an earlier run returned.
     clock : callable
         Seconds of a steady clock.
+
+    Raises
+    ------
+    InputError
+        When an effect is asked for that needs a table, or temperatures.
 
     """
 
@@ -102,10 +72,11 @@ class LiveByHand:
         self._names = {sensor: None if text is None else parse_effects(sensor, text)
                        for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
         self._gravity = by_hand.gravity or None
+        _check_model(self.model)
         self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
         if saved is not None:
             self._store.load(saved)
-        self._pacer, self._unsearched, self._reported_ns = SolvePacer(settings.solve_share), 0, None
+        self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
         self.found, self.result = NOTHING, None
         self._search(self._store)
 
@@ -223,77 +194,21 @@ class LiveByHand:
         """Return the GroupState of every effect."""
         if self.result is None:
             return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
-        return _group_states(self.result)
+        return hand_group_states(self.result)
 
     def question(self):
         """Return None: what the model gets wrong is asked of recordings."""
 
     def status(self):
         """Return the HandStatus: what there is, and the pose or turn that helps most."""
-        word, needs = self._needs()
-        found = self.found
-        values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
-                  **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
-                  'directions of gravity not seen': ' '.join(self.unseen()), 'at rest for [s]': f'{found.resting:.1f}',
-                  'samples kept': len(self._store), 'samples forgotten': self._store.forgotten, 'next': '; '.join(needs)}
-        parts = [f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}']
-        if found.dropped:
-            parts.append('turns left out: ' + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items())))
-        if found.resting:
-            parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
-        parts += [f'next: {need}' for need in needs] if needs else ['everything is determined: save it']
-        return HandStatus(word, '; '.join(parts), values)
-
-    def unseen(self):
-        """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
-        if self.found.poses is None:
-            return list(FACES)
-        up = self.found.poses.force / np.linalg.norm(self.found.poses.force, axis=1, keepdims=True)
-        nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACES.items()}
-        return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
-
-    def _needs(self):
-        unseen = self.unseen()
-        if self.found.attitudes < POSES_LEAST or self.result is None:
-            still = f'hold it still with {unseen[0]} up' if unseen else 'hold it still in an attitude between two faces'
-            more = f' (not seen yet: {", ".join(unseen)})' if len(unseen) > 1 else ''
-            return 'waiting', [f'{still}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
-        calibration = self.result.calibration
-        lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
-        if not lacking:
-            return 'determined', []
-        if self._gravity is None and set(lacking) <= set(SCALES):
-            return 'weak', ["give the local gravity (parameter 'gravity'), which scales the accelerometer as a whole"]
-        return 'weak', list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+        status = hand_status(self.found, self.result and self.result.calibration, self._gravity is None)
+        return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 
-def look_for_poses(imu, windows):
-    """Return the Findings in ImuSamples with rising stamps."""
-    rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
-    if not rests:
-        return NOTHING
-    settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
-    poses, noise = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
-    turns, dropped = collect_turns(seconds, imu, poses, noise, settings)
-    goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
-    resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
-    return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
-
-
-def _group_states(result):
-    """Return the GroupState of every effect of a calibration by hand."""
-    calibration, states = result.calibration, []
-    names, sd = calibration.param_names, calibration.sd
-    for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
-        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        state = group_status(calibration.status[part])
-        own = set(names[part]) if state != 'determined' else set()
-        needs = next((item['needs'] for item in calibration.undetermined if own & set(item['parameters'])), '')
-        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
-                                 effect.unit_of(worst - part.start), needs))
-    return states
-
-
-def _plural(count, noun):
-    return f'{count} {noun}' + ('' if count == 1 else 's')
+def _check_model(model):
+    """Refuse effects that need a table, and those of temperature: live, no temperatures are kept with the poses."""
+    thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
+    if thermal:
+        raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
+                         "record a bag and run 'imu_calibration calibrate BAG', or leave it out")
+    HandModel(model, STANDARD_GRAVITY)

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration import accumulator_state, observability
-from imu_calibration.calibration import HELD, WEAK
+from imu_calibration import accumulator_state
 from imu_calibration.errors import InputError
-from imu_calibration.estimation import make_prior
 from imu_calibration.gathering import Collector, Gathered, merge
+from imu_calibration.group_states import group_states, waiting_groups
 from imu_calibration.live_diagnosis import LEAST_WINDOWS, Question, RecentWindows, baseline_model
 from imu_calibration.samples import ImuSamples
 from imu_calibration.sensor_model import coefficients, columns
@@ -17,8 +16,6 @@ from imu_calibration.settings import setting
 from imu_calibration.window_store import WindowStore
 from imu_calibration.workflow import PASSES, SENSORS, CalibrationOptions, check_units, choose_model, finish, linearise_again
 
-WAITING = 'waiting'
-"""Status of a parameter group before the first solution; then 'determined', 'weak' or 'held'."""
 HELD_BACK = 200
 """Blocks that wait for the first temperature at most, when a thermal effect needs one."""
 
@@ -39,30 +36,6 @@ class LiveSettings:
                                       'too small: the diagnosis takes a core from other programs')
     diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each', (1000, 100_000_000),
                                      'too small: effects that need the whole session are not found')
-
-
-@dataclass(frozen=True)
-class GroupState:
-    """What is known of one effect of one sensor."""
-
-    sensor: str
-    """'accelerometer', 'gyroscope' or 'reference'."""
-    effect: str
-    """Name of the effect."""
-    status: str
-    """The worst of its parameters: 'determined', 'weak', 'held', or 'waiting' before the first solution."""
-    parameter: str
-    """The parameter whose standard deviation is largest in tolerances."""
-    sd: float
-    """Its standard deviation, SI; NaN before the first solution."""
-    tolerance: float
-    """Its tolerance, SI."""
-    unit: str
-    """Unit of both."""
-    needs: str = ''
-    """The motion that is still needed."""
-    predicted_sd: float = float('nan')
-    """Standard deviation after one minute of that motion; NaN when it cannot be predicted."""
 
 
 class LiveCalibration:
@@ -286,34 +259,6 @@ def _copied(gathered):
     """Return a copy that shares only what nobody changes in place."""
     accumulator = gathered.accumulator.copy()
     return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), windows=[], kept=[], counts=dict(gathered.counts))
-
-
-def group_states(result):
-    """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
-    calibration, prior_sd = result.calibration, make_prior(result.model).sd
-    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, prior_sd)
-    names, sd, states = calibration.param_names, calibration.sd, []
-    for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
-        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        status = calibration.status[part]
-        state = group_status(status)
-        text, predicted = needed.get(names[worst], ('', float('nan'))) if state != 'determined' else ('', float('nan'))
-        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
-                                 effect.unit_of(worst - part.start), text, predicted))
-    return states
-
-
-def group_status(statuses):
-    """Return the worst of the statuses of an effect's parameters."""
-    return next((kind for kind in (HELD, WEAK) if kind in statuses), 'determined')
-
-
-def waiting_groups(model):
-    """Return the GroupState of every effect of a model of which nothing is known yet."""
-    texts = {motion.name: motion.text for motion in observability.MOTIONS} | observability.TABLE_MOTIONS
-    return [GroupState(e.sensor, e.name, WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
-            for e in model.effects]
 
 
 class SolvePacer:

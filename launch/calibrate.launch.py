@@ -3,6 +3,8 @@ Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
 
+    ros2 launch imu_calibration calibrate.launch.py table:= imu:=/imu/data_raw      # by hand, without a table
+
 Several IMUs: one launch each with its own `namespace` and `save_file`.
 """
 
@@ -20,7 +22,7 @@ def generate_launch_description():
     """Describe calibration_node and the names it can be given."""
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
-                              description='table description, YAML'),
+                              description='table description, YAML; empty: no table, by hand'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
                               description='parameters of the node, YAML'),
         DeclareLaunchArgument('save_file', default_value='calibration.yaml',

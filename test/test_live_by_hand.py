@@ -5,8 +5,9 @@ import pytest
 from test_by_hand import GRAVITY, load, simulate
 
 from imu_calibration import workflow
-from imu_calibration.errors import DocumentError, NotObservableError
-from imu_calibration.live_by_hand import FACES, LiveByHand, LiveByHandSettings
+from imu_calibration.errors import DocumentError, InputError, NotObservableError
+from imu_calibration.hand_status import FACES, unseen
+from imu_calibration.live_by_hand import LiveByHand, LiveByHandSettings
 from imu_calibration.live_calibration import LiveSettings
 from imu_calibration.samples import ImuSamples, SampleBlock
 
@@ -90,7 +91,7 @@ def test_before_any_motion_it_asks_for_attitudes():
     with pytest.raises(NotObservableError, match='4 different attitudes'):
         live.solve()
     status = live.status()
-    assert status.word == 'waiting' and 'hold it still with' in status.message and set(live.unseen()) == set(FACES)
+    assert status.word == 'waiting' and 'hold it still with' in status.message and set(unseen(live.found)) == set(FACES)
     assert all(group.status == 'waiting' and group.needs for group in live.groups())
 
 
@@ -103,7 +104,7 @@ def test_the_direction_that_is_missing_is_named():
     live, asked = make_live(), {}
     for block in blocks(imu):
         live.push(block)
-        asked[live.found.attitudes] = live.status(), live.unseen()
+        asked[live.found.attitudes] = live.status(), unseen(live.found)
     assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACES)
     assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACES) - {'+z'}
     assert set(asked[2][1]) == set(FACES) - {'+z', '+x'}
@@ -203,3 +204,18 @@ def test_without_a_long_rest_the_oldest_go(session):
     run(live, session)
     assert len(live._store) <= len(session) * 6 // 10 + 100
     assert_same(live.solve(pending=True), offline(live._store.samples()), 1e-4)
+
+
+@pytest.mark.parametrize(('model', 'what'), [('bias+matrix+accel_thermal_bias', 'record a bag'), ('bias+matrix+accel_size_effect', 'table')])
+def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, what):
+    with pytest.raises(InputError, match=what):
+        LiveByHand(workflow.CalibrationOptions(accelerometer_model=model), LiveSettings())
+
+
+def test_further_effects_are_estimated_as_offline(session):
+    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
+    live = LiveByHand(options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0)
+    run(live, session)
+    expected = workflow.calibrate_without_table([lambda: iter([SampleBlock(session)])], options, GRAVITY)
+    assert any('accel_quadratic' in name for name in expected.calibration.param_names)
+    assert_same(live.solve(pending=True), expected)

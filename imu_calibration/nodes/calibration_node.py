@@ -151,6 +151,8 @@ class CalibrationNode(Node):
         state = self.worker.state
         if state.streams is not None and state.streams.word == 'trouble':
             self._complain(state.streams.message)
+        if self._table is None and self.count_publishers(self.resolve_topic_name('joint_states')):
+            self.get_logger().info("joint states are published; to calibrate on a table give 'table_file'", once=True)
         return statuses_of(state)
 
 
