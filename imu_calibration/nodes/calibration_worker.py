@@ -147,9 +147,11 @@ class CalibrationWorker(threading.Thread):
             asked, self._asked = self._asked, []
         for request in asked:
             try:
-                request.answer(True, getattr(self, '_' + request.what)())
+                success, message = True, getattr(self, '_' + request.what)()
             except ImuCalibrationError as error:
-                request.answer(False, str(error))
+                success, message = False, str(error)
+            self._tell()   # who asked looks at the diagnostics next
+            request.answer(success, message)
 
     def _solve_when_due(self):
         idle = not self._closed and time.monotonic() - (self._watch.last_arrival or 0.0) > IDLE
