@@ -79,7 +79,7 @@ def reduce_window(window, model, table, session=0, column_function=columns):
     if static and temperature is not None:
         temperature = np.array([temperature.mean()])
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    length = 0 if static or len(window.time) < 2 else int(round(SLOW_TIME * (len(window.time) - 1) / (window.time[-1] - window.time[0])))
+    length = piece_length(window)
     # Both sensors feel the same motion unless a lag or a delay acts: then it is worked out once.
     shared = {'ref': reference_motion(table, window.motion, temperature)} if column_function is columns and not warps_act(model) else {}
     designs = {sensor: column_function(model, sensor, table, window.motion, temperature, **shared) for sensor in SENSORS}
@@ -97,9 +97,22 @@ def _reduce_moving(design, output, length):
     rows = np.concatenate([design, output], axis=1)
     mean = rows.mean(axis=0)
     rows -= mean
-    unknown, pieces = np.full(3, np.nan), len(rows) // length if length > 1 else 0
-    slow = rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
-    return SensorStatistics(mean, triangular(rows), unknown, unknown, triangular(slow), pieces)
+    unknown, slow = np.full(3, np.nan), slow_part(rows, length)
+    return SensorStatistics(mean, triangular(rows), unknown, unknown, triangular(slow), len(slow))
+
+
+def piece_length(window):
+    """Return the number of samples in SLOW_TIME, at least one; zero for a static window."""
+    if window.kind == 'static':
+        return 0
+    span = window.time[-1] - window.time[0]
+    return max(int(round(SLOW_TIME * (len(window.time) - 1) / span)), 1) if span > 0 else 1
+
+
+def slow_part(rows, length):
+    """Return the means of pieces of `length` rows times the root of their length, none when a piece is a single row."""
+    pieces = len(rows) // length if length > 1 else 0
+    return rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
 
 
 def batch_statistics(output, batches=16):

@@ -101,7 +101,32 @@ def investigate(windows, table, model, progress=None):
     chosen = [question for question in chosen if '@' not in question.label]
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
-    return Investigation(used, attempt, explained, explained.pruned(chosen), limits, not_testable)
+    named = _that_help(attempt, explained.pruned(chosen))
+    for _ in range(LINEARISATIONS - 1):
+        if not attempt.acts_beside(named):
+            break
+        attempt = Attempt(used, table, model, asked, attempt.point(named))
+        explained = Explained(attempt.evidence, attempt.search)
+        named = _that_help(attempt, explained.pruned([next(q for q in attempt.questions if q.label == question.label) for question in named]))
+    return Investigation(used, attempt, explained, named, limits, not_testable)
+
+
+def _that_help(attempt, named):
+    """
+    Return the findings that are physically possible, and, where no rest tells the noise, lower the plain residual of locked windows.
+
+    Without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes evidence of anything that
+    goes with it.
+    """
+    kept = [question for question in named if attempt.search.allowed(named, question)]
+    if np.any(attempt.lifted.kind == 'static'):
+        return kept
+    while kept:
+        least = [heldout_gain(attempt, [q for q in kept if q is not question], kept, sensors_of(question.effect)).ci95[0] for question in kept]
+        if not np.min(least) <= 0.0:
+            break
+        del kept[int(np.argmin(least))]
+    return kept
 
 
 def with_joints_of(model, table):
@@ -132,8 +157,8 @@ def _without_clipping(windows, table, model):
 def _assembled(windows, table, found):
     attempt, named, limits = found.attempt, found.named, found.limits
     model = attempt.baseline
-    baseline = extended_solution(attempt.lifted, attempt.noise, model, [])
-    solution = extended_solution(attempt.lifted, attempt.noise, model, named, limits) if named or limits else baseline
+    baseline = extended_solution(attempt.space, attempt.noise, model, [])
+    solution = extended_solution(attempt.space, attempt.noise, model, named, limits) if named or limits else baseline
     findings = [_clipping(limit, solution) for limit in limits]
     for place in range(len(named)):
         findings.append(_finding(attempt, found.explained, named, place, solution, table))

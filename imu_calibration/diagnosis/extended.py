@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.bands import NO_SAY
 from imu_calibration.diagnosis.lifted import own_coefficients, own_groups
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation import solve
@@ -12,14 +13,14 @@ from imu_calibration.window_noise import WindowNoise
 from imu_calibration.window_statistics import SensorStatistics, WindowStatistics
 
 
-def extended_solution(lifted, noise, baseline, chosen, saturations=()):
+def extended_solution(space, noise, baseline, chosen, saturations=()):
     """
     Return the Solution of the baseline extended by the chosen effects.
 
     Parameters
     ----------
-    lifted : Lifted
-        Its columns were taken at the point of the chosen effects.
+    space : Space
+        Of a recording whose columns were taken at the point of the chosen effects.
     noise : dict
         Sensor -> SensorNoise.
     baseline : SensorModel
@@ -28,19 +29,21 @@ def extended_solution(lifted, noise, baseline, chosen, saturations=()):
         Limits to write into the model.
 
     """
+    lifted = space.lifted
     model = replace(baseline, point={**baseline.point, **lifted.model.point}, temperature_ref_c=lifted.model.temperature_ref_c)
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    solution = solve(accumulate(lifted, model, noise), model, noise={s: window_noise(noise[s]) for s in SENSORS})
+    solution = solve(accumulate(lifted, model, noise), model, noise={s: window_noise(noise[s], space.slow_only[s]) for s in SENSORS})
     for limit in saturations:
         solution = _with_limit(solution, limit)
     return solution
 
 
-def window_noise(noise):
-    """Return the noise as the solver knows it."""
-    scale = {kind: factor / noise.inflation for kind, factor in noise.within.items()}
-    return WindowNoise(noise.white, noise.inflation, noise.offset_sd, noise.wander_sd, noise.wander_time, scale)
+def window_noise(noise, slow_only):
+    """Return the noise as the solver knows it; fast parts have no say on axes where only the slow part is compared."""
+    slow = {kind: factor / noise.inflation for kind, factor in noise.within.items()}
+    scale = {kind: np.where(slow_only, NO_SAY * factor, factor) for kind, factor in slow.items()}
+    return WindowNoise(noise.white, noise.inflation, noise.offset_sd, noise.wander_sd, noise.wander_time, scale, slow)
 
 
 def accumulate(lifted, model, noise):
@@ -56,12 +59,15 @@ def accumulate(lifted, model, noise):
                                          int(lifted.session[k])))
     for sensor in SENSORS:
         for kind in np.unique(lifted.kind[lifted.kind != 'static']):
-            accumulator.within[sensor, str(kind)] = _root(picked[sensor][1][lifted.kind == kind].sum(axis=0))
+            rows = lifted.kind == kind
+            accumulator.within[sensor, str(kind)] = _root(picked[sensor][1][rows].sum(axis=0))
+            accumulator.slow[sensor, str(kind)] = _root(picked[sensor][2][rows].sum(axis=0))
+            accumulator.slow_rows[str(kind)] = int(lifted.slow_rows[rows].sum())
     return accumulator
 
 
 def _picked(lifted, model, sensor):
-    """Return (mean rows, products) with the columns of `model` and the output instead of the residual."""
+    """Return (mean rows, products, products of the slow part) with the columns of `model` and the output instead of the residual."""
     start, places = 0, {}
     for name, width in own_groups(lifted.model, sensor):
         places[name] = np.arange(start, start + width)
@@ -74,7 +80,7 @@ def _picked(lifted, model, sensor):
     join[columns[known], known] = 1.0
     join[:start, -3:] = own_coefficients(lifted.model, sensor, lifted.values)
     join[-3:, -3:] = np.eye(3)
-    return lifted.mean[sensor] @ join, join.T @ (lifted.gram[sensor] @ join)
+    return lifted.mean[sensor] @ join, join.T @ (lifted.gram[sensor] @ join), join.T @ (lifted.slow[sensor] @ join)
 
 
 def _root(gram):

@@ -85,10 +85,11 @@ def heldout_gain(attempt, before, after, sensors):
     for sensor in sensors:
         squares = [_squares(attempt, choice, sensor) for choice in (before, after)]
         for measure, part in (('samples', 0), ('window means', 1)):
-            chosen = [_rms(s[part][~attempt.locked], s[2 + part][~attempt.locked]) for s in squares]
-            reduction = 1 - chosen[1] / chosen[0]
+            chosen, locked = ([(s[part][rows], s[2 + part][rows]) for s in squares] for rows in (~attempt.locked, attempt.locked))
+            # What is sure to fall: a large fall of a few window means may be chance.
+            reduction = np.nan_to_num(reduction_interval(chosen)[0], nan=-np.inf)
             if best is None or reduction > best[0]:
-                best = (reduction, sensor, measure, [(s[part][attempt.locked], s[2 + part][attempt.locked]) for s in squares])
+                best = (reduction, sensor, measure, locked)
     _, sensor, measure, pair = best
     rms = [_rms(*entry) for entry in pair]
     return Gain(sensor, measure, rms[0], rms[1], reduction_interval(pair), int(attempt.locked.sum()))
@@ -96,7 +97,7 @@ def heldout_gain(attempt, before, after, sensors):
 
 def _squares(attempt, choice, sensor):
     """Return sums of squares of samples and of window means, and the numbers of each, per window, four arrays (k,)."""
-    space, lifted = attempt.space, attempt.lifted
+    space, lifted = attempt.all_samples, attempt.lifted
     used = attempt.search.used(choice)
     values = np.zeros(space.size + 1)
     values[list(used)], values[-1] = -attempt.evidence.fit(used)[0], 1.0

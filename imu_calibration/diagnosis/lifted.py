@@ -9,7 +9,7 @@ from imu_calibration.effects.regressors import GROUPS
 from imu_calibration.joint_motion import JointMotion
 from imu_calibration.reference import lever_matrix
 from imu_calibration.sensor_model import INPUT_OF, coefficients, warped_reference
-from imu_calibration.window_statistics import batch_statistics
+from imu_calibration.window_statistics import batch_statistics, piece_length, slow_part
 
 CHUNK = 16384
 """Samples whose columns are held at once."""
@@ -40,6 +40,10 @@ class Lifted:
     """Sensor -> mean rows, shape (k, p + 3)."""
     gram: dict
     """Sensor -> products of the centred rows, shape (k, p + 3, p + 3); zero for static windows."""
+    slow: dict
+    """Sensor -> the part of these products that the means of short pieces make (`bands`), shape (k, p + 3, p + 3)."""
+    slow_rows: np.ndarray
+    """Short pieces of each window, shape (k,)."""
     noise: dict
     """Sensor -> (variance about the mean, inflation) of static windows, each (k, 3), NaN elsewhere."""
     describe: dict
@@ -75,7 +79,7 @@ def lift(windows, table, model, values, constants, progress=None):
         Called with the share that is done, in [0, 1].
 
     """
-    means, grams = {s: [] for s in SENSORS}, {s: [] for s in SENSORS}
+    means, grams, slows = {s: [] for s in SENSORS}, {s: [] for s in SENSORS}, {s: [] for s in SENSORS}
     noise = {s: [] for s in SENSORS}
     describe = []
     coefficient = {s: own_coefficients(model, s, values) for s in SENSORS}
@@ -90,7 +94,8 @@ def lift(windows, table, model, values, constants, progress=None):
                 output = window.force_s if sensor == 'accelerometer' else window.rate_s
                 p = len(coefficient[sensor])
                 residual = output - design[:, :p] @ coefficient[sensor]
-                mean, gram, spread = _reduce(window.kind == 'static', design, residual)
+                mean, gram, slow, spread = _reduce(piece_length(window), design, residual)
+                slows[sensor].append(slow)
                 means[sensor].append(mean)
                 grams[sensor].append(gram)
                 noise[sensor].append(spread)
@@ -102,20 +107,21 @@ def lift(windows, table, model, values, constants, progress=None):
     return Lifted(model, values, np.asarray(constants), np.array([w.kind for w in windows]), fields['time'],
                   np.array([len(w.time) for w in windows], float), np.array([w.time[-1] - w.time[0] for w in windows]),
                   np.zeros(len(windows), int),
-                  {s: np.array(means[s]) for s in SENSORS}, {s: np.array(grams[s]) for s in SENSORS},
+                  {s: np.array(means[s]) for s in SENSORS}, {s: np.array(grams[s]) for s in SENSORS}, {s: np.array(slows[s]) for s in SENSORS},
+                  np.array([len(w.time) // n if (n := piece_length(w)) > 1 else 0 for w in windows]),
                   {s: (np.array([n[0] for n in noise[s]]), np.array([n[1] for n in noise[s]])) for s in SENSORS}, fields)
 
 
 def rebased(lifted, values):
     """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
-    mean, gram = {}, {}
+    mean, gram, slow = {}, {}, {}
     for sensor in SENSORS:
         change = own_coefficients(lifted.model, sensor, values) - own_coefficients(lifted.model, sensor, lifted.values)
         join = np.eye(lifted.mean[sensor].shape[1])
         join[:len(change), -3:] -= change
         mean[sensor] = lifted.mean[sensor] @ join
-        gram[sensor] = join.T @ lifted.gram[sensor] @ join
-    return replace(lifted, values=values, mean=mean, gram=gram)
+        gram[sensor], slow[sensor] = (join.T @ part[sensor] @ join for part in (lifted.gram, lifted.slow))
+    return replace(lifted, values=values, mean=mean, gram=gram, slow=slow)
 
 
 def _pieces(windows):
@@ -130,15 +136,16 @@ def _pieces(windows):
         yield part
 
 
-def _reduce(static, design, residual):
+def _reduce(length, design, residual):
     unknown = np.full(3, np.nan)
-    if static:
+    if length == 0:
         p = design.shape[1] + 3
-        return np.concatenate([design.mean(axis=0), residual.mean(axis=0)]), np.zeros((p, p)), batch_statistics(residual)
+        return np.concatenate([design.mean(axis=0), residual.mean(axis=0)]), np.zeros((p, p)), np.zeros((p, p)), batch_statistics(residual)
     rows = np.concatenate([design, residual], axis=1)
     mean = rows.mean(axis=0)
     rows = rows - mean
-    return mean, rows.T @ rows, (unknown, unknown)
+    pieces = slow_part(rows, length)
+    return mean, rows.T @ rows, pieces.T @ pieces, (unknown, unknown)
 
 
 def _describe(window):

@@ -14,6 +14,8 @@ TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
 ABSURD = 50.0
 """A size beyond this many times the largest that the catalogue knows of is no explanation."""
+KNOWN = {'earth_rate': 1.0}
+"""Effects whose size is known: times the largest that the catalogue holds."""
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
@@ -83,7 +85,7 @@ class Search:
         if question.effect.name.endswith('_bandwidth') and value[0] < 0:
             return False
         largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
-        return bool(np.all(np.abs(value) - 3 * sd < ABSURD * largest))
+        return bool(np.all(np.abs(value) - 3 * sd < KNOWN.get(question.name, ABSURD) * largest))
 
     def run(self):
         """Return the chosen questions in the order in which they were found."""

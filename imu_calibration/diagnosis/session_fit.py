@@ -8,6 +8,7 @@ from imu_calibration.diagnosis.lifted import lift, rebased
 from imu_calibration.diagnosis.search import Search
 from imu_calibration.diagnosis.session_noise import first_noise, normal_matrix, saturated_noise, solve_normal
 from imu_calibration.diagnosis.space import counted_from_values, parameter_space, questions, smooth_parameters
+from imu_calibration.diagnosis.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
@@ -26,7 +27,8 @@ class Attempt:
         used = baseline_parameters(baseline, model)
         if point is None:
             lifted = _at_baseline(lifted, baseline, used)
-        self.space = parameter_space(lifted, baseline)
+        self.all_samples = parameter_space(lifted, baseline)
+        self.space = in_trusted_band(self.all_samples)
         self.questions = questions(self.space, effects)
         self.noise = saturated_noise(self.space, smooth_parameters(self.questions))
         self.locked = locked_windows(lifted.kind)
@@ -58,6 +60,12 @@ class Attempt:
             if weight * _curvature(question, values, model)**2 > 4.0:
                 return True
         return False
+
+    def acts_beside(self, chosen):
+        """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
+        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        model = self.lifted.model
+        return any(e.warp is not None and (e.sensor, e.name) not in kept and np.any(model.warp_point(e)) for e in model.effects)
 
     def point(self, chosen):
         """Return (model, values) at which the columns should be taken for this choice."""
@@ -111,7 +119,7 @@ def _start(baseline, effects):
 def _at_baseline(lifted, baseline, used):
     """Move the residual to the baseline's own solution."""
     for _ in range(2 if baseline.has_arms else 1):
-        space = parameter_space(lifted, baseline)
+        space = in_trusted_band(parameter_space(lifted, baseline))
         change = solve_normal(normal_matrix(space, first_noise(space)), space.prior_sd, space.prior_mean, np.array(used))
         lifted = rebased(lifted, lifted.values + change[:len(lifted.values)])
     return lifted

@@ -1,6 +1,6 @@
 """From columns to parameters: each window's contribution to a linear problem in the parameters of everything that is asked."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,6 +28,10 @@ class Space:
     """Sensor -> three arrays (k, q_a + 1): mean rows ``[design | residual]``."""
     within: dict
     """Sensor -> three arrays (k, q_a + 1, q_a + 1): products of the centred rows."""
+    slow: dict
+    """Sensor -> the same of their slow part."""
+    slow_only: dict = field(default_factory=dict)
+    """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
 
     @property
     def size(self):
@@ -61,11 +65,11 @@ def parameter_space(lifted, baseline):
         names += [f'{short}_warm_up.{k}.{axis}' for k in range(n_bank) for axis in 'xyz']
     q_model, q = len(model.param_names), len(names)
     bank_sd = np.concatenate([np.full(3 * n_bank, 0.5), np.full(3 * n_bank, 0.05)])
-    index, mean, within = {}, {}, {}
+    index, mean, within, slow = {}, {}, {}, {}
     for number, sensor in enumerate(SENSORS):
         jacobian = own_jacobian(model, sensor, lifted.values)
         p = len(jacobian)
-        index[sensor], mean[sensor], within[sensor] = [], [], []
+        index[sensor], mean[sensor], within[sensor], slow[sensor] = [], [], [], []
         for axis in range(3):
             full = np.zeros((p + n_bank, q))
             full[:p, :q_model] = jacobian[:, axis]
@@ -77,8 +81,9 @@ def parameter_space(lifted, baseline):
             join[:-1, -1] = full[:, :q_model] @ removed
             index[sensor].append(used)
             mean[sensor].append(lifted.mean[sensor][:, take] @ join)
-            within[sensor].append(join.T @ (lifted.gram[sensor][:, take[:, None], take[None, :]] @ join))
-    return Space(lifted, tuple(names), np.concatenate([sd, bank_sd]), np.concatenate([shift, np.zeros(6 * n_bank)]), index, mean, within)
+            for found, products in ((within, lifted.gram), (slow, lifted.slow)):
+                found[sensor].append(join.T @ (products[sensor][:, take[:, None], take[None, :]] @ join))
+    return Space(lifted, tuple(names), np.concatenate([sd, bank_sd]), np.concatenate([shift, np.zeros(6 * n_bank)]), index, mean, within, slow)
 
 
 def counted_from_values(model, baseline):
