@@ -1,0 +1,95 @@
+"""Slow and fast parts of moving windows: alike where the reference is right, apart where the fast part is wrong."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.bands import band_misfit, extra_weight, variance_along
+from imu_calibration.estimation import solve
+from imu_calibration.joint_motion import JointMotion
+from imu_calibration.least_squares import Accumulator
+from imu_calibration.sensor_model import SensorModel
+from imu_calibration.turntable import Table
+from imu_calibration.window import Window
+from imu_calibration.window_statistics import reduce_window, slow_part
+
+TABLE = Table.from_mapping({'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1], 'gravity': 9.80665, 'latitude': None})
+MODEL = SensorModel(joint_names=('shaft',))
+GAIN, NOISE = 1.02, 0.01
+
+
+def sweeps(rng, fast_gain, n_windows=12, length=1500):
+    """Return windows of a shaft that swings slowly and shakes at 11 Hz; the gyroscope shows the shaking with a gain of its own."""
+    windows = []
+    for number in range(n_windows):
+        time = 20.0 * number + 0.01 * np.arange(length)
+        slow, fast = 2 * np.pi * 0.3, 2 * np.pi * 11.13
+        terms = [(1.0, slow, 0.0), (0.01, fast, 0.4)]
+        parts = [[a * w**k * np.sin(w * time + p + k * np.pi / 2) for k in range(4)] for a, w, p in terms]
+        motion = JointMotion(time, *(sum(part[k] for part in parts)[:, None] for k in range(4)))
+        rate = rng.normal(0, NOISE, (length, 3))
+        rate[:, 2] += GAIN * parts[0][1] + fast_gain * parts[1][1]
+        force = np.array([0.0, 0.0, 9.80665]) + rng.normal(0, 0.02, (length, 3))
+        windows.append(Window('dynamic', (time * 1e9).astype(np.int64), time, force, rate, motion, None))
+    return windows
+
+
+def solved(windows):
+    """Return the gain along the shaft, its standard deviation, and the noise of the gyroscope."""
+    accumulator = Accumulator()
+    for window in windows:
+        accumulator.add(reduce_window(window, MODEL, TABLE))
+    solution = solve(accumulator, MODEL)
+    place = list(solution.param_names).index('gyroscope.matrix.zz')
+    return solution.values[place], solution.sd[place], solution.noise['gyroscope']
+
+
+@pytest.mark.parametrize('fast_gain', [0.3, 0.85, 1.2])
+def test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate(fast_gain):
+    """Ripple that a low-pass has taken from the gyroscope, or the encoder from the reference; all samples alike would err by up to 8 %."""
+    windows = sweeps(np.random.default_rng(1), fast_gain)
+    value, sd, noise = solved(windows)
+    assert abs(value - GAIN) < 4 * sd < 0.01
+    assert noise.slow_scale['dynamic'][2] < 0.5 * noise.kind_scale['dynamic'][2]
+    x = np.concatenate([w.motion.rate[:, 0] - w.motion.rate[:, 0].mean() for w in windows])
+    y = np.concatenate([w.rate_s[:, 2] for w in windows])
+    assert abs(x @ y / (x @ x) - GAIN) > 3 * abs(value - GAIN)
+
+
+def test_nothing_is_thrown_away_where_the_reference_is_right():
+    """The standard deviation is that of all samples, and its scatter is as it says."""
+    rng, errors = np.random.default_rng(2), []
+    for _ in range(20):
+        windows = sweeps(rng, GAIN, n_windows=6, length=400)
+        value, sd, noise = solved(windows)
+        assert np.all(noise.slow_weight('dynamic') == 0.0)
+        errors.append((value - GAIN) / sd)
+    power = sum(((w.motion.rate[:, 0] - w.motion.rate[:, 0].mean())**2).sum() for w in windows)
+    assert 0.95 < sd * np.sqrt(power) / NOISE < 1.1
+    assert 0.3 < np.mean(np.square(errors)) < 2.2
+
+
+def test_white_noise_has_the_same_variance_in_both_parts():
+    rows = np.random.default_rng(3).normal(0, 2.0, (25000, 3))
+    slow = slow_part(rows, 25)
+    found = band_misfit((rows**2).sum(axis=0), len(rows), (slow**2).sum(axis=0), len(slow))
+    assert not found.apart.any()
+    np.testing.assert_allclose(found.overall, 4.0, rtol=0.05)
+    np.testing.assert_allclose(found.slow, 4.0, rtol=0.2)
+    every, of_slow = found.weights(np.full(3, 4.0), np.ones(3))
+    np.testing.assert_array_equal(every, of_slow)
+
+
+def test_weights_of_slow_and_of_all_rows_give_each_part_its_own():
+    fast, slow = np.full(3, 5.0), np.full(3, 2.0)
+    np.testing.assert_allclose(1 / fast + extra_weight(fast, slow)**2, 1 / slow)
+    np.testing.assert_array_equal(extra_weight(slow, slow), 0.0)
+
+
+def test_variance_along_the_columns_is_that_of_noise_and_shows_what_is_no_noise():
+    rng = np.random.default_rng(4)
+    design = rng.normal(size=(20000, 4))
+    slow = slow_part(design, 25)
+    noise = rng.normal(0, 3.0, 20000)
+    none = (slow[:0], slow[:0, 0])
+    assert 9 * 0.05 < variance_along((design, noise), none) < 9 * 4
+    assert variance_along((design, noise + 0.2 * design[:, 1]), none) > 50
