@@ -66,7 +66,7 @@ class HandStore:
 
     def forget(self, rests, most_rests):
         """
-        Let samples go when there are too many: the inside of the longest rest when that is enough, else the oldest; return whether some went.
+        Let samples go when there are too many: the inside of the longest rest when that is enough, else the oldest; return if any went.
 
         Parameters
         ----------
@@ -118,7 +118,8 @@ class HandStore:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 if str(arrays['format']) != FORMAT:
-                    raise DocumentError(f"saved samples must say '{FORMAT}', got '{arrays['format']}'; remove the file, or start without resume")
+                    raise DocumentError(f"saved samples must say '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
+                                        'without resume')
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not ({type(error).__name__}: {error}); '

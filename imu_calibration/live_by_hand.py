@@ -1,4 +1,4 @@
-"""Calibration by hand while the IMU is being turned: poses are counted, the direction that is missing is named, the answer is that of the recording."""
+"""Calibration by hand while the IMU is being turned: poses are counted, what is missing is named, the answer is that of the recording."""
 
 import copy
 import time
@@ -25,7 +25,8 @@ SEARCH_SHARE = 0.05
 """Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
 SEARCH_STEP = 0.5
 """Rest is looked for after so many seconds of new samples, at the earliest."""
-_FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes', 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
+_FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes',
+                'gyroscope': 'turn it from one attitude to the next, within half a minute'}
 MOST_POSES = 200
 """The time of the joint estimate grows with the third power of their number; the oldest are forgotten."""
 
@@ -34,10 +35,10 @@ MOST_POSES = 200
 class LiveByHandSettings:
     """What a calibration by hand keeps, and its reference."""
 
-    gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02', (0.0, 30.0),
-                             'all three accelerometer scales are wrong together')
-    hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); beyond them '
-                                'the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
+    gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
+                             (0.0, 30.0), 'all three accelerometer scales are wrong together')
+    hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
+                                'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
                                 'too small: poses are forgotten, diagnostics say so')
 
 
@@ -158,7 +159,8 @@ class LiveByHand:
             store.add(copy.deepcopy(self._check).finish())
         imu = store.samples()
         if imu is None or len(imu) < 3:
-            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes held still, no sample came yet; check the topic')
+            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes held still, no sample came yet; '
+                                     'check the topic')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
         solved = calibrate_samples_by_hand(recording, self._gravity, self.options.tolerances, provenance, *self._names.values(),
@@ -188,7 +190,8 @@ class LiveByHand:
         bias, matrix = hand.accelerometer
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
         resting_bias, _, sensitivity = hand.gyroscope
-        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ matrix.T, mean.rate_s - resting_bias - gravity_s @ sensitivity.T, mean.frame_id)
+        rate_s = mean.rate_s - resting_bias - gravity_s @ sensitivity.T
+        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ matrix.T, rate_s, mean.frame_id)
 
     def groups(self):
         """Return the GroupState of every effect."""

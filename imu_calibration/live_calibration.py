@@ -31,10 +31,11 @@ class LiveSettings:
     store_samples: int = setting(300_000, '1', 'samples in motion kept for effects that must be linearised anew (table tilt, delays); '
                                  'about 200 bytes each', (0, 100_000_000),
                                  'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so')
-    diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth of the time '
-                                      'at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
+    diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth '
+                                      'of the time at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
                                       'too small: the diagnosis takes a core from other programs')
-    diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each', (1000, 100_000_000),
+    diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each',
+                                     (1000, 100_000_000),
                                      'too small: effects that need the whole session are not found')
 
 

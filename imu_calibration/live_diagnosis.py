@@ -99,19 +99,22 @@ def describe(diagnosis, forgotten=0):
     """Return the DiagnosisState of a Diagnosis: the first finding, or nothing, or what stays unexplained."""
     values = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked, 'older windows not looked at': forgotten}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
-    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor) for sensor, found in diagnosis.unexplained.items() if found.significant}
+    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor)
+               for sensor, found in diagnosis.unexplained.items() if found.significant}
     if not diagnosis.findings:
         nothing = 'nothing found: no effect of the catalogue explains more than noise does'
         return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing, values)
     first = diagnosis.findings[0]
     message = f'{first.effect}: {first.explanation}'
     if first.indistinguishable_from:
-        message += f' This motion cannot tell it from {", ".join(first.indistinguishable_from)}; to separate them: {first.separating_motion}'
+        others = ', '.join(first.indistinguishable_from)
+        message += f' This motion cannot tell it from {others}; to separate them: {first.separating_motion}'
     low, high = first.gain.ci95
     values = {'effect': first.effect, 'sensor': first.sensor, 'explanation': first.explanation,
               **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},
               'p-value': f'{first.p_value:.2g}', 'held-out reduction': f'{first.gain.reduction:.3f}',
-              'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}', 'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
+              'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
+              'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
               'indistinguishable from': ' '.join(first.indistinguishable_from),
               'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]), **values}
     return DiagnosisState(FOUND, message, values)

@@ -180,7 +180,8 @@ def check_the_poses(station, expected):
     assert any('hold it still with' in message and 'not seen yet' in message for message in messages)
     assert any('at rest for' in message for message in messages)
     figures = values_of(station, 'poses')
-    assert int(figures['poses']) == expected.statistics['windows']['static'] and int(figures['turns']) == expected.statistics['windows']['turns']
+    windows = expected.statistics['windows']
+    assert (int(figures['poses']), int(figures['turns'])) == (windows['static'], windows['turns'])
     assert station.status['calibration_node: accelerometer bias'].level == b'\0'
     print(f'by hand, live: {messages[0]} ... {messages[-1]}')
 

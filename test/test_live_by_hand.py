@@ -21,7 +21,8 @@ def blocks(imu, seed=0, mean=20):
 
 def make_live(saved=None, **by_hand):
     """Return a LiveByHand that looks for rest as often as it can."""
-    return LiveByHand(workflow.CalibrationOptions(), LiveSettings(), LiveByHandSettings(**{'gravity': GRAVITY, **by_hand}), saved, lambda: 0.0)
+    settings = LiveByHandSettings(**{'gravity': GRAVITY, **by_hand})
+    return LiveByHand(workflow.CalibrationOptions(), LiveSettings(), settings, saved, lambda: 0.0)
 
 
 def run(live, imu, seed=0):
@@ -206,7 +207,8 @@ def test_without_a_long_rest_the_oldest_go(session):
     assert_same(live.solve(pending=True), offline(live._store.samples()), 1e-4)
 
 
-@pytest.mark.parametrize(('model', 'what'), [('bias+matrix+accel_thermal_bias', 'record a bag'), ('bias+matrix+accel_size_effect', 'table')])
+@pytest.mark.parametrize(('model', 'what'), [('bias+matrix+accel_thermal_bias', 'record a bag'),
+                                             ('bias+matrix+accel_size_effect', 'table')])
 def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, what):
     with pytest.raises(InputError, match=what):
         LiveByHand(workflow.CalibrationOptions(accelerometer_model=model), LiveSettings())

@@ -85,7 +85,8 @@ class CalibrationNode(Node):
         if self._table is not None:
             topics.append((JointState, 'joint_states', self._gatherer.add_joints))
         else:
-            self.get_logger().info("no 'table_file' was given: calibrates by hand, hold the IMU still in many attitudes and turn it in between")
+            self.get_logger().info("no 'table_file' was given: calibrates by hand, hold the IMU still in many attitudes "
+                                   'and turn it in between')
         self._inputs = [BatchSubscription(self, kind, topic, add, qos) for kind, topic, add in topics]
         self.worker.start()
 

@@ -226,7 +226,8 @@ class CalibrationWorker(threading.Thread):
         self._watch.note_counts(counts, now)
         result = self.live.result
         verdict, lines = ('', ()) if result is None else summary(result)
-        values = {'poses' if self._by_hand else 'windows': self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
+        gathered = 'poses' if self._by_hand else 'windows'
+        values = {gathered: self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
             lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: '
                      'calibrate the recording offline']
@@ -235,7 +236,8 @@ class CalibrationWorker(threading.Thread):
         else:
             groups = self.state.groups
         hand, diagnosis = (self.live.status(), None) if self._by_hand else (None, self._diagnosis_state())
-        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values, hand, diagnosis)
+        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values,
+                                 hand, diagnosis)
 
     def _diagnosis_state(self):
         state = self._diagnosis.state
