@@ -169,9 +169,9 @@ def _six_faces(section, folder):
 def _count(section, rows, few):
     for what, table in (('every pose left out once', rows), (f'{FEW} poses for the fit', few)):
         better = [row[-1] for row in table]
-        section.claim(f'norm fit beside ours, {what}', 'whoever predicts better',
+        section.claim(f'poses that took no part, norm fit beside ours, {what}', 'whoever predicts better',
                       f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no difference seen in '
-                      f'{better.count("no difference seen")} of {len(better)}')
+                      f'{better.count("no difference seen")} of {len(better)}', headline=table is rows)
 
 
 def _draw(section, plots, everything):

@@ -20,6 +20,7 @@ from validation.recordings import VARIABLE, data_folder   # noqa: E402
 from validation.section import Section, claims_table, text   # noqa: E402
 
 SECTIONS = ('shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'held_out', 'inspecting', 'diagnosing')
+HEADING = '## How good is it\n'
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
 
@@ -67,6 +68,21 @@ def document(sections):
     return '\n\n'.join(parts + [section.markdown() for section in sections]) + '\n'
 
 
+def update_readme(sections, readme=ROOT / 'README.md'):
+    """Write the README's section with the headlines of this run."""
+    rows = [row for section in sections for row in section.rows]
+    judged = [row for row in rows if row.holds is not None]
+    table = claims_table([row for row in rows if row.headline])
+    new = text('readme', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table)
+    page = readme.read_text()
+    before, _, rest = page.partition(HEADING)
+    _, mark, after = rest.partition('\n## ')
+    if not rest:   # the first time, before the speed
+        before, mark, after = page.partition('\n## Speed')
+        before, mark = before + '\n', '\n## Speed'
+    readme.write_text(before + new + '\n' + mark + after)
+
+
 def main():
     """Run, write, say where."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -86,6 +102,8 @@ def main():
         print('\n\n'.join(section.markdown() for section in sections))
     else:
         (options.output / 'validation.md').write_text(document(sections))
+        if options.output == ROOT / 'docs':
+            update_readme(sections)
         print(f'written: {options.output / "validation.md"}')
     return 0 if all(whole for _, whole in results) else 1
 

@@ -18,6 +18,8 @@ class Row:
     """What this run measured."""
     holds: bool | None = None
     """Whether it holds; None where there is nothing to hold."""
+    headline: bool = False
+    """Whether the README quotes it."""
 
 
 @dataclass
@@ -33,9 +35,9 @@ class Section:
     plots: list = field(default_factory=list)
     """(file name beside the document, caption)."""
 
-    def claim(self, claim, target, found, holds=None):
-        """Add a claim."""
-        self.rows.append(Row(claim, target, found, None if holds is None else bool(holds)))
+    def claim(self, claim, target, found, holds=None, headline=False):
+        """Add a claim; a headline is quoted by the README."""
+        self.rows.append(Row(claim, target, found, None if holds is None else bool(holds), headline))
 
     def say(self, text):
         """Add a paragraph."""
@@ -72,7 +74,8 @@ def text(name, **values):
 def claims_table(rows):
     """Return the table of claims."""
     words = {True: 'yes', False: '**no**', None: ''}
-    return markdown_table(('claim', 'known or wanted', 'found', 'holds'), [(r.claim, r.target, r.found, words[r.holds]) for r in rows])
+    cells = [(row.claim, row.target, row.found, words[row.holds]) for row in rows]
+    return markdown_table(('claim', 'known or wanted', 'found', 'holds'), cells)
 
 
 def markdown_table(head, rows):

@@ -67,7 +67,8 @@ def _claims(section, name, what, calibration, entry, known):
         section.claim(f'{name}, {what}: gain along the shaft', f'{known} within 0.003', f'refused: {calibration}', False)
         return
     gain, sd, lag = gain_and_lag(calibration, entry)
-    section.claim(f'{name}, {what}: gain along the shaft', f'{known} within 0.003', f'{gain:.4f} ± {sd:.4f}', abs(gain - known) < 0.003)
+    section.claim(f'{name}, {what}: gain along the shaft', f'{known} within 0.003', f'{gain:.4f} ± {sd:.4f}',
+                  abs(gain - known) < 0.003, what == 'default')
     if lag is not None:
         section.claim(f'{name}, {what}: lag behind the encoder', '12 to 14 ms', f'{1e3 * lag:.1f} ms', 0.012 <= lag <= 0.014)
     if what == 'default':

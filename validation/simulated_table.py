@@ -115,7 +115,8 @@ def run(folder, plots):
     ratio = np.array([(value - true) / sd for _, value, true, sd, _ in rows])
     asked = [status for name, *_, status in rows if 'size_effect' not in name and 'lever_arm' not in name]
     section.claim('truth of python-ins within three of our standard deviations', f'all {len(rows)} parameters that are not held',
-                  f'largest {np.abs(ratio).max():.1f} sd, rms {np.sqrt(np.mean(ratio**2)):.2f} sd', np.abs(ratio).max() < 3)
+                  f'largest {np.abs(ratio).max():.1f} sd, rms {np.sqrt(np.mean(ratio**2)):.2f} sd', np.abs(ratio).max() < 3,
+                  headline=True)
     section.claim('biases and matrices are all determined', '24 of 24', f'{asked.count("determined")} of 24',
                   asked.count('determined') == 24)
     tilt = [(n, v, s) for n, v, s in zip(calibration.param_names, calibration.values, calibration.sd) if 'table_tilt' in n]
