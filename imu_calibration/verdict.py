@@ -91,8 +91,14 @@ def _ratios(calibration, sensor):
     return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
 
 
+def _quiet(calibration):
+    """Return what residuals in motion are compared with; without a rest only their own slow part is there, and lags show in the fast one."""
+    windows = calibration.statistics.get('windows')
+    return 'the noise at rest' if windows is None or windows.get('static') else 'their slow part (a lag or a late clock leaves that)'
+
+
 def _misfits(calibration):
-    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times the noise at rest: the model leaves something out',
+    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: the model leaves something out',
                    "run 'imu_calibration diagnose' to find the cause")
             for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if ratio > MISFIT]
 
@@ -156,7 +162,7 @@ def _all_well(calibration, tolerances):
     worst = int(np.argmax(share))
     count = sum(requested(n) for n in calibration.param_names)
     fit = [ratio for sensor in SENSORS for ratio in _ratios(calibration, sensor).values()]
-    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times the noise at rest' if fit else ''
+    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {_quiet(calibration)}' if fit else ''
     return Reason(GOOD, f'all {count} parameters are within their tolerance (the closest, {calibration.param_names[worst]}, '
                         f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', or compensator_node")
 
@@ -166,7 +172,7 @@ def _notes(calibration, tolerances):
 
 
 def _loose(calibration):
-    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times the noise at rest',
+    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}',
                    "see 'imu_calibration diagnose' when that matters to you")
             for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
 
