@@ -30,7 +30,8 @@ class BandMisfit:
     def weights(self, white, inflation):
         """Return the factors on ``white * inflation`` for the variance of all rows and of the slow rows, both shape (3,)."""
         unit = white * inflation
-        every = np.maximum.reduce([np.where(self.apart, self.fast, self.overall) / white, np.where(self.apart, 0.0, self.slow) / unit, np.ones(3)])
+        samples, pieces = np.where(self.apart, self.fast, self.overall), np.where(self.apart, 0.0, self.slow)
+        every = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
         return every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every)
 
     def without_fast(self):

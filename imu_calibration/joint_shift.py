@@ -17,8 +17,8 @@ def shifted(motion, delay):
     Return the motion at ``time - delay``, with `time` left as it is: what the IMU felt when its stamps are `delay` late.
 
     Between two stamps the polynomial of degree seven that meets position, rate, acceleration and jerk at both (Hermite), so that
-    the error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps' frequency. Before the first of a run of stamps
-    and after the last, the Taylor series from there, with the jerk as the last derivative.
+    the error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps' frequency. Before the first of a run of
+    stamps and after the last, the Taylor series from there, with the jerk as the last derivative.
 
     Parameters
     ----------
@@ -46,7 +46,8 @@ def _interpolated(time, step, derivatives, target, backwards):
     right = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
     inside = (step[right - 1] <= LINKED) & (target >= time[right - 1]) & (target <= time[right])
     start = right[inside] - 1
-    between = _hermite(derivatives.take(start, axis=1), derivatives.take(start + 1, axis=1), step[start, None], (target[inside] - time[start])[:, None])
+    ends = (derivatives.take(at, axis=1) for at in (start, start + 1))
+    between = _hermite(*ends, step[start, None], (target[inside] - time[start])[:, None])
     if inside.all():
         return between
     moved = np.empty((4, len(target), derivatives.shape[2]))

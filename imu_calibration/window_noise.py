@@ -52,7 +52,7 @@ class WindowNoise:
         return extra_weight(unit * self.kind_scale[kind], unit * self.slow_scale[kind])
 
     def weighs_alike(self, other, change=0.05):
-        """Return whether slow parts count no more than fast ones, or both count as with `other`, to a relative change of their variances."""
+        """Return whether slow parts count no more than fast ones, or both as with `other`, to a relative change of their variances."""
         unit, other_unit = (noise.white_variance * noise.inflation for noise in (self, other))
         for kind, slow in self.slow_scale.items():
             every = self.kind_scale[kind]

@@ -158,8 +158,8 @@ def _cautious(solution):
     """
     Return values to linearise at: those of the solution, but for directions that the recording hardly shows.
 
-    At zero a lag and a delay are the same to first order. What tells them apart, and how far, is only seen from a point where both act; a full
-    step along their difference would lead anywhere. So the step is the solution's with a pull of LINEAR_STEPS towards the point.
+    At zero a lag and a delay are the same to first order. What tells them apart, and how far, is only seen from a point where both act;
+    a full step along their difference would lead anywhere. So the step is the solution's with a pull of LINEAR_STEPS towards the point.
     """
     model, values = solution.model, solution.values
     move, pull = np.zeros(len(values)), np.zeros(len(values))

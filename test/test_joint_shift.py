@@ -41,7 +41,8 @@ def test_nothing_is_drawn_across_a_hole():
     """After a hole the motion is another one, and a rest is a single row."""
     time = np.concatenate([0.01 * np.arange(10), 3.0 + 0.01 * np.arange(10), [7.0]])
     motion = oscillation(time, 1.0)
-    rest = JointMotion(time, *(np.where(time[:, None] > 6.0, 0.5 if name == 'position' else 0.0, getattr(motion, name)) for name in NAMES))
+    resting = (time > 6.0)[:, None]
+    rest = JointMotion(time, *(np.where(resting, 0.5 if name == 'position' else 0.0, getattr(motion, name)) for name in NAMES))
     for delay in (0.013, -0.013):
         late, true = shifted(rest, delay), oscillation(time - delay, 1.0)
         np.testing.assert_allclose(late.position[:-1], true.position[:-1], atol=1e-5)

@@ -46,7 +46,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
 
 @pytest.mark.parametrize('name', ['shaft_pitch_slow', 'shaft_yaw_medium'])
 def test_the_lag_is_the_one_finding(recordings, name):
-    """Found as an offset of the clocks (or the low-pass that is the same to first order), with its gain on held-out windows, and no story beside it."""
+    """Found as an offset of the clocks (or a low-pass, the same to first order), with its gain on held-out windows, and no story beside it."""
     folder = recordings / name
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
 

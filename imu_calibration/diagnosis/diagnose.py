@@ -107,7 +107,8 @@ def investigate(windows, table, model, progress=None):
             break
         attempt = Attempt(used, table, model, asked, attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
-        named = _that_help(attempt, explained.pruned([next(q for q in attempt.questions if q.label == question.label) for question in named]))
+        again = [next(q for q in attempt.questions if q.label == question.label) for question in named]
+        named = _that_help(attempt, explained.pruned(again))
     return Investigation(used, attempt, explained, named, limits, not_testable)
 
 
@@ -122,7 +123,7 @@ def _that_help(attempt, named):
     if np.any(attempt.lifted.kind == 'static'):
         return kept
     while kept:
-        least = [heldout_gain(attempt, [q for q in kept if q is not question], kept, sensors_of(question.effect)).ci95[0] for question in kept]
+        least = [heldout_gain(attempt, [q for q in kept if q is not each], kept, sensors_of(each.effect)).ci95[0] for each in kept]
         if not np.min(least) <= 0.0:
             break
         del kept[int(np.argmin(least))]

@@ -31,7 +31,8 @@ def in_trusted_band(space):
         for axis in range(3):
             totals = [part[moving].sum(axis=0) for part in (space.within[sensor][axis], space.slow[sensor][axis])]
             (left, rank), (left_slow, rank_slow) = (_misfit(total) for total in totals)
-            found = band_misfit(np.full(3, left), (lifted.count[moving] - 1).sum() - rank, np.full(3, left_slow), n_slow[moving].sum() - rank_slow)
+            dofs = (lifted.count[moving] - 1).sum() - rank, n_slow[moving].sum() - rank_slow
+            found = band_misfit(np.full(3, left), dofs[0], np.full(3, left_slow), dofs[1])
             if not found.apart[0] or found.fast[0] < 2.0 * at_rest[axis]:
                 continue
             chosen[axis], parts[axis] = True, space.slow[sensor][axis].copy()

@@ -24,7 +24,7 @@ class Rest:
     significant: bool
     """Whether it stands out of noise and of the wander that every bias has."""
     rms: float
-    """Rms of the windows' means beyond noise, m/s^2 or rad/s."""
+    """Rms beyond noise, m/s^2 or rad/s: of the windows' means, or within windows where only that stands out."""
     sigma: float
     """Standard deviations by which it exceeds noise."""
     correlates_with: str | None
@@ -53,13 +53,16 @@ def _rest(attempt, explained, sensor, excess, values):
     residual = np.stack([space.mean[sensor][axis] @ values[np.r_[space.index[sensor][axis], space.size]] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
     noise_sd = np.sqrt(floor.mean_variance(lifted.kind, lifted.count) + floor.wander_sd**2)
-    sigma = excess[0] / np.sqrt(2 * explained.n_means)
+    sigma = sigma_means = excess[0] / np.sqrt(2 * explained.n_means)
     if excess[1] > WITHIN_SHARE * explained.n_within:
         sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT and explained.chosen.sum() >= LEAST_WINDOWS)
     if not significant:
         return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
+    if sigma_means <= SIGNIFICANT:
+        inside = np.mean([floor.row_variance(kind) for kind in np.unique(lifted.kind[lifted.kind != 'static'])])
+        return Rest(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
     name, share = correlate(_explanations(lifted), residual / noise_sd)
     return Rest(True, rms, float(sigma), name, share, where_most(lifted.time, residual, noise_sd), residual, noise_sd)
 
