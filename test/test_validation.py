@@ -147,7 +147,7 @@ def test_the_truth_of_python_ins_is_recovered():
 @pytest.mark.real_data
 def test_one_imu_predicts_another_live(recordings):
     pytest.importorskip('rclpy')
-    case = arm_live.prepare(recordings, 'array_2', seconds=40.0)
+    case = arm_live.prepare(recordings, 'array_2', 'array_5', seconds=40.0)
     found, count = arm_live.residuals(case, arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1))
     before, after = arm_live.rms(found['turned']), arm_live.rms(found['moved'])
     print(f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the arm {after:.2f} wanted 0.65 of it')

@@ -59,19 +59,19 @@ class Case:
         return tuple((-mat_ba @ self.arm.arm).tolist()), tuple(Rotation.from_matrix(mat_ba).as_euler('xyz').tolist())
 
 
-def prepare(folder, name, pair=PAIR, seconds=STRETCH_S):
-    """Return the Case of the last `seconds` of a recording; calibrations and arm come from the whole of it."""
+def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
+    """Return the Case of the last `seconds` of a recording; calibrations come from its poses, the arm from the recording `arm_from`."""
     topics = [f'/imu_{k}/data_raw' for k in pair]
     imus = [load(folder, name, topic) for topic in topics]
     found = []
     for topic in topics:
         with open_recording(folder / name, topic, want_joints=False) as recording:
             found.append(calibrate_recording_by_hand(recording.blocks())[:2])
-    arm = estimate_arm(*imus)
+    arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
     a, b = imus
     part = a.select(a.stamp_ns > a.stamp_ns[-1] - int(seconds * 1e9))
     origin = a.stamp_ns[0]
-    time_b = 1e-9 * (b.stamp_ns - origin) - arm.time_offset
+    time_b = 1e-9 * (b.stamp_ns - origin)
     time_a = 1e-9 * (part.stamp_ns - origin)
     force_b = found[1][1].compensate(b.force_s, b.rate_s)[0]
     force_b = np.stack([np.interp(time_a, time_b, force_b[:, k]) for k in range(3)], axis=1)
@@ -199,7 +199,7 @@ def run(folder, plots):
         return section
     rows, bins, case, found = [], [], None, None
     for name in NAMES:
-        case = prepare(folder, name)
+        case = prepare(folder, name, arm_from=NAMES[1 - NAMES.index(name)])
         found, count = residuals(case, play(case))
         before, after, ahead = rms(found['turned']), rms(found['moved']), looking_ahead(case)
         lost = 2 * len(case.imu_a) - sum(count.values())

@@ -111,11 +111,11 @@ def _xsens(section, document):
 
 
 def _shaft(section, name, document):
-    claim, wanted = f'{name}: the lag is found by itself', 'time_offset or gyro_bandwidth, together 12 to 14 ms'
+    claim, wanted = f'{name}: the lag is found by itself', 'time_offset or gyro_bandwidth, together 12 to 14 in whole ms'
     if isinstance(document, str):
         section.claim(claim, wanted, document, False)
         return
     lags = [finding for finding in document['findings'] if finding['effect'] in ('time_offset', 'gyro_bandwidth')]
     shown = '; '.join(f'{found_text(finding)}, gain {gain_text(finding)}' for finding in lags) or 'not found'
     lag = sum(parameter['value'] for finding in lags for parameter in finding['parameters'].values())
-    section.claim(claim, wanted, f'{1e3 * lag:.1f} ms: {shown}', 0.012 <= lag <= 0.014, headline=True)
+    section.claim(claim, wanted, f'{1e3 * lag:.1f} ms: {shown}', 12 <= round(1e3 * lag) <= 14, headline=True)
