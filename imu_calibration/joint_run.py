@@ -4,6 +4,7 @@ import numpy as np
 
 from imu_calibration.joint_motion import fit_joint_curve
 from imu_calibration.joint_phases import MOVING, STILL, joint_phases
+from imu_calibration.smoothing import encoder_step
 
 LEAST_READINGS = 4
 """Fewer say too little about the motion."""
@@ -16,6 +17,7 @@ class JointRun:
         self.time, self.position, self.velocity = time, position, velocity
         self.phase, self.level = joint_phases(time, position, settings, noise_rad)
         self._moving = time[self.phase != STILL]
+        self.step = np.array([encoder_step(column) for column in position.T])
 
     def covered(self, time, before, after):
         """Tell which instants lie between the readings or, where the joints rest, within two periods of the first or last."""

@@ -133,7 +133,7 @@ class MotionChunks:
         time = (imu.stamp_ns - self._start_ns) / 1e9
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
         runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
-        phase, level = self._phases(time, runs, final)
+        phase, level, joint_step = self._phases(time, runs, final)
         quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor,
                               phase == STILL)
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
@@ -143,7 +143,7 @@ class MotionChunks:
         temperature = self._temperatures(imu.stamp_ns[core], stop_ns + self._margin_ns)
         return self._without_lost(PhasedSamples(
             imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, temperature, phase[core],
-            quiet[core], after_gap, np.zeros(len(after_gap), bool)), self._at_edge(imu.stamp_ns[core], limit, final))
+            quiet[core], after_gap, np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):
         """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
@@ -160,14 +160,16 @@ class MotionChunks:
         return runs, limit
 
     def _phases(self, time, runs, final):
-        """Return the phase of each IMU sample and the level of the joints there."""
+        """Return the phase of each IMU sample, the level of the joints there and the steps of their encoders."""
         phase = np.full(len(time), LOST, np.int8)
         level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
+        steps = np.zeros(level.shape)
         for k, run in enumerate(runs):
             first = self._first_joint_ns is not None and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
             inside = run.covered(time, before=first, after=final and k == len(runs) - 1)
             phase[inside], level[inside] = run.at(time[inside])
-        return phase, level
+            steps[inside] = run.step
+        return phase, level, steps
 
     def _draw_curves(self, motion, time, phase, runs):
         """Put the joints' motion on the samples near which joints move."""

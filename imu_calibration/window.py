@@ -28,6 +28,8 @@ class Window:
     """Temperature at the samples, degrees Celsius, shape (n,), or None."""
     reason: str = ''
     """Why the window is 'unused'."""
+    joint_step: np.ndarray | None = None
+    """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
 
     def __len__(self):
         return len(self.time)
@@ -74,6 +76,8 @@ class PhasedSamples(_Columns):
     """Whether a window cannot go on from the sample before, shape (n,)."""
     after_loss: np.ndarray
     """Whether the joints were unknown just before, shape (n,)."""
+    joint_step: np.ndarray
+    """Steps of the encoders, rad, zero where none show, shape (n, n_joints)."""
 
 
 def make_window(samples, kind, reason=''):
@@ -81,7 +85,7 @@ def make_window(samples, kind, reason=''):
     temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
     moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk)
     motion = _mean_motion(samples) if kind == 'static' else moving
-    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason)
+    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason, samples.joint_step.max(axis=0))
 
 
 def _mean_motion(samples):

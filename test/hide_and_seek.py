@@ -28,7 +28,7 @@ from imu_calibration.diagnosis.diagnose import investigate  # noqa: E402
 from imu_calibration.diagnosis.gain import heldout_gain  # noqa: E402
 from imu_calibration.diagnosis.stories import sensors_of  # noqa: E402
 
-FIRST_SEED = 5000
+FIRST_SEED = 7000
 """Seeds from here on were never used while the search was developed."""
 PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power')
 DEG = np.pi / 180

@@ -114,12 +114,17 @@ def investigate(windows, table, model, progress=None):
 
 def _that_help(attempt, named):
     """
-    Return the findings that are physically possible, and, where no rest tells the noise, lower the plain residual of locked windows.
+    Return the findings that are possible and predict the locked windows better, one at a time the least helpful taken out.
 
     Without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes evidence of anything that
-    goes with it.
+    goes with it: there the plain residual of the locked windows must fall.
     """
     kept = [question for question in named if attempt.search.allowed(named, question)]
+    while kept:
+        helps = [attempt.locked_gain(kept, question) for question in kept]
+        if min(helps) >= 0.0:
+            break
+        del kept[int(np.argmin(helps))]
     if np.any(attempt.lifted.kind == 'static'):
         return kept
     while kept:

@@ -66,12 +66,12 @@ class Evidence:
 
     def loss(self, used):
         """Return the loss of the best fit on all chosen windows."""
-        return _quadratic(self.total, np.asarray(used), self.fit(used)[0])
+        return quadratic(self.total, np.asarray(used), self.fit(used)[0])
 
     def heldout_losses(self, used):
         """Return the loss of each fold under the fit to the other folds, shape (n_folds,)."""
         index = np.asarray(used)
-        return np.array([_quadratic(part, index, self.fit(used, number)[0]) for number, part in enumerate(self.parts)])
+        return np.array([quadratic(part, index, self.fit(used, number)[0]) for number, part in enumerate(self.parts)])
 
     def heldout(self, used):
         """Return the loss on held-out windows, all folds."""
@@ -114,6 +114,8 @@ class Evidence:
         return {sensor: white_means(self.space, self.noise, sensor) for sensor in SENSORS}
 
 
-def _quadratic(normal, used, values):
+def quadratic(normal, used, values):
+    """Return the loss of `values` of the parameters `used` under a normal matrix."""
+    used = np.asarray(used)
     inner = normal[np.ix_(used, used)]
     return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ inner @ values)

@@ -51,8 +51,8 @@ class Score:
 class Search:
     """Forward selection with reconsideration over a fixed set of questions."""
 
-    def __init__(self, evidence, baseline, questions):
-        self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
+    def __init__(self, evidence, baseline, questions, encoder_step=0.0):
+        self.evidence, self.baseline, self.questions, self.encoder_step = evidence, tuple(baseline), questions, encoder_step
         self.n_effects = max(len({q.name for q in questions}), 1)
         self.history = []
 
@@ -77,12 +77,15 @@ class Search:
         return Score(question, gain, p_value, self.allowed(chosen + [question], question))
 
     def allowed(self, chosen, question):
-        """Return whether the effect's estimate is physically possible: a lag is not negative, and no size is absurd."""
+        """Return whether the effect's estimate is possible: a lag is not negative, no size is absurd, no angle within half an encoder step."""
         used = self.used(chosen)
         values, inverse = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
         value, sd = values[places], np.sqrt(np.diag(inverse)[places])
         if question.effect.name.endswith('_bandwidth') and value[0] < 0:
+            return False
+        # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
+        if question.effect.unit == 'rad' and np.all(np.abs(value) < 0.5 * self.encoder_step):
             return False
         largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
         return bool(np.all(np.abs(value) - 3 * sd < KNOWN.get(question.name, ABSURD) * largest))

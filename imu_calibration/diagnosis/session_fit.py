@@ -3,7 +3,7 @@
 import numpy as np
 
 from imu_calibration.diagnosis.candidates import extended_model, time_constants
-from imu_calibration.diagnosis.evidence import Evidence, folds_of, locked_windows
+from imu_calibration.diagnosis.evidence import Evidence, folds_of, locked_windows, quadratic
 from imu_calibration.diagnosis.lifted import lift, rebased
 from imu_calibration.diagnosis.search import Search
 from imu_calibration.diagnosis.session_noise import first_noise, normal_matrix, saturated_noise, solve_normal
@@ -33,7 +33,7 @@ class Attempt:
         self.noise = saturated_noise(self.space, smooth_parameters(self.questions))
         self.locked = locked_windows(lifted.kind)
         self.evidence = Evidence(self.space, self.noise, folds_of(lifted.kind, self.locked))
-        self.search = Search(self.evidence, used, self.questions)
+        self.search = Search(self.evidence, used, self.questions, encoder_step(windows))
 
     @property
     def lifted(self):
@@ -60,6 +60,13 @@ class Attempt:
             if weight * _curvature(question, values, model)**2 > 4.0:
                 return True
         return False
+
+    def locked_gain(self, chosen, question):
+        """Return by how much an effect of a choice raises the log likelihood of the locked windows, fitted to the others, nats."""
+        normal = normal_matrix(self.space, self.noise, self.locked)
+        rest = [q for q in chosen if q is not question]
+        losses = [quadratic(normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
+        return 0.5 * (losses[0] - losses[1])
 
     def acts_beside(self, chosen):
         """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
@@ -103,6 +110,11 @@ class Attempt:
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
+
+
+def encoder_step(windows):
+    """Return the largest step of the encoders that shows in the readings, rad; 0 where none does."""
+    return max((float(np.max(w.joint_step)) for w in windows if w.joint_step is not None), default=0.0)
 
 
 def baseline_parameters(baseline, model):

@@ -24,7 +24,7 @@ def verdict_of(name, alone, beside, found, mates):
     if name in mates:
         return f'as good as {mates[name]}'
     if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
-        return 'refused: its size would be impossible'
+        return 'refused: its size is impossible, or within the steps of the encoders'
     if beside is not None and beside.significant:
         return 'refused: it leaves most of the unexplained where it was'
     if alone.significant:
