@@ -7,21 +7,19 @@ import numpy as np
 from imu_calibration.by_hand import ByHandSettings, HandCalibration, solve_by_hand
 from imu_calibration.by_hand_model import possible_by_hand
 from imu_calibration.diagnosis.candidates import TEMPERATURE_SPAN, Question, time_constants
-from imu_calibration.diagnosis.gain import Gain, Traces, reduction_interval
+from imu_calibration.diagnosis.gain import Gain, reduction_interval
 from imu_calibration.diagnosis.hand_evidence import HandEvidence
+from imu_calibration.diagnosis.hand_result import as_solution, rest_of, traces_of
 from imu_calibration.diagnosis.hand_rows import BASE, build_rows
 from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.search import Search
 from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.diagnosis.separation import motions_of
-from imu_calibration.diagnosis.stories import SIGNIFICANT_REST, needed_share
-from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Rest, correlate, slow_explanations, where_most
+from imu_calibration.diagnosis.stories import SIGNIFICANT_REST, pruned
 from imu_calibration.diagnosis.verdicts import verdict_of
 from imu_calibration.effects import catalogue
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
-from imu_calibration.estimation import Solution
-from imu_calibration.window_noise import WindowNoise
 
 OUTER = 12
 """Times that the whole search is repeated without some of the poses, to measure the gain on them."""
@@ -55,18 +53,7 @@ class _Inquiry:
 
     def named(self):
         """Return the findings: chosen, and each explaining most of what was unexplained."""
-        return self.pruned(self.search.run())
-
-    def pruned(self, chosen):
-        """Return the choice without effects that leave most of a significant rest where it was, weakest first."""
-        chosen = list(chosen)
-        while chosen:
-            shares = [self.share(chosen, q) / needed_share(q) for q in chosen]
-            weakest = int(np.argmin(shares))
-            if shares[weakest] >= 1.0:
-                break
-            chosen = chosen[:weakest] + chosen[weakest + 1:]
-        return chosen
+        return pruned(self.search.run(), self.share)
 
     def share(self, chosen, question):
         """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
@@ -255,8 +242,8 @@ def _assembled(baseline, hand, inquiry, named, held_out, not_testable):
     sensors = [q.sensor for q in named] or ['accelerometer']
     gain = _gain(inquiry, held_out, [], named, sensors[0]) if named else None
     count = len(baseline.poses.start)
-    return Diagnosis(findings, {s: _rest(baseline, inquiry, named, s) for s in SENSORS}, _candidates(inquiry, named), tuple(not_testable), before, after,
-                     gain, _traces(baseline, hand), count, count if named else 0)
+    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, s) for s in SENSORS}, _candidates(inquiry, named), tuple(not_testable), before, after,
+                     gain, traces_of(baseline, hand), count, count if named else 0)
 
 
 def _finding(inquiry, named, place, held_out, solution):
@@ -282,73 +269,3 @@ def _candidates(inquiry, named):
         rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain, beside and beside.p_value,
                                         verdict_of(question.name, alone, beside, found, mates))
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
-
-
-def as_solution(hand):
-    """Return a HandCalibration as the `Solution` that documents and reports know."""
-    model = hand.model.model
-    order = [hand.param_names.index(name) for name in model.param_names]
-    held = np.array([hand.statuses[k] == 'held' for k in order])
-    information = np.zeros((len(order), len(order)))
-    own = [model.param_names.index(name) for name in hand.model.param_names]
-    information[np.ix_(own, own)] = hand.information
-    found, noise, rms, chi2 = hand.statistics, {}, {}, {}
-    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
-    for sensor, key, scatter in (('accelerometer', 'force', 'pose'), ('gyroscope', 'rate', 'drift')):
-        white = np.square(found[f'{key}_noise_sd'])
-        noise[sensor] = WindowNoise(white, np.square(found[f'{key}_noise_colour']), found[f'{scatter}_scatter_sd'])
-        rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
-        chi2[sensor] = {'mean': None}
-    return Solution(model, hand.values[order], hand.covariance[np.ix_(order, order)], held, noise, chi2, information, rms)
-
-
-def _rates_left(hand):
-    """Return the rates at rest that the model leaves, shape (k, 3)."""
-    poses, true = hand.poses, hand.gravity * hand.state.up
-    more = hand.model.further('gyroscope', hand.state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)[0]
-    return poses.rate - hand.gyroscope[0] - more
-
-
-def _traces(baseline, hand):
-    poses = hand.poses
-    true = hand.gravity * hand.state.up
-    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': _rates_left(h)} for h in (baseline, hand)]
-    count = len(poses.start)
-    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, *errors,
-                  (poses.stop - poses.start).astype(float), None)
-
-
-def _rest(hand, inquiry, named, sensor):
-    """Return what stays unexplained of one sensor: its rows at rest and its turns against what noise leaves."""
-    used = inquiry.search.used(named)
-    residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
-    for block, residual in zip(inquiry.blocks, residuals):
-        if block.sensor != sensor:
-            continue
-        spare = len(residual) - np.linalg.matrix_rank(block.rows[:, list(used)])
-        if spare < 3:
-            continue
-        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
-        if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
-            excess = np.sum(residual**2) / spare - np.mean(block.floor)
-            if own > sigma:
-                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
-    count = len(hand.poses.start)
-    first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
-    layers = residuals[first].reshape(count, -1)
-    noise_sd = np.sqrt(inquiry.blocks[first].floor).reshape(count, -1)
-    significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
-    if not significant:
-        return Rest(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)
-    name, share = correlate(_explanations(hand), layers / noise_sd)
-    if chosen is not None and chosen.name == 'turns' and name is None:
-        name = 'motion (turns between poses)'
-    return Rest(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd)
-
-
-def _explanations(hand):
-    poses, up = hand.poses, hand.state.up
-    every = np.ones(len(up), bool)
-    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
-    yield 'direction of gravity', up, every
-    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2], up[:, 0] * up[:, 2]], axis=1), every

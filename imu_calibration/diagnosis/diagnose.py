@@ -12,7 +12,7 @@ from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, para
 from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.diagnosis.separation import separating_motion
 from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
-from imu_calibration.diagnosis.stories import Explained, sensors_of
+from imu_calibration.diagnosis.stories import Explained, pruned, sensors_of
 from imu_calibration.diagnosis.unexplained import unexplained
 from imu_calibration.diagnosis.verdicts import verdict_of
 from imu_calibration.effects import find_effect
@@ -101,14 +101,14 @@ def investigate(windows, table, model, progress=None):
     chosen = [question for question in chosen if '@' not in question.label]
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
-    named = _that_help(attempt, explained.pruned(chosen))
+    named = _that_help(attempt, pruned(chosen, explained.share))
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
         attempt = Attempt(used, table, model, asked, attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
         again = [next(q for q in attempt.questions if q.label == question.label) for question in named]
-        named = _that_help(attempt, explained.pruned(again))
+        named = _that_help(attempt, pruned(again, explained.share))
     return Investigation(used, attempt, explained, named, limits, not_testable)
 
 

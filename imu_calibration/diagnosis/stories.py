@@ -57,16 +57,17 @@ class Explained:
         # A cause of the table shows in both sensors; where it hardly shows it proves nothing.
         return min(value / (value + self.rest(with_it[s])) for s, value in removed.items() if value >= 0.2 * strongest)
 
-    def pruned(self, chosen):
-        """Return the choice without effects that remove too little, weakest first."""
-        chosen = list(chosen)
-        while chosen:
-            shares = [self.share(chosen, q) / needed_share(q) for q in chosen]
-            weakest = int(np.argmin(shares))
-            if shares[weakest] >= 1.0:
-                break
-            chosen = chosen[:weakest] + chosen[weakest + 1:]
-        return chosen
+
+def pruned(chosen, share):
+    """Return the choice without effects that remove too little, weakest first; `share(chosen, question)` says how much each removes."""
+    chosen = list(chosen)
+    while chosen:
+        shares = [share(chosen, question) / needed_share(question) for question in chosen]
+        weakest = int(np.argmin(shares))
+        if shares[weakest] >= 1.0:
+            break
+        chosen = chosen[:weakest] + chosen[weakest + 1:]
+    return chosen
 
 
 def needed_share(question):
