@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hand_sessions import GRAVITY, simulate
 
-from imu_calibration.by_hand import gather_by_hand
+from imu_calibration.by_hand import ByHandSettings, gather_by_hand, solve_by_hand
 from imu_calibration.diagnosis import to_mapping
 from imu_calibration.diagnosis.by_hand import diagnose_by_hand
 from imu_calibration.errors import NotObservableError
@@ -57,6 +57,21 @@ def test_sizes_agree_with_what_was_hidden(responding):
     for name, true in (('xy', 3e-4), ('yx', -4e-4), ('zz', 5e-4), ('xx', 0.0)):
         value, sd, _ = parameters[f'gyroscope.gyro_g_sensitivity.{name}']
         assert abs(value - true) < 4.5 * sd and sd < 1e-4
+
+
+def test_the_turns_tell_apart_what_is_one_to_the_norm():
+    """a_y a_z in x, a_x a_z in y and a_x a_y in z change the norm alike; the directions that the gyroscope carries along do not."""
+    def spoil(f, w, t, k):
+        return 15 * MG / 9.8**2 * np.stack([f[:, 1] * f[:, 2], 0 * t, 0 * t], axis=1), NOTHING
+    imu, ranges, _ = simulate(36, n_poses=36, spoil=spoil)
+    data = gather_by_hand(imu, ranges)
+    result = diagnose_by_hand(data, GRAVITY)
+    assert result.diagnosis.findings[0].effect == 'accel_cross_product'
+    for name, true in (('x_yz', 15 * MG / 9.8**2), ('y_xz', 0.0), ('z_xy', 0.0)):
+        full = f'accelerometer.accel_cross_product.{name}'
+        assert abs(result.hand.value(full) - true) < 4.5 * result.hand.sd_of(full) and result.hand.sd_of(full) < 2 * MG / 9.8**2
+    alone = solve_by_hand(data.poses, [], GRAVITY, 0.0, ByHandSettings(), data.statistics, accelerometer=('bias', 'matrix', 'accel_cross_product'))
+    assert alone.sd_of('accelerometer.accel_cross_product.x_yz') > 10 * result.hand.sd_of('accelerometer.accel_cross_product.x_yz')
 
 
 @pytest.mark.slow

@@ -15,6 +15,8 @@ WANDERS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Wander of the bias that is tried, in units of offset and noise together."""
 TIMES = (100.0, 300.0)
 """Its correlation times, s."""
+ALIKE = 0.1
+"""Columns that differ by less than this count as one."""
 UNIQUE = 0.2
 """Least sine of the angle between a column and what the baseline explains for the column to count."""
 
@@ -116,7 +118,7 @@ class HandEvidence:
     def rank(self, added, smaller):
         """Return how many combinations of the added columns the smaller choice cannot imitate."""
         white = np.concatenate(self._white)
-        known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)])
+        known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)], ALIKE)
         if not new.shape[1]:
             return 0
         sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
@@ -127,14 +129,14 @@ def _alive(block, columns):
     return [k for k in columns if np.any(block.rows[:, k])]
 
 
-def _basis(columns):
-    """Return an orthonormal basis of the span of columns, which may be empty or dependent."""
+def _basis(columns, least=1e-9):
+    """Return an orthonormal basis of the span of columns, which may be empty or dependent: singular values above `least` of the largest count."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.shape[1]:
         return columns
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > 1e-9 * singular[0]]
+    return left[:, singular > least * singular[0]]
 
 
 def _covariance(block, used):
