@@ -99,10 +99,11 @@ def test_the_wander_goes_on_from_block_to_block():
 
 
 def test_parameter_files_hold_the_defaults_of_the_settings():
+    from imu_calibration.live_by_hand import LiveByHandSettings
     from imu_calibration.nodes.bag_player_node import PlayerSettings
     from imu_calibration.nodes.calibration_node import CalibrationNodeSettings
     from imu_calibration.nodes.simulator_node import SimulatorSettings
-    groups = {'calibration_node': (CalibrationNodeSettings, LiveSettings, WindowSettings), 'simulator_node': (SimulatorSettings,),
+    groups = {'calibration_node': (CalibrationNodeSettings, LiveByHandSettings, LiveSettings, WindowSettings), 'simulator_node': (SimulatorSettings,),
               'bag_player_node': (PlayerSettings,)}
     for name, settings in groups.items():
         written = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
