@@ -3,8 +3,10 @@
 import os
 from pathlib import Path
 
-import pytest
-from hypothesis import HealthCheck, settings
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')   # before numpy comes: threads that wait for each other take minutes on a busy machine
+
+import pytest  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples every time, and no failure because the machine is busy.
 settings.register_profile('suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -19,6 +19,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
 import numpy as np  # noqa: E402
+from hide_and_seek_figures import write_figures  # noqa: E402
 from hide_and_seek_report import report  # noqa: E402
 from hiding import Sizes, all_effects, options_of, record  # noqa: E402
 from physics_draw import OUTSIDE  # noqa: E402
@@ -140,7 +141,7 @@ def power_of_seed(seed, noise, effects, factors):
     return rows
 
 
-EFFECTS_PER_TASK = 7
+EFFECTS_PER_TASK = 13
 
 
 def tasks_of(options):
@@ -194,6 +195,7 @@ def main(arguments=None):
     else:
         rows = _work(tasks_of(options), options)
     report(rows, options.docs)
+    write_figures(rows, options.docs)
     return 0
 
 

@@ -11,6 +11,10 @@ from imu_calibration.sensor_model import coefficient_jacobian, coefficients, col
 
 MARGIN = 4.0
 """Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
+AGREEMENT = 0.25
+"""Least sum of the chances of being beyond the limit over clipped samples, as a share of what it is when they are clipped by that chance.
+
+Near one g at rest only the tails of the noise are cut: a right limit then gives each of the samples a chance of a tenth."""
 LEAST_CLIPPED = 4
 SHORTEST = 20
 """A window with fewer samples left is dropped."""
@@ -127,8 +131,7 @@ def find_saturation(windows, predicted, noise_sd, sensor):
     clipped = np.abs(output) >= level * (1 - 1e-12)
     beyond = norm.sf((level - np.abs(expected)) / noise_sd)
     n_expected = float(beyond.sum())
-    agree = float(beyond[clipped].sum())
-    if n_expected < LEAST_CLIPPED or agree < 0.25 * clipped.sum():
+    if n_expected < LEAST_CLIPPED or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
         return None
     far = np.abs(expected) > level
     before, after = output - expected, output - np.clip(expected, -level, level)
