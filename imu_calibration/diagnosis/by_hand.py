@@ -6,18 +6,17 @@ import numpy as np
 
 from imu_calibration.by_hand import ByHandSettings, HandCalibration, solve_by_hand
 from imu_calibration.by_hand_model import possible_by_hand
-from imu_calibration.diagnosis.candidates import TEMPERATURE_SPAN, Question, time_constants
+from imu_calibration.diagnosis.candidates import TEMPERATURE_SPAN, Question, sort_effects, time_constants
 from imu_calibration.diagnosis.gain import Gain, reduction_interval
 from imu_calibration.diagnosis.hand_evidence import HandEvidence
 from imu_calibration.diagnosis.hand_result import as_solution, rest_of, traces_of
 from imu_calibration.diagnosis.hand_rows import BASE, build_rows
-from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
+from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.search import Search
 from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.diagnosis.separation import motions_of
 from imu_calibration.diagnosis.stories import SIGNIFICANT_REST, pruned
-from imu_calibration.diagnosis.verdicts import verdict_of
-from imu_calibration.effects import catalogue
+from imu_calibration.diagnosis.verdicts import candidates_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
 
@@ -105,7 +104,7 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
         raise NotObservableError(f'a diagnosis by hand needs at least {9 + SPARE} poses held still, so that some can be held out, '
                                  f'{len(poses.start)} were found; hold the IMU still in more attitudes')
     baseline = solve_by_hand(poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
-    effects, not_testable = _testable(baseline, poses, data.turns)
+    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, data.statistics, effects, constants)
     report(0.1)
@@ -129,21 +128,6 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
 
 def _held(hand):
     return np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == 'held' for name in hand.model.param_names])
-
-
-def _testable(hand, poses, turns):
-    """Return (effects that can be asked about, {'effect', 'why', 'needs'} of the others)."""
-    have = {(e.sensor, e.name) for e in hand.model.model.effects}
-    known, lacking = [], []
-    for key, effect in catalogue().items():
-        if key in have:
-            continue
-        why = _why_not(effect, poses, turns)
-        if why is None:
-            known.append(effect)
-        else:
-            lacking.append({'effect': effect.name, 'why': why[0], 'needs': why[1]})
-    return known, lacking
 
 
 def _why_not(effect, poses, turns):
@@ -180,12 +164,12 @@ def _questions(effects, blocks, space, base, not_testable):
 def _held_out(inquiry, report):
     """Return fold -> (poses, what was named without them, evidence without them): the whole search, repeated."""
     poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
-    found = []
-    for number in range(min(OUTER, len(poses))):
-        out = poses[number::min(OUTER, len(poses))]
+    found, times = [], min(OUTER, len(poses))
+    for number in range(times):
+        out = poses[number::times]
         smaller = inquiry.without(out)
         found.append((out, smaller.named(), smaller))
-        report(0.3 + 0.6 * (number + 1) / min(OUTER, len(poses)))
+        report(0.3 + 0.6 * (number + 1) / times)
     return found
 
 
@@ -242,7 +226,7 @@ def _assembled(baseline, hand, inquiry, named, held_out, not_testable):
     sensors = [q.sensor for q in named] or ['accelerometer']
     gain = _gain(inquiry, held_out, [], named, sensors[0]) if named else None
     count = len(baseline.poses.start)
-    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, s) for s in SENSORS}, _candidates(inquiry, named), tuple(not_testable), before, after,
+    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, s) for s in SENSORS}, candidates_of(inquiry.search, named), tuple(not_testable), before, after,
                      gain, traces_of(baseline, hand), count, count if named else 0)
 
 
@@ -255,17 +239,3 @@ def _finding(inquiry, named, place, held_out, solution):
     gain = _gain(inquiry, held_out, named[:place], named[:place + 1], question.sensor)
     return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
                    inquiry.share(named, question), gain, tuple(mate.name for mate, _ in mates), motions_of(question, mates[0][0]) if mates else '')
-
-
-def _candidates(inquiry, named):
-    search, rows = inquiry.search, {}
-    found = {q.name for q in named}
-    mates = {mate.name: q.name for q in named for mate, _ in search.class_mates(named, q)}
-    for question in inquiry.questions:
-        alone = search.score([], question)
-        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
-            continue
-        beside = None if question.name in found else search.score(named, question)
-        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain, beside and beside.p_value,
-                                        verdict_of(question.name, alone, beside, found, mates))
-    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))

@@ -53,12 +53,22 @@ def testable_effects(model, table, windows):
     """
     kinds = {window.kind for window in windows}
     span = _temperature_span(windows)
+    have = {(e.sensor, e.name) for e in model.effects}
+    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span))
+
+
+def sort_effects(model, why_not):
+    """
+    Return (effects that can be asked about, list of {'effect', 'why', 'needs'}) of the catalogue's that the model lacks.
+
+    ``why_not(effect)`` gives (why, needs), or None for what can be asked about.
+    """
     known, lacking = [], []
     have = {(e.sensor, e.name) for e in model.effects}
     for key, effect in catalogue(tuple(model.joint_names)).items():
         if key in have:
             continue
-        why = _why_not(effect, have, table, kinds, span)
+        why = why_not(effect)
         if why is None:
             known.append(effect)
         else:

@@ -8,13 +8,13 @@ from imu_calibration.diagnosis import censoring
 from imu_calibration.diagnosis.candidates import testable_effects
 from imu_calibration.diagnosis.extended import extended_solution
 from imu_calibration.diagnosis.gain import Gain, heldout_gain, residual_traces
-from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding, parameters_of
+from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.diagnosis.separation import separating_motion
 from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
 from imu_calibration.diagnosis.stories import Explained, pruned, sensors_of
 from imu_calibration.diagnosis.unexplained import unexplained
-from imu_calibration.diagnosis.verdicts import verdict_of
+from imu_calibration.diagnosis.verdicts import candidates_of
 from imu_calibration.effects import find_effect
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
@@ -169,7 +169,7 @@ def _assembled(windows, table, found):
     for place in range(len(named)):
         findings.append(_finding(attempt, found.explained, named, place, solution, table))
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), _candidates(attempt, named), tuple(found.not_testable),
+    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named), tuple(found.not_testable),
                      baseline, solution, heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution),
                      len(found.used), int(attempt.locked.sum()))
 
@@ -193,20 +193,3 @@ def _clipping(limit, solution):
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
     return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value,
                    limit.n_expected, 1.0, gain, (), '')
-
-
-def _candidates(attempt, named):
-    """Return every effect that was asked about, the strongest first."""
-    found, mates = {q.name for q in named}, {}
-    for question in named:
-        for mate, _ in attempt.search.class_mates(named, question):
-            mates.setdefault(mate.name, question.name)
-    rows = {}
-    for question in attempt.questions:
-        alone = attempt.search.score([], question)
-        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
-            continue
-        beside = None if question.name in found else attempt.search.score(named, question)
-        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain,
-                                        beside and beside.p_value, verdict_of(question.name, alone, beside, found, mates))
-    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))

@@ -98,12 +98,8 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
     reference = hand.model.model.temperature_ref_c
     model = HandModel(SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=reference, point=point), hand.gravity)
-    values = model.nominal.copy()
     known = dict(zip(hand.model.param_names, hand.state.values))
-    values[:] = [known.get(name, value) for name, value in zip(model.param_names, values)]
-    if tau is None and effect.components[-1] != 'time_constant':
-        return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]
-    values[-1] = tau
+    values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
     return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]
 
 

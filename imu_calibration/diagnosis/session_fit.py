@@ -1,5 +1,7 @@
 """The recording reduced around a point of linearisation, the search on it, and the decision whether to linearise anew."""
 
+from functools import cached_property
+
 import numpy as np
 
 from imu_calibration.diagnosis.candidates import extended_model, time_constants
@@ -61,11 +63,14 @@ class Attempt:
                 return True
         return False
 
+    @cached_property
+    def _locked_normal(self):
+        return normal_matrix(self.space, self.noise, self.locked)
+
     def locked_gain(self, chosen, question):
         """Return by how much an effect of a choice raises the log likelihood of the locked windows, fitted to the others, nats."""
-        normal = normal_matrix(self.space, self.noise, self.locked)
         rest = [q for q in chosen if q is not question]
-        losses = [quadratic(normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
+        losses = [quadratic(self._locked_normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
         return 0.5 * (losses[0] - losses[1])
 
     def acts_beside(self, chosen):

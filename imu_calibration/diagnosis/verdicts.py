@@ -1,6 +1,23 @@
 """What is said of each effect that was asked about."""
 
+from imu_calibration.diagnosis.result import Candidate
 from imu_calibration.diagnosis.search import FAMILY_WISE
+
+
+def candidates_of(search, named):
+    """Return every effect that a search asked about beside the findings, the strongest first; of a warm-up its best time constant."""
+    found, mates, rows = {question.name for question in named}, {}, {}
+    for question in named:
+        for mate, _ in search.class_mates(named, question):
+            mates.setdefault(mate.name, question.name)
+    for question in search.questions:
+        alone = search.score([], question)
+        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
+            continue
+        beside = None if question.name in found else search.score(named, question)
+        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain,
+                                        beside and beside.p_value, verdict_of(question.name, alone, beside, found, mates))
+    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 
 def verdict_of(name, alone, beside, found, mates):
