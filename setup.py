@@ -40,7 +40,7 @@ setup(
     maintainer='imu_calibration maintainers',
     maintainer_email='imu_calibration@users.noreply.github.com',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_adapters', 'msg_adapters.*']),
-    package_data={NAME: ['templates/*']},
+    package_data={f'{NAME}.report': ['templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -57,7 +57,7 @@ setup(
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={
         'console_scripts': [
-            f'{NAME} = {NAME}.cli:main',
+            f'{NAME} = {NAME}.cli.main:main',
             *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
         ],
     },

@@ -19,10 +19,10 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
-from rosbags.highlevel import AnyReader   # noqa: E402
+from rosbags.highlevel import AnyReader  # noqa: E402
 
-from benchmarks.bags import long_session, write_bench_bag   # noqa: E402
-from imu_calibration.resources import config_file   # noqa: E402
+from benchmarks.bags import long_session, write_bench_bag  # noqa: E402
+from imu_calibration.resources import config_file  # noqa: E402
 
 REPETITIONS = 5
 MINUTES = 60.0

@@ -20,12 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
-import numpy as np   # noqa: E402
+import numpy as np  # noqa: E402
 
-from imu_calibration.calibration import Calibration   # noqa: E402
-from imu_calibration.documents import calibration_to_text   # noqa: E402
-from imu_calibration.sensor_model import SensorModel   # noqa: E402
-from imu_calibration.simulation import random_values   # noqa: E402
+from imu_calibration.calibration.document import (
+    Calibration,  # noqa: E402
+    calibration_to_text,  # noqa: E402
+)
+from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
+from imu_calibration.simulation.session import random_values  # noqa: E402
 
 ENDS = str(ROOT / 'benchmarks' / 'relay_ends.py')
 TURN = 5.0

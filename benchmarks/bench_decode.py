@@ -16,10 +16,10 @@ from typing import NamedTuple
 if __name__ == '__main__':
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from rosbags.highlevel import AnyReader   # noqa: E402
+from rosbags.highlevel import AnyReader  # noqa: E402
 
-from benchmarks.bags import long_session, write_bench_bag   # noqa: E402
-from msg_adapters.bag import open_recording   # noqa: E402
+from benchmarks.bags import long_session, write_bench_bag  # noqa: E402
+from msg_adapters.bag import open_recording  # noqa: E402
 
 REPETITIONS = 5
 

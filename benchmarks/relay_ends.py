@@ -9,15 +9,15 @@ from pathlib import Path
 if __name__ == '__main__':
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import numpy as np   # noqa: E402
-import rclpy   # noqa: E402
-from sensor_msgs.msg import Imu   # noqa: E402
+import numpy as np  # noqa: E402
+import rclpy  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
 
-from imu_calibration.nodes import relay_loop   # noqa: E402
-from imu_calibration.nodes.qos import input_qos, output_qos   # noqa: E402
-from imu_calibration.samples import ImuSamples   # noqa: E402
-from msg_adapters.encode import encode_imu   # noqa: E402
-from msg_adapters.imu import FIELDS, find_imu_layout   # noqa: E402
+from imu_calibration.nodes import relay_loop  # noqa: E402
+from imu_calibration.nodes.qos import input_qos, output_qos  # noqa: E402
+from imu_calibration.samples import ImuSamples  # noqa: E402
+from msg_adapters.encode import encode_imu  # noqa: E402
+from msg_adapters.imu import find_imu_layout  # noqa: E402
 
 ORIENTATION, STAMP_AT = 'orientation', 4
 END = 2.0**40

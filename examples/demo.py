@@ -9,9 +9,11 @@ import shutil
 from argparse import Namespace
 from pathlib import Path
 
-from imu_calibration import evaluation
-from imu_calibration.cli import files, main, recordings
+from imu_calibration import files
+from imu_calibration.cli import recordings
+from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
+from imu_calibration.compensation import evaluation
 
 NO_TOPICS = Namespace(imu_topic=None, joint_topic=None, temperature_topic=None)
 

@@ -3,12 +3,15 @@
 
 import numpy as np
 
-from imu_calibration import navigation, zhang, zhang_claims
+from imu_calibration import navigation
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import NotObservableError
-from imu_calibration.zhang_designs import DESIGNS, design_runs, face, oscillation, skewed_axes, spin, stack_runs
-from imu_calibration.zhang_joint import arm_errors, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
+from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.papers import zhang2017_navigation as zhang_claims
+from imu_calibration.papers.zhang2017_designs import DESIGNS, design_runs, face, oscillation, skewed_axes, spin, stack_runs
+from imu_calibration.papers.zhang2017_joint_fit import arm_errors, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
 
-G = zhang.STANDARD_GRAVITY
+G = STANDARD_GRAVITY
 MG = 1e-3 * G
 TABLE = zhang.printed_static_model()
 SENSOR = zhang.static_model_from_matrix(TABLE.matrix, TABLE.bias)

@@ -1,7 +1,6 @@
 """Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
 
-from imu_calibration import calibration as calibrations
-from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.errors import InputError
 
 
 def to_text(document):
@@ -51,28 +50,6 @@ def from_text(text, what='document'):
     if not isinstance(document, dict):
         raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file')
     return document
-
-
-def calibration_to_text(calibration):
-    """Return a calibration as the YAML of its document."""
-    return to_text(calibrations.to_mapping(calibration))
-
-
-def calibration_from_text(text):
-    """
-    Return the calibration in a YAML document.
-
-    Raises
-    ------
-    DocumentError
-        When it is no calibration, newer, or implausible.
-
-    """
-    try:
-        mapping = from_text(text, 'calibration document')
-    except InputError as error:
-        raise DocumentError(str(error)) from error
-    return calibrations.from_mapping(mapping)
 
 
 def version_of(text):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.reference import skew
+from imu_calibration.reference.reference_motion import skew
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Arrays of samples as they come from a bag or a topic; nothing here knows messages or files."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -80,3 +80,22 @@ class SampleBlock:
     """Temperature samples, or None."""
     dropped: dict | None = None
     """Messages that could not be turned into samples: reason -> count."""
+
+
+@dataclass(frozen=True)
+class NominalScaling:
+    """Nominal conversion of volts or counts to SI: ``SI = (reading - offset) / scale``."""
+
+    accelerometer_offset: float = 0.0
+    """Reading at zero specific force."""
+    accelerometer_scale: float = 1.0
+    """Reading per m/s^2."""
+    gyroscope_offset: float = 0.0
+    """Reading at zero rate."""
+    gyroscope_scale: float = 1.0
+    """Reading per rad/s."""
+
+    def apply(self, imu):
+        """Return the samples in SI."""
+        return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
+                       rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)

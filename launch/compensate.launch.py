@@ -4,12 +4,13 @@ Correct an IMU's messages with a calibration, live.
     ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml imu:=/imu/data_raw
 """
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 

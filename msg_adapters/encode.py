@@ -88,5 +88,3 @@ def _table(stamp_ns, head, pieces):
 
 def _constant(data, n):
     return np.broadcast_to(np.frombuffer(data, dtype=np.uint8), (n, len(data)))
-
-

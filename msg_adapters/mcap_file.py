@@ -11,9 +11,29 @@ import numpy as np
 
 from msg_adapters.compressed import decompress_chunk
 from msg_adapters.layout import Packed
-from msg_adapters.mcap_records import (CHANNEL, CHUNK, CHUNK_INDEX, DATA_END, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, PREFIX, SCHEMA,
-                                       STATISTICS, McapDamage, indexed_messages, is_record, log_times, parse_channel,
-                                       parse_message_index, parse_schema, parse_statistics, unpack_chunk, walk)
+from msg_adapters.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    PREFIX,
+    SCHEMA,
+    STATISTICS,
+    McapDamage,
+    indexed_messages,
+    is_record,
+    log_times,
+    parse_channel,
+    parse_message_index,
+    parse_schema,
+    parse_statistics,
+    unpack_chunk,
+    walk,
+)
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.storage import StorageFile, Stretch
 

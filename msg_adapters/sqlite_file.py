@@ -14,7 +14,7 @@ import numpy as np
 from msg_adapters.layout import Packed
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.sqlite_pages import PageReader
-from msg_adapters.storage import Stretch, StorageFile
+from msg_adapters.storage import StorageFile, Stretch
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
 STRETCH_ROWS = 8192

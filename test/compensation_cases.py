@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.calibration import Calibration
-from imu_calibration.effects import catalogue
-from imu_calibration.sensor_model import SensorModel
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.sensor_model import SensorModel
 
 SIZE = {'bias': 0.3, 'accel_quadratic': 2e-4, 'accel_cubic': 1e-5, 'accel_scale_asymmetry': 2e-3, 'accel_cross_product': 2e-4,
         'accel_size_effect': 0.02, 'accel_thermal_bias': 0.01, 'accel_thermal_scale': 3e-4, 'gyro_quadratic': 1e-3,

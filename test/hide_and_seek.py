@@ -24,10 +24,12 @@ from hide_and_seek_report import report  # noqa: E402
 from hiding import Sizes, all_effects, options_of, record  # noqa: E402
 from physics_draw import OUTSIDE  # noqa: E402
 
-from imu_calibration.diagnosis import diagnose  # noqa: E402
-from imu_calibration.diagnosis.diagnose import investigate  # noqa: E402
+from imu_calibration.diagnosis.diagnose import (
+    diagnose,  # noqa: E402
+    investigate,  # noqa: E402
+)
+from imu_calibration.diagnosis.explained_share import sensors_of  # noqa: E402
 from imu_calibration.diagnosis.gain import heldout_gain  # noqa: E402
-from imu_calibration.diagnosis.stories import sensors_of  # noqa: E402
 
 FIRST_SEED = 7000
 """Seeds from here on were never used while the search was developed."""

@@ -12,9 +12,9 @@ from scipy.stats import chi2, ncx2
 
 from imu_calibration.diagnosis.diagnose import investigate
 from imu_calibration.diagnosis.search import FAMILY_WISE
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.turntable import Table
-from imu_calibration.windows import MotionGatherer
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window_finder import MotionGatherer
 
 NOT_SIZED = {'earth_rate'}
 """The Earth turns as fast as it does: it is sought with a tactical grade of noise, where it is well above detectability."""

@@ -1,18 +1,20 @@
 """Short sessions for the tests of the nodes: enough motion for an answer in a few seconds of processing."""
 
 import numpy as np
-
-from imu_calibration import documents, workflow
-from imu_calibration.profiles import make_profile
-from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
 from live_station import TABLE as TABLE_FILE
+
+from imu_calibration import documents
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping(documents.from_text(TABLE_FILE.read_text()))
 TOLERANCES = documents.from_text((TABLE_FILE.parent / 'tolerances.yaml').read_text())
-OPTIONS = workflow.CalibrationOptions(tolerances=TOLERANCES)
+OPTIONS = CalibrationOptions(tolerances=TOLERANCES)
 
 
 def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='quick'):
@@ -28,7 +30,7 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
 
 def offline(*sessions):
     """Return the offline answer for (imu, joints) as they were sent."""
-    return workflow.calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS).calibration
+    return calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS).calibration
 
 
 def assert_same(live, expected, share=1e-6):

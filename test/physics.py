@@ -14,10 +14,10 @@ from physics_draw import Climate, draw_events, draw_imu, draw_value, generator, 
 from physics_sensor import low_pass
 from physics_table import local_gravity, move_table
 
-from imu_calibration import noise as noise_models
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.profiles import make_profile
+from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders, realistic
 
 PLACE = {'gravity': None, 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 20.0}
 Z_Y_X = [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}]
@@ -71,11 +71,11 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     noise : str or NoiseModel
         'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too.
     grade : str
-        IMU grade in `imu_calibration.noise.GRADES`.
+        IMU grade in `imu_calibration.simulation.sensor_noise.GRADES`.
     duration : float, optional
         Length of the session, s; default the profile's own.
     profile : str
-        Name in `imu_calibration.profiles`.
+        Name in `imu_calibration.simulation.profiles`.
     table : str or dict
         Name in `TABLES` or a description; `mount_rpy_deg` changes the mount.
     arms : bool
@@ -107,7 +107,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     # Every thing is drawn from its own generator: hiding an effect leaves unit, motion and noise as they were.
     values = {name: draw_value(name, size, n_joints, generator(seed, name)) for name, size in hidden.items()}
     model = _noise_model(noise, grade, encoder_resolution)
-    triads = draw_imu(noise_models.GRADES[grade], values, arms, generator(seed, 'unit'))
+    triads = draw_imu(GRADES[grade], values, arms, generator(seed, 'unit'))
     events = draw_events(moves, generator(seed, 'events'))
     climate = Climate(temperature or 'warm_up', moves.duration, generator(seed, 'climate'))
     gravity = mapping['gravity'] or local_gravity(mapping['latitude'], mapping['height'])
@@ -120,13 +120,13 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     if knock or 'knock_step' in values:
         outputs = [out + shock for out, shock in zip(outputs, _shock(sampling.time, events['knock']))]
     _set_limits(triads, outputs, values)
-    outputs = noise_models.add_imu_noise(*outputs, model, imu_rate, generator(seed, 'noise'))
+    outputs = add_imu_noise(*outputs, model, imu_rate, generator(seed, 'noise'))
     outputs = [np.clip(out, -triad.limit, triad.limit) for out, triad in zip(outputs, triads)]
 
     clock = generator(seed, 'clock')
     start_ns = 1_700_000_000_000_000_000 + int(clock.integers(10**12))
     stamp_ns = start_ns + to_ns(sampling.time + values.get('time_offset', 0.0))
-    imu = ImuSamples(noise_models.jitter_stamps(stamp_ns, model.stamp_jitter, clock), *outputs, 'imu_link')
+    imu = ImuSamples(jitter_stamps(stamp_ns, model.stamp_jitter, clock), *outputs, 'imu_link')
     joints = _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, generator(seed, 'encoders'))
     published = climate.publish(start_ns, moves.duration, generator(seed, 'thermometer')) if temperature else None
     if 'earth_rate' in values:
@@ -149,9 +149,9 @@ def write_bag(session, path, **options):
 
 def _noise_model(noise, grade, encoder_resolution):
     if isinstance(noise, str):
-        full = noise_models.realistic(grade)
+        full = realistic(grade)
         quiet = replace(full.white_only(), encoder_noise=2e-6)
-        noise = {'none': noise_models.NoiseModel(), 'white': quiet, 'realistic': replace(full, encoder_noise=2e-6)}[noise]
+        noise = {'none': NoiseModel(), 'white': quiet, 'realistic': replace(full, encoder_noise=2e-6)}[noise]
     return noise if encoder_resolution is None else replace(noise, encoder_resolution=encoder_resolution)
 
 
@@ -218,7 +218,7 @@ def _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, 
     motion = moves.at(time)
     shown, slope = encoder_reading(motion.position, values.get('encoder_harmonic'))
     rate = motion.rate * slope
-    shown = noise_models.read_encoders(shown, model, rng)
+    shown = read_encoders(shown, model, rng)
     rate = {'good': rate + rng.normal(0.0, 1e-5, rate.shape) * (model.encoder_noise > 0.0), 'none': np.full_like(rate, np.nan),
             'zero': np.zeros_like(rate), 'differences': np.gradient(shown, 1.0 / joint_rate, axis=0)}[velocity]
     return JointSamples(start_ns + to_ns(time), shown, rate, tuple(joint['name'] for joint in mapping['joints']))

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
+from test_adapters_bag import make_session
 
 from imu_calibration.errors import InputError
 from msg_adapters.decode import Decoder, JointDecoder
@@ -16,7 +17,6 @@ from msg_adapters.layout import MAX_LAYOUTS, Packed
 from msg_adapters.live import LiveGatherer
 from msg_adapters.stamps import MessageError
 from msg_adapters.temperature import TEMPERATURE_TYPE
-from test_adapters_bag import make_session
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

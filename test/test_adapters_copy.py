@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from test_adapters_bag import make_session
 
 from imu_calibration.errors import InputError
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
 from msg_adapters.write import copy_with_corrected, write_session
-from test_adapters_bag import make_session
 
 
 def raw_messages(path, topic):

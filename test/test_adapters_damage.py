@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from test_adapters_bag import make_session
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples
@@ -17,7 +18,6 @@ from msg_adapters.compressed import zstd
 from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.write import write_session
-from test_adapters_bag import make_session
 
 N = 9000
 KINDS = {'sqlite3': {'storage': 'sqlite3'}, 'mcap': {'storage': 'mcap'}, 'mcap_zstd': {'storage': 'mcap', 'compression': 'zstd'},

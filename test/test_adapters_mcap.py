@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_adapters_bag import make_session
 
 from imu_calibration.samples import ImuSamples
 from msg_adapters.bag import open_recording
@@ -15,7 +16,6 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.mcap_records import indexed_messages, walk
 from msg_adapters.mcap_writer import MAGIC, record, text
-from test_adapters_bag import make_session
 
 
 def message(channel, stamp_ns, data):

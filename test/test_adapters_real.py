@@ -7,6 +7,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_typestore
+from test_adapters_bag import make_session
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples
@@ -15,7 +16,6 @@ from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.imu import imu_from_rows, imu_row
 from msg_adapters.joint_state import joint_row, joints_from_rows
 from msg_adapters.write import copy_with_corrected
-from test_adapters_bag import make_session
 
 
 def by_rosbags(path, topic, limit=None):

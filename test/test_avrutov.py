@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from figures import show
 
-from imu_calibration import avrutov, avrutov_budget
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.linear import condition_numbers, null_directions, numerical_rank, predicted_sd, tolerance_scaled
+from imu_calibration.estimation.linear_least_squares import (
+    condition_numbers,
+    null_directions,
+    numerical_rank,
+    predicted_sd,
+    tolerance_scaled,
+)
+from imu_calibration.papers import avrutov2017 as avrutov
+from imu_calibration.papers import avrutov2017_budget as avrutov_budget
 
 ANGLES = avrutov.equal_angles()
 CASES = [(order, axis) for order in avrutov.GIMBAL_ORDERS for axis in 'xyz']

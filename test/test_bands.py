@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from imu_calibration.bands import band_misfit, extra_weight, variance_along
-from imu_calibration.estimation import solve
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.least_squares import Accumulator
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.turntable import Table
-from imu_calibration.window import Window
-from imu_calibration.window_statistics import reduce_window, slow_part
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.band_misfit import band_misfit, extra_weight, variance_along
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import reduce_window, slow_part
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 TABLE = Table.from_mapping({'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1], 'gravity': 9.80665, 'latitude': None})
 MODEL = SensorModel(joint_names=('shaft',))

@@ -5,16 +5,16 @@ import pytest
 from hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand import ByHandSettings, KnownTurn, calibrate_by_hand
-from imu_calibration.by_hand_poses import g_sensitivity_evidence
-from imu_calibration.by_hand_model import unpack
-from imu_calibration.by_hand_system import Poses, State, TurnData, build_system, moved
+from imu_calibration.by_hand.calibrate import ByHandSettings, KnownTurn, calibrate_by_hand
+from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.by_hand.model import unpack
+from imu_calibration.by_hand.poses import g_sensitivity_evidence
+from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.gathering import NominalScaling
-from imu_calibration.samples import ImuSamples
-from imu_calibration.still_search import find_still
-from imu_calibration.turn_integration import integrate_turn
-from imu_calibration.variance_components import estimate_scatter
+from imu_calibration.estimation.variance_components import estimate_scatter
+from imu_calibration.samples import ImuSamples, NominalScaling
+from imu_calibration.segmentation.static_detector import find_still
+
 
 def differences(found, truth):
     names = [n for n in found.param_names if n in PARAM_NAMES]
@@ -279,7 +279,7 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
 # real recordings
 
 def load(recordings, name, topic=None):
-    from imu_calibration.by_hand_document import read_imu
+    from imu_calibration.by_hand.workflow import read_imu
     from msg_adapters.bag import open_recording
     return read_imu(open_recording(recordings / name, topic, want_joints=False).blocks())[0]
 

@@ -6,20 +6,23 @@ import numpy as np
 import physics
 import pytest
 import yaml
-
-from imu_calibration.documents import calibration_from_text
-from imu_calibration.profiles import make_profile
-from imu_calibration.turntable import Table, reference_motion
-from imu_calibration.workflow_diagnosis import diagnose_recording
 from live_sessions import OPTIONS, TABLE, assert_same, make_session
-from imu_calibration import workflow
-from imu_calibration.simulation import START_NS
 from test_by_hand import GRAVITY, simulate
+
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import START_NS
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
 pytest.importorskip('rclpy')
 from live_station import Station, taken  # noqa: E402
+
+from imu_calibration.by_hand.workflow import calibrate_without_table
 
 pytestmark = pytest.mark.dds
 RATE = 10.0
@@ -48,7 +51,7 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bags / 'session') as recording:
-            expected = workflow.calibrate([lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS).calibration
+            expected = calibrate([lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS).calibration
         check_the_answer(station, live, expected)
         assert sorted(path.name for path in tmp_path.iterdir()) == ['calibration.accumulator.npz', 'calibration.yaml']
 
@@ -164,7 +167,7 @@ def check_by_hand(bag, folder, rate, gravity=None):
         assert answer.success, answer.message
         live = calibration_from_text((folder / 'calibration.yaml').read_text())
         with open_recording(bag, want_joints=False) as recording:
-            expected = workflow.calibrate_without_table([recording.blocks], OPTIONS, gravity).calibration
+            expected = calibrate_without_table([recording.blocks], OPTIONS, gravity).calibration
         assert live.statistics['samples_used'] == expected.statistics['samples_used'] and live.gauge == expected.gauge
         assert live.param_names == expected.param_names and live.status == expected.status
         free = expected.sd > 0

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration.cli import main
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.cli.main import main
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from msg_adapters.write import write_session
 
 JOINTS = [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}]

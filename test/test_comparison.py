@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration import DETERMINED, HELD, Calibration
-from imu_calibration.cli import main
-from imu_calibration.comparison import LEVEL, compare
-from imu_calibration.documents import calibration_to_text
+from imu_calibration.calibration.comparison import LEVEL, compare
+from imu_calibration.calibration.document import DETERMINED, HELD, Calibration, calibration_to_text
+from imu_calibration.cli.main import main
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
-from imu_calibration.sensor_model import SensorModel
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)

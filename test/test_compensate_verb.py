@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from compensation_cases import FURTHER, random_calibration
 from scipy.spatial.transform import Rotation
+from test_adapters_copy import raw_messages
 
-from imu_calibration.cli import main
-from imu_calibration.compensation_covariance import Uncertainty
-from imu_calibration.documents import calibration_to_text
-from imu_calibration.reference import Reference, lever_matrix
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.cli.main import main
+from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.effects.forward_equations import sensor_output
+from imu_calibration.reference.reference_motion import Reference, lever_matrix
 from imu_calibration.samples import ImuSamples, TemperatureSamples
-from imu_calibration.sensor_model import sensor_output
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS, parse_imu
 from msg_adapters.write import write_session
-from test_adapters_copy import raw_messages
 
 PERIOD_NS = 2_000_000
 N = 3000

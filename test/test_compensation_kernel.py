@@ -6,8 +6,8 @@ from compensation_cases import FURTHER, random_calibration, random_motion
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imu_calibration.compensation import Transfer, compensate
-from imu_calibration.compensation_kernel import kernel_text, make_kernel
+from imu_calibration.compensation.compensate import Transfer, compensate
+from imu_calibration.compensation.kernel import kernel_text, make_kernel
 
 some = {sensor: st.lists(st.sampled_from(names), unique=True).map(tuple) for sensor, names in FURTHER.items()}
 small = st.floats(-1.0, 1.0)

@@ -8,10 +8,10 @@ import pytest
 from compensation_cases import random_calibration
 from ros_harness import Harness
 
-from imu_calibration.calibration import Calibration
-from imu_calibration.compensation import Transfer
-from imu_calibration.documents import calibration_to_text, version_of
-from imu_calibration.nodes.live_compensation import LiveCompensation
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.documents import version_of
+from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.processes import NodeProcesses
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu

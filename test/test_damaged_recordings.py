@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration.cli import main
-from imu_calibration.profiles import make_profile
+from imu_calibration.cli.main import main
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_three_axis.yaml')

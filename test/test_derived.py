@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from imu_calibration import zhang
-from imu_calibration.calibration import DETERMINED, Calibration
-from imu_calibration.derived import PAIRS, angles_of, derive, in_paper_units, split
-from imu_calibration.gathering import NominalScaling
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.units import G, decimals, for_people, significant, with_sd
+from imu_calibration.calibration.document import DETERMINED, Calibration
+from imu_calibration.calibration.installation_angles import PAIRS, angles_of, derive, in_paper_units, split
+from imu_calibration.constants import STANDARD_GRAVITY as G
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.samples import NominalScaling
+from imu_calibration.units import decimals, for_people, significant, with_sd
 
 MODEL = SensorModel()
 DEG = np.pi / 180

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from imu_calibration import documents
-from imu_calibration.cli import main
+from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.cli.main import main
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +26,7 @@ def test_the_hidden_effects_are_found_and_measured(outcome):
     assert document['format'] == 'imu_calibration/diagnosis/1'
     found = {finding['effect']: finding for finding in document['findings']}
     assert set(found) == {'accel_size_effect', 'gyro_g_sensitivity'}
-    truth = documents.calibration_from_text((outcome / 'bag' / 'truth.yaml').read_text())
+    truth = calibration_from_text((outcome / 'bag' / 'truth.yaml').read_text())
     values = dict(zip(truth.param_names, truth.values))
     for name, entry in found['gyro_g_sensitivity']['parameters'].items():
         assert abs(entry['value'] - values[name]) < 4.5 * entry['sd']
@@ -42,7 +42,7 @@ def test_the_extended_calibration_is_accepted_everywhere(outcome):
     again = main(['simulate', '--table', str(outcome / 'bag' / 'table.yaml'), '--profile', 'quick', '--calibration', calibration, '--output',
                   str(outcome / 'again')])
     assert again == 0
-    found = documents.calibration_from_text((outcome / 'out' / 'calibration.yaml').read_text())
+    found = calibration_from_text((outcome / 'out' / 'calibration.yaml').read_text())
     assert found.has('gyroscope', 'gyro_g_sensitivity')
 
 

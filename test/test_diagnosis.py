@@ -7,8 +7,8 @@ import pytest
 from hiding import Sizes, record
 from scipy.stats import chi2
 
-from imu_calibration.diagnosis import diagnose, to_mapping
-from imu_calibration.diagnosis.diagnose import investigate
+from imu_calibration.diagnosis.diagnose import diagnose, investigate
+from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
 
 SEED = 3

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hand_sessions import GRAVITY, simulate
 
-from imu_calibration.by_hand import ByHandSettings, gather_by_hand, solve_by_hand
-from imu_calibration.diagnosis import to_mapping
-from imu_calibration.diagnosis.by_hand import diagnose_by_hand
+from imu_calibration.by_hand.calibrate import ByHandSettings, gather_by_hand, solve_by_hand
+from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
+from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
 
 NOTHING = np.zeros(3)
@@ -107,9 +107,9 @@ def test_too_few_poses_are_refused_with_their_number():
 @pytest.mark.real_data
 def test_xsens_counts_tells_no_stories(recordings):
     """The accelerometer scatters beyond its noise and no effect claims it; the gyroscope's answer to gravity is found and predicts."""
-    from imu_calibration.gathering import NominalScaling
-    from imu_calibration.workflow import CalibrationOptions
-    from imu_calibration.workflow_diagnosis import diagnose_without_table
+    from imu_calibration.calibration.options import CalibrationOptions
+    from imu_calibration.diagnosis.workflow import diagnose_without_table
+    from imu_calibration.samples import NominalScaling
     from msg_adapters.bag import open_recording
     options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.differentiation import CausalDerivative, choose_derivative
+from imu_calibration.compensation.angular_acceleration import CausalDerivative, choose_derivative
 
 
 def slopes(derivative, values):

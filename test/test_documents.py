@@ -8,12 +8,21 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imu_calibration import calibration as calibrations
 from imu_calibration import documents
-from imu_calibration.calibration import DETERMINED, HELD, WEAK, Calibration, from_mapping, to_mapping
-from imu_calibration.effects import catalogue
+from imu_calibration.calibration.document import (
+    DETERMINED,
+    HELD,
+    WEAK,
+    Calibration,
+    calibration_from_text,
+    calibration_to_text,
+    from_mapping,
+    implausible,
+    to_mapping,
+)
+from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.sensor_model import SensorModel
 
 ACCELEROMETER = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry', 'accel_size_effect', 'lever_arm', 'accel_thermal_bias',
                  'accel_thermal_scale', 'accel_bias_drift', 'accel_bandwidth')
@@ -59,8 +68,8 @@ def any_calibration(draw):
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(any_calibration())
 def test_any_calibration_survives_yaml_whole(calibration):
-    text = documents.calibration_to_text(calibration)
-    read = documents.calibration_from_text(text)
+    text = calibration_to_text(calibration)
+    read = calibration_from_text(text)
     assert set(read.param_names) == set(calibration.param_names)
     order = [read.param_names.index(name) for name in calibration.param_names]
     assert np.array_equal(read.values[order], calibration.values)
@@ -74,8 +83,8 @@ def test_any_calibration_survives_yaml_whole(calibration):
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(any_calibration())
 def test_written_read_and_written_again_is_the_same_text(calibration):
-    once = documents.calibration_to_text(documents.calibration_from_text(documents.calibration_to_text(calibration)))
-    assert documents.calibration_to_text(documents.calibration_from_text(once)) == once
+    once = calibration_to_text(calibration_from_text(calibration_to_text(calibration)))
+    assert calibration_to_text(calibration_from_text(once)) == once
 
 
 def plain():
@@ -117,14 +126,14 @@ def test_what_is_no_calibration_is_refused_in_one_line(change, words):
 @pytest.mark.parametrize('text', ('', 'a: [', '[]', '\x00', '7', 'a: !!python/object/apply:os.getcwd []'))
 def test_text_that_is_no_document_is_refused_in_one_line(text):
     with pytest.raises(DocumentError) as refusal:
-        documents.calibration_from_text(text)
+        calibration_from_text(text)
     assert '\n' not in str(refusal.value)
 
 
 def test_implausible_values_are_named():
     model = SensorModel()
     values = model.start()
-    assert calibrations.implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24)) == []
+    assert implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24)) == []
     values[1] = 50.0
-    lines = calibrations.implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24))
+    lines = implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24))
     assert len(lines) == 1 and 'accelerometer bias' in lines[0]

@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration import error_budget as budgets
-from imu_calibration.estimation import solve
-from imu_calibration.gathering import gather
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.collector import gather
+from imu_calibration.calibration.error_budget import ReferenceErrors, _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solver import solve
+from imu_calibration.reference.table import Table, tilt
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table, tilt
-from imu_calibration.workflow import CalibrationOptions, calibrate
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'gravity': 9.81, 'latitude': 48.8, 'azimuth_deg': 0.0})
@@ -51,7 +52,7 @@ def moved(recording, result, false_table):
 @pytest.mark.parametrize('axis', (0, 1))
 def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, result, axis):
     angle = 1e-3 * np.eye(2)[axis]
-    shift = budgets.parameter_shifts(result, [budgets._Tilted(angle)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [_Tilted(angle)])[0].sum(axis=0)
     actual = -moved(recording, result, tilt(result.table, angle))
     assert np.linalg.norm(shift[:12]) > 1e-4
     for effect in result.solution.model.effects[:3]:
@@ -60,14 +61,14 @@ def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, 
 
 
 def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
-    shift = budgets.parameter_shifts(result, [budgets._Heavier(0.01)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [_Heavier(0.01)])[0].sum(axis=0)
     assert shift[3:12] == pytest.approx(result.solution.values[3:12] * 0.01 / 9.81, abs=3e-7)
     actual = -moved(recording, result, replace(result.table, gravity=9.82))
     assert actual[:21] == pytest.approx(shift[:21], abs=5e-6)
 
 
 def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
-    shift = budgets.parameter_shifts(result, [budgets._Faster(1e-3)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [_Faster(1e-3)])[0].sum(axis=0)
     names = result.solution.param_names
     arms, matrix = (result.solution.model.slices[key] for key in (('accelerometer', 'accel_size_effect'), ('gyroscope', 'matrix')))
     assert names[matrix.start] == 'gyroscope.matrix.xx'
@@ -77,9 +78,9 @@ def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
 
 def test_joint_errors_are_drawn_anew_in_every_window(result):
     """The sd of the budget is that of random joint errors put through the same shifts."""
-    budget = budgets.error_budget(result)
-    changes = [budgets._Turned(1.0 * budgets.ReferenceErrors().joint_position, k) for k in range(3)]
-    shifts = budgets.parameter_shifts(result, changes)
+    budget = error_budget(result)
+    changes = [_Turned(1.0 * ReferenceErrors().joint_position, k) for k in range(3)]
+    shifts = parameter_shifts(result, changes)
     rng = np.random.default_rng(5)
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
     own = budget.causes['joint position']
@@ -88,20 +89,20 @@ def test_joint_errors_are_drawn_anew_in_every_window(result):
 
 
 def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
-    without = budgets.error_budget(result)
+    without = error_budget(result)
     assert list(without.causes) == ['noise', 'levelling', 'joint position', 'table rate', 'gravity']
     matrix = result.solution.model.slices['accelerometer', 'matrix']
     assert np.max(without.causes['levelling'][matrix]) > 10 * np.max(without.causes['noise'][matrix])
-    with_tilt = budgets.error_budget(calibrated(recording, TABLE, CalibrationOptions()))
+    with_tilt = error_budget(calibrated(recording, TABLE, CalibrationOptions()))
     assert 'levelling' not in with_tilt.causes
 
 
 def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result):
-    small, large = (budgets.error_budget(result, replace(budgets.ReferenceErrors(), joint_position=size)) for size in (1e-5, 1e-4))
+    small, large = (error_budget(result, replace(ReferenceErrors(), joint_position=size)) for size in (1e-5, 1e-4))
     assert small.total**2 == pytest.approx(sum(part**2 for part in small.causes.values()), rel=1e-12)
     assert large.causes['joint position'] == pytest.approx(10 * small.causes['joint position'], rel=1e-3, abs=1e-12)
 
 
 def test_gravity_sd_of_the_table_description_is_used(result):
     stated = replace(result, table=replace(result.table, gravity_sd=1e-3))
-    assert 'to 0.001' in budgets.error_budget(stated).texts['gravity']
+    assert 'to 0.001' in error_budget(stated).texts['gravity']

@@ -3,19 +3,22 @@
 import numpy as np
 import pytest
 
+from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import coefficients, predict
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
-from imu_calibration.estimation import make_prior, solve
-from imu_calibration.gathering import restrict
-from imu_calibration.least_squares import Accumulator
-from imu_calibration.profiles import make_profile
+from imu_calibration.estimation.accumulator import Accumulator, restrict
+from imu_calibration.estimation.noise_model import WindowNoise
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel, columns, coefficients, predict
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.noise import GRADES, NoiseModel, gauss_markov
-from imu_calibration.turntable import Table
-from imu_calibration.window_noise import WindowNoise
-from imu_calibration.window_statistics import reduce_window
-from imu_calibration.windows import MotionGatherer, Window
+from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, gauss_markov
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
@@ -178,7 +181,7 @@ def test_fewer_columns_are_the_same_as_a_smaller_model(session):
                                   'axis_non_orthogonality', 'encoder_zero', 'encoder_harmonic', 'earth_rate'])
 def test_columns_are_the_derivative_of_the_prediction(session, name):
     """Columns times the derivative of the coefficients equal finite differences of the forward equations."""
-    from imu_calibration.effects import owner_of
+    from imu_calibration.effects.catalogue import owner_of
     owner = owner_of(name)
     model = FULL.with_effect(owner, name) if (owner, name) not in FULL.slices else FULL
     values = true_values(model, 11)

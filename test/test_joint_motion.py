@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from imu_calibration.bspline import Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
 from imu_calibration.errors import InputError
-from imu_calibration.joint_motion import JointMotion, fit_joint_curve, with_encoder_harmonics
-from imu_calibration.settings import JointSettings
-from imu_calibration.smoothing import PenalisedSpline, encoder_step
-from imu_calibration.velocity_check import check_velocity
+from imu_calibration.reference.encoder import encoder_step, with_encoder_harmonics
+from imu_calibration.reference.joint_curve import fit_joint_curve
+from imu_calibration.reference.joint_fit import JointSettings, check_velocity
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.quintic_spline import Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
+from imu_calibration.reference.smoothing import PenalisedSpline
 
 STEP_0088 = np.radians(0.088)
 QUIET = JointSettings()

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.joint_shift import shifted
+from imu_calibration.reference.joint_delay import shifted
+from imu_calibration.reference.joint_motion import JointMotion
 
 NAMES = ('position', 'rate', 'acceleration', 'jerk')
 

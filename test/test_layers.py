@@ -110,6 +110,32 @@ def test_adapters_know_no_node_and_no_command_line(path):
     assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes')
 
 
+ORDER = (('constants', 'errors', 'samples'), ('settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
+         ('estimation', 'preflight', 'simulation', 'compensation'), ('calibration', 'papers'), ('by_hand', 'report'), ('diagnosis',),
+         ('files', 'resources'), ('cli', 'nodes'), ('__main__',))
+"""Packages and root modules from the ground up: each may import what stands in an earlier row."""
+
+
+@pytest.mark.parametrize('path', [p for p in modules('imu_calibration') if p != ROOT / 'imu_calibration/__init__.py'], ids=module_name)
+def test_each_package_imports_only_what_stands_below_it(path):
+    height = {name: row for row, names in enumerate(ORDER) for name in names}
+    own = path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
+    others = {name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name} & set(height) - {own}
+    assert all(height[name] < height[own] for name in others), (own, others)
+
+
+def test_every_package_has_its_place_in_the_order():
+    found = {path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0] for path in modules('imu_calibration')} - {'__init__'}
+    assert found == {name for names in ORDER for name in names}
+
+
+def test_every_package_says_what_comes_in_what_goes_out_and_what_to_read_first():
+    for folder in (ROOT / 'imu_calibration').iterdir():
+        if folder.is_dir() and any(folder.glob('*.py')):
+            text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) or ''
+            assert 'In: ' in text and 'Out: ' in text and 'Read `' in text, folder.name
+
+
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
     assert {'imu_calibration.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names

@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from imu_calibration import linear
 from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.estimation.linear_least_squares import (
+    condition_numbers,
+    null_directions,
+    numerical_rank,
+    predicted_sd,
+    solve_linear,
+    tolerance_scaled,
+    tolerance_scaled_covariance,
+)
 
 NAMES = ('bias', 'slope', 'curve')
 
@@ -17,8 +25,8 @@ def vandermonde(rng, n=12):
 def test_exact_data_come_back_for_one_and_several_outputs():
     rng = np.random.default_rng(1)
     design, truth = vandermonde(rng), rng.normal(size=(3, 2))
-    both = linear.solve_linear(design, design @ truth, NAMES)
-    one = linear.solve_linear(design, design @ truth[:, 0], NAMES)
+    both = solve_linear(design, design @ truth, NAMES)
+    one = solve_linear(design, design @ truth[:, 0], NAMES)
     np.testing.assert_allclose(both.values, truth, rtol=0, atol=1e-14)
     np.testing.assert_allclose(one.values, truth[:, 0], rtol=0, atol=1e-14)
     assert one.values.shape == one.sd.shape == (3,) and both.sd.shape == (3, 2) and both.covariance.shape == (2, 3, 3)
@@ -30,7 +38,7 @@ def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
     core = 1.0 / (np.arange(1, 15)[:, None] + np.arange(5))
     design = core * np.array([1e-6, 1e-3, 1, 1e3, 1e6])
     truth = np.array([1e6, 1e3, 1, 1e-3, 1e-6])
-    solution = linear.solve_linear(design, design @ truth, tuple('abcde'))
+    solution = solve_linear(design, design @ truth, tuple('abcde'))
     normal = np.linalg.solve(design.T @ design, design.T @ (design @ truth))
     error, normal_error = np.max(np.abs(solution.values / truth - 1)), np.max(np.abs(normal / truth - 1))
     print(f'scaled SVD relative error {error:.1e}, normal equations {normal_error:.1e}')
@@ -40,17 +48,17 @@ def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
 def test_covariance_equals_the_inverse_normal_matrix_and_the_weights_enter():
     rng = np.random.default_rng(2)
     design, weights = vandermonde(rng), rng.uniform(0.5, 4, 12)
-    solution = linear.solve_linear(design, rng.normal(size=12), NAMES, weights)
+    solution = solve_linear(design, rng.normal(size=12), NAMES, weights)
     np.testing.assert_allclose(solution.unit_covariance, np.linalg.inv(design.T @ (weights[:, None] * design)), rtol=1e-11)
     np.testing.assert_allclose(design.T @ (weights * solution.residuals), 0, atol=1e-12)
-    np.testing.assert_allclose(linear.predicted_sd(design, weights), solution.unit_sd, rtol=1e-12)
+    np.testing.assert_allclose(predicted_sd(design, weights), solution.unit_sd, rtol=1e-12)
 
 
 def test_reported_sd_is_the_scatter_over_many_draws():
     """With 4000 draws the sd ratio itself has sd 1.1 %; five of those are allowed."""
     rng = np.random.default_rng(3)
     design = vandermonde(rng)
-    solution = linear.solve_linear(design, rng.normal(scale=0.3, size=(12, 4000)), NAMES)
+    solution = solve_linear(design, rng.normal(scale=0.3, size=(12, 4000)), NAMES)
     ratio = np.std(solution.values, axis=1) / (0.3 * solution.unit_sd)
     np.testing.assert_allclose(ratio, 1, atol=0.055)
     assert abs(np.mean(solution.chi2_per_dof) / 0.09 - 1) < 0.04
@@ -59,7 +67,7 @@ def test_reported_sd_is_the_scatter_over_many_draws():
 def test_units_of_a_parameter_do_not_change_eqcond_or_the_fit():
     rng = np.random.default_rng(4)
     design, outputs, units = vandermonde(rng), rng.normal(size=12), np.array([1, 1e5, 1e-7])
-    plain, scaled = linear.solve_linear(design, outputs, NAMES), linear.solve_linear(design * units, outputs, NAMES)
+    plain, scaled = solve_linear(design, outputs, NAMES), solve_linear(design * units, outputs, NAMES)
     np.testing.assert_allclose(scaled.values * units, plain.values, rtol=1e-12)
     assert scaled.eqcond == pytest.approx(plain.eqcond, rel=1e-12)
     assert scaled.cond > 1e10 * plain.cond
@@ -72,23 +80,23 @@ def test_singular_design_is_refused_by_parameter_name(column, expected):
     design = vandermonde(rng)
     design[:, 2] = column if column is not None else 3 * design[:, 1]
     with pytest.raises(NotObservableError, match='rank 2') as caught:
-        linear.solve_linear(design, np.ones(12), NAMES)
+        solve_linear(design, np.ones(12), NAMES)
     text = str(caught.value).split('not determined:')[1].split('.  ')[0]
     assert all(name in text for name in expected) and 'bias' not in text
-    (direction,) = linear.null_directions(design, NAMES)
+    (direction,) = null_directions(design, NAMES)
     assert set(direction) == expected
     if column is None:
         assert -direction['slope'] / direction['curve'] == pytest.approx(3)
-    assert linear.numerical_rank(design) == 2
-    assert np.isinf(linear.predicted_sd(design)).tolist() == [name in expected for name in NAMES]
+    assert numerical_rank(design) == 2
+    assert np.isinf(predicted_sd(design)).tolist() == [name in expected for name in NAMES]
 
 
 def test_too_few_rows_and_an_empty_design_are_refused():
     with pytest.raises(NotObservableError, match='rank 2 from 2 rows'):
-        linear.solve_linear(np.array([[1.0, 0, 0], [1, 1, 1]]), np.ones(2), NAMES)
+        solve_linear(np.array([[1.0, 0, 0], [1, 1, 1]]), np.ones(2), NAMES)
     with pytest.raises(NotObservableError, match='rank 0'):
-        linear.solve_linear(np.zeros((4, 3)), np.ones(4), NAMES)
-    assert linear.null_directions(np.eye(3), NAMES) == []
+        solve_linear(np.zeros((4, 3)), np.ones(4), NAMES)
+    assert null_directions(np.eye(3), NAMES) == []
 
 
 @pytest.mark.parametrize('design, outputs, weights', [
@@ -99,14 +107,14 @@ def test_too_few_rows_and_an_empty_design_are_refused():
 ])
 def test_wrong_input_is_refused(design, outputs, weights):
     with pytest.raises(InputError):
-        linear.solve_linear(design, outputs, NAMES, weights)
+        solve_linear(design, outputs, NAMES, weights)
 
 
 def test_tolerance_scaling_finds_the_weak_parameter_that_eqcond_misses():
     """Orthogonal columns have eqcond 1 whatever their size; against tolerances the small one is out of reach."""
     design = np.kron(np.eye(3), np.ones((4, 1))) * np.array([1, 1, 1e-3])
-    scaled = linear.tolerance_scaled(design, np.full(3, 0.1), sigma=0.02)
-    assert linear.condition_numbers(design)[1] == pytest.approx(1)
+    scaled = tolerance_scaled(design, np.full(3, 0.1), sigma=0.02)
+    assert condition_numbers(design)[1] == pytest.approx(1)
     assert scaled.cond == pytest.approx(1e3)
     np.testing.assert_allclose(scaled.sd_over_tolerance, [0.1, 0.1, 100], rtol=1e-12)
     assert [set(direction) for direction in scaled.weak_directions(NAMES)] == [{'curve'}]
@@ -115,7 +123,7 @@ def test_tolerance_scaling_finds_the_weak_parameter_that_eqcond_misses():
 def test_tolerance_scaling_of_design_and_covariance_agree():
     rng = np.random.default_rng(6)
     design, tolerances = vandermonde(rng), np.array([0.1, 2.0, 0.5])
-    covariance = 0.3**2 * linear.solve_linear(design, np.ones(12), NAMES).unit_covariance
-    by_design, by_covariance = linear.tolerance_scaled(design, tolerances, 0.3), linear.tolerance_scaled_covariance(covariance, tolerances)
+    covariance = 0.3**2 * solve_linear(design, np.ones(12), NAMES).unit_covariance
+    by_design, by_covariance = tolerance_scaled(design, tolerances, 0.3), tolerance_scaled_covariance(covariance, tolerances)
     np.testing.assert_allclose(by_covariance.singular_values, by_design.singular_values, rtol=1e-10)
     np.testing.assert_allclose(by_covariance.sd_over_tolerance, by_design.sd_over_tolerance, rtol=1e-10)

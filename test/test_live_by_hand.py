@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from test_by_hand import GRAVITY, load, simulate
 
-from imu_calibration import workflow
+from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
+from imu_calibration.by_hand.status import FACES, unseen
+from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
-from imu_calibration.hand_status import FACES, unseen
-from imu_calibration.live_by_hand import LiveByHand, LiveByHandSettings
-from imu_calibration.live_calibration import LiveSettings
 from imu_calibration.samples import ImuSamples, SampleBlock
 
 
@@ -22,7 +23,7 @@ def blocks(imu, seed=0, mean=20):
 def make_live(saved=None, **by_hand):
     """Return a LiveByHand that looks for rest as often as it can."""
     settings = LiveByHandSettings(**{'gravity': GRAVITY, **by_hand})
-    return LiveByHand(workflow.CalibrationOptions(), LiveSettings(), settings, saved, lambda: 0.0)
+    return LiveByHand(CalibrationOptions(), LiveSettings(), settings, saved, lambda: 0.0)
 
 
 def run(live, imu, seed=0):
@@ -32,7 +33,7 @@ def run(live, imu, seed=0):
 
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
-    return workflow.calibrate_without_table([lambda: iter([SampleBlock(imu)])], gravity=gravity)
+    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], gravity=gravity)
 
 
 def assert_same(live, expected, share=1e-6):
@@ -211,13 +212,13 @@ def test_without_a_long_rest_the_oldest_go(session):
                                              ('bias+matrix+accel_size_effect', 'table')])
 def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, what):
     with pytest.raises(InputError, match=what):
-        LiveByHand(workflow.CalibrationOptions(accelerometer_model=model), LiveSettings())
+        LiveByHand(CalibrationOptions(accelerometer_model=model), LiveSettings())
 
 
 def test_further_effects_are_estimated_as_offline(session):
-    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
+    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
     live = LiveByHand(options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0)
     run(live, session)
-    expected = workflow.calibrate_without_table([lambda: iter([SampleBlock(session)])], options, GRAVITY)
+    expected = calibrate_without_table([lambda: iter([SampleBlock(session)])], options, GRAVITY)
     assert any('accel_quadratic' in name for name in expected.calibration.param_names)
     assert_same(live.solve(pending=True), expected)

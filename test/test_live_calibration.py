@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration import accumulator_state, workflow
+from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration.calibrate import calibrate, finish
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
-from imu_calibration.live_calibration import LiveCalibration, LiveSettings, SolvePacer
-from imu_calibration.live_streams import StreamWatch
-from imu_calibration.profiles import make_profile
+from imu_calibration.preflight.stream_watch import StreamWatch
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({
     'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -55,9 +58,9 @@ def blocks(imu, joints, seed=0, mean_seconds=0.2):
         yield SampleBlock(*parts)
 
 
-def offline(*sessions, options=workflow.CalibrationOptions()):
+def offline(*sessions, options=CalibrationOptions()):
     """Return what the offline tool says."""
-    return workflow.calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options)
+    return calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options)
 
 
 def run(live, imu, joints, seed=0):
@@ -143,7 +146,7 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     data = accumulator_state.to_bytes(gathered, live.model)
     again = accumulator_state.from_bytes(data, live.model)
     assert accumulator_state.to_bytes(again, live.model) == data
-    assert_same(workflow.finish(again, live.model, TABLE).calibration, workflow.finish(gathered, live.model, TABLE).calibration, 1e-12)
+    assert_same(finish(again, live.model, TABLE).calibration, finish(gathered, live.model, TABLE).calibration, 1e-12)
 
 
 def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
@@ -166,7 +169,7 @@ def test_before_any_motion_it_waits_and_says_for_what():
 
 
 def test_groups_name_the_motion_that_is_still_needed(quick):
-    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect')
+    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect')
     live = LiveCalibration(TABLE, options)
     still = [window for window in run(LiveCalibration(TABLE), *quick) if window.kind == 'static']
     until = int(np.searchsorted(quick[0].stamp_ns, still[1].stamp_ns[-1]))
@@ -209,7 +212,7 @@ def test_memory_stays_bounded(quick):
 
 
 def test_a_thermal_effect_waits_for_the_first_temperature(quick):
-    options = workflow.CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias')
+    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias')
     live = LiveCalibration(TABLE, options)
     parts = list(blocks(*quick))[:5]
     for block in parts:

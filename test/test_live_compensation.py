@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.compensation import Transfer
-from imu_calibration.compensation_covariance import Uncertainty
-from imu_calibration.compensation_stream import CompensationStream
-from imu_calibration.nodes.live_compensation import LiveCompensation
+from imu_calibration.compensation.angular_acceleration import WARM_UP
+from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.samples import ImuSamples, TemperatureSamples
-from imu_calibration.stamped_derivative import WARM_UP
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, N_DOUBLES, parse_imu, patch_imu
 

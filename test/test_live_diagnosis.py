@@ -7,26 +7,32 @@ from dataclasses import replace
 import numpy as np
 import physics
 import pytest
-
-from imu_calibration.diagnosis import diagnose
-from imu_calibration.live_calibration import LiveCalibration, LiveSettings
-from imu_calibration.live_diagnosis import DiagnosisState, RecentWindows, describe
-from imu_calibration.samples import SampleBlock
-from imu_calibration.turntable import Table
-from imu_calibration.workflow_diagnosis import diagnose_recording
 from test_live_calibration import blocks
+
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis, RecentWindows, describe
+from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
 
 pytest.importorskip('rclpy')
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
 
 
-def live_of(session, **settings):
-    """Return a LiveCalibration that has taken a physics session in, and solved."""
-    live = LiveCalibration(Table.from_mapping(session.table), settings=LiveSettings(**settings))
-    for block in blocks(session.imu, session.joints):
-        live.push(block)
-    live.solve(pending=True)
-    return live
+class Station:
+    """A LiveCalibration with its LiveDiagnosis, fed as calibration_node feeds them."""
+
+    def __init__(self, session, diagnosis_samples=300_000):
+        self.live = LiveCalibration(Table.from_mapping(session.table), settings=LiveSettings())
+        self.diagnosis = LiveDiagnosis(diagnosis_samples)
+        for block in blocks(session.imu, session.joints):
+            self.diagnosis.add(self.live.push(block))
+        self.live.solve(pending=True)
+
+    def question(self):
+        """Return the Question about the session."""
+        return self.diagnosis.question(self.live)
 
 
 @pytest.fixture(scope='module')
@@ -36,10 +42,10 @@ def hidden():
 
 
 def test_the_first_finding_is_that_of_the_verb(hidden):
-    live = live_of(hidden)
+    station = Station(hidden)
     table = Table.from_mapping(hidden.table)
     expected = diagnose_recording(lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), table).diagnosis
-    question = live.question()
+    question = station.question()
     assert len(question.windows) == expected.windows
     state = question.answer()
     first = expected.findings[0]
@@ -52,26 +58,25 @@ def test_the_first_finding_is_that_of_the_verb(hidden):
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
-    state = live_of(physics.make_session(3)).question().answer()
+    state = Station(physics.make_session(3)).question().answer()
     assert state.word == 'nothing found' and 'no effect of the catalogue' in state.message
 
 
-def test_without_windows_or_with_the_period_at_zero_nothing_is_asked(hidden):
-    assert LiveCalibration(Table.from_mapping(hidden.table)).question() is None
-    assert live_of(hidden, diagnosis_period=0.0).question() is None
+def test_without_windows_or_with_nothing_kept_nothing_is_asked(hidden):
+    assert LiveDiagnosis(300_000).question(LiveCalibration(Table.from_mapping(hidden.table))) is None
+    assert Station(hidden, diagnosis_samples=0).question() is None
 
 
 def test_windows_are_bounded_and_the_oldest_go(hidden):
-    live = live_of(hidden, diagnosis_samples=5000)
-    question = live.question()
+    question = Station(hidden, diagnosis_samples=5000).question()
     assert sum(len(window) for window in question.windows) <= 5000 + 2 * 2000 and question.forgotten > 0
     assert question.windows[-1].time[-1] > 0.9 * hidden.truth['temperature_c'].size / 100
-    full = live_of(hidden).question().windows
+    full = Station(hidden).question().windows
     assert [w.time[0] for w in question.windows] == [w.time[0] for w in full[-len(question.windows):]]
 
 
 def test_a_window_keeps_no_chunk_alive(hidden):
-    windows = live_of(hidden).question().windows
+    windows = Station(hidden).question().windows
     recent = RecentWindows(10**6)
     recent.add(windows[:3])
     assert all(np.shares_memory(w.force_s, r.force_s) is False for w, r in zip(windows, recent.list()))
@@ -145,8 +150,8 @@ def test_a_failure_is_a_status_and_zero_is_off():
 
 
 def test_what_stays_unexplained_is_said(hidden):
-    live = live_of(hidden)
-    diagnosis = diagnose(live.question().windows, live.table, live.question().model)
+    question = Station(hidden).question()
+    diagnosis = diagnose(question.windows, question.table, question.model)
     rest = {sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3) for sensor, found in diagnosis.unexplained.items()}
     state = describe(replace(diagnosis, findings=(), unexplained=rest))
     assert state.word == 'unexplained' and state.message.startswith('unexplained: ') and 'gyroscope' in state.message

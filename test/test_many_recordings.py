@@ -3,17 +3,22 @@
 import numpy as np
 import pytest
 
-from imu_calibration.estimation import solve
-from imu_calibration.least_squares import Accumulator
-from imu_calibration.noise import NoiseModel
-from imu_calibration.profiles import make_profile
+from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.noise_model import WindowNoise
+from imu_calibration.estimation.restricted_likelihood import OffsetLikelihood
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.whitening import predict_session_offsets, whiten
+from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel, coefficients, columns
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
-from imu_calibration.window_noise import OffsetLikelihood, WindowNoise, predict_session_offsets, whiten
-from imu_calibration.window_statistics import reduce_window
-from imu_calibration.windows import MotionGatherer, Window
+from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import NoiseModel
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})

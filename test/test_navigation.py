@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from figures import show
 
-from imu_calibration import navigation, zhang, zhang_claims, zhang_designs, zhang_joint
+from imu_calibration import navigation
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
-from imu_calibration.reference import Reference
+from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.papers import zhang2017_designs as zhang_designs
+from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
+from imu_calibration.papers import zhang2017_navigation as zhang_claims
+from imu_calibration.reference.reference_motion import Reference
 
-G = zhang.STANDARD_GRAVITY
+G = STANDARD_GRAVITY
 MODEL = zhang.printed_static_model()
 COSINES = zhang.static_model_from_matrix(MODEL.matrix, MODEL.bias).cosines
 ARMS = zhang.TABLE_3_ARMS

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from imu_calibration.noise import GRADES, NoiseModel, add_imu_noise, gauss_markov, jitter_stamps, quantise, read_encoders, realistic
+from imu_calibration.simulation.sensor_noise import (
+    GRADES,
+    NoiseModel,
+    add_imu_noise,
+    gauss_markov,
+    jitter_stamps,
+    quantise,
+    read_encoders,
+    realistic,
+)
 
 
 def test_white_noise_integrates_to_a_random_walk_of_its_density():

@@ -13,7 +13,7 @@ from catkin_pkg.package import parse_package
 
 import imu_calibration
 from imu_calibration import resources
-from imu_calibration.effects import catalogue
+from imu_calibration.effects.catalogue import catalogue
 from imu_calibration.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -117,7 +117,7 @@ def test_every_python_package_and_data_file_is_installed(installed):
     present = {str(path.relative_to(ROOT)) for pattern in ('config/*', 'launch/*.launch.py') for path in ROOT.glob(pattern)}
     assert present | {'package.xml', 'resource/imu_calibration'} == listed
     others = {path for path in (ROOT / 'imu_calibration').rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
-    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/templates'}
+    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/report/templates'}
 
 
 @pytest.mark.parametrize('name', ['pypi.txt', 'jazzy-ubuntu2404.txt', 'oldest.txt'])

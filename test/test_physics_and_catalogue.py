@@ -7,10 +7,11 @@ import pytest
 from physics import encoder_reading, make_session
 from physics_draw import EFFECTS
 
-from imu_calibration.effects import owner_of
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.sensor_model import SensorModel, predict
-from imu_calibration.turntable import Table
+from imu_calibration.effects.catalogue import owner_of
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3}

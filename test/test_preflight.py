@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from physics import TABLES, make_session, write_bag
+from physics import make_session, write_bag
 
-from imu_calibration.cli import main
-from imu_calibration.preflight import GOOD, NOTE, REFUSE, WARNING, Preflight
+from imu_calibration.cli.main import main
 from imu_calibration.preflight.axes import match_axes, signed_permutations
-from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.samples import SampleBlock
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
@@ -261,10 +262,10 @@ def test_a_joint_that_counts_backwards_is_left_handed(capsys, tmp_path, session)
 
 def test_counts_against_the_joints(capsys, tmp_path, session, table):
     """Seven times too fast is neither deg/s nor rad/s; the joints know."""
+    from imu_calibration.calibration.collector import Collector
+    from imu_calibration.effects.sensor_model import SensorModel
     from imu_calibration.preflight.joint_checks import against_joints
-    from imu_calibration.gathering import Collector
-    from imu_calibration.sensor_model import SensorModel
-    from imu_calibration.turntable import Table
+    from imu_calibration.reference.table import Table
     model, description = SensorModel(joint_names=session.joints.names), Table.from_mapping(session.table)
     for factor, expected in ((1.0, []), (7.0, ['rate_unit']), (180 / np.pi, ['rate_unit'])):
         collector = Collector(description, model)

@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 
-from imu_calibration import workflow
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.documents import from_text
-from imu_calibration.turntable import Table
-from imu_calibration.workflow_diagnosis import diagnose_recording
+from imu_calibration.reference.table import Table
 from msg_adapters.bag import open_recording
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
-BOTH = workflow.CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
+BOTH = CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
 SHAFTS = [('shaft_pitch_slow', 'yy', 0.985), ('shaft_yaw_medium', 'zz', 1.005)]
 
 
@@ -23,7 +25,7 @@ def opened(folder):
 
 
 @pytest.mark.parametrize('name, diagonal, scale', SHAFTS)
-@pytest.mark.parametrize('options', [workflow.CalibrationOptions(), BOTH], ids=['as_it_comes', 'with_lag'])
+@pytest.mark.parametrize('options', [CalibrationOptions(), BOTH], ids=['as_it_comes', 'with_lag'])
 def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, scale, options):
     """
     The scale along the shaft within 0.003 with and without the lag in the model, and the lag behind the encoder of 12-14 ms.
@@ -32,7 +34,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
     motor at 12 and 47 Hz, beyond what the model or the joint states follow, must not bend the scale.
     """
     table, blocks = opened(recordings / name)
-    calibration = workflow.calibrate([lambda: iter(blocks)], table, options).calibration
+    calibration = calibrate([lambda: iter(blocks)], table, options).calibration
     values, sds = (dict(zip(calibration.param_names, numbers)) for numbers in (calibration.values, calibration.sd))
     found = values[f'gyroscope.matrix.{diagonal}']
     assert abs(found - scale) < 0.003
@@ -68,7 +70,7 @@ def test_what_one_axis_cannot_show_is_held(recordings):
     folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        result = workflow.calibrate([lambda: recording.blocks(table.joint_names)], table)
+        result = calibrate([lambda: recording.blocks(table.joint_names)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
     assert all(status[f'gyroscope.matrix.{name}'] == 'held' for name in ('xx', 'xy', 'yx', 'yy', 'zx', 'zy'))
-    assert workflow.exit_code(result) == 3
+    assert exit_code(result) == 3

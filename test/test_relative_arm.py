@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand_document import read_imu
+from imu_calibration.by_hand.modulating_functions import make_windows
+from imu_calibration.by_hand.relative_arm import clipped, estimate_arm
+from imu_calibration.by_hand.workflow import read_imu
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.modulation import make_windows
-from imu_calibration.reference import lever_matrix
-from imu_calibration.relative_arm import clipped, estimate_arm
+from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.samples import ImuSamples
 
 ARM = np.array([0.012, -0.019, 0.004])

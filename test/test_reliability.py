@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from imu_calibration.documents import calibration_from_text
-from imu_calibration.samples import ImuSamples
 from live_sessions import assert_same, errors_in_sd, make_session, offline
+
+from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.samples import ImuSamples
 from msg_adapters.write import write_session
 
 pytest.importorskip('rclpy')

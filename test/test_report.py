@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from imu_calibration import navigation
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile
-from imu_calibration.report import calibration_report
+from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
 from imu_calibration.report.numbers import fixed, text
 from imu_calibration.report.readings import reading_tables
@@ -20,11 +23,10 @@ from imu_calibration.report.residuals import autocorrelation
 from imu_calibration.report.window_errors import window_errors
 from imu_calibration.report.worked_sample import worked_sample
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.units import with_sd
-from imu_calibration.workflow import CalibrationOptions, calibrate, calibrate_without_table
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
@@ -242,4 +244,3 @@ def test_a_browser_shows_it_without_errors_and_without_overflow(pages, tmp_path,
     assert found, done.stdout[:300]
     wide, flat, figures = map(int, found.groups())
     assert wide <= 0 and flat == 0 and figures >= 6
-

@@ -5,16 +5,16 @@ import re
 import numpy as np
 import pytest
 
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile
-from imu_calibration.report import diagnosis_report
-from imu_calibration.report.diagnosis_page import cause_of, chance, explained_share
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, explained_share
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
-from imu_calibration.workflow import CalibrationOptions, exit_code
-from imu_calibration.workflow_diagnosis import diagnose_recording
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'azimuth_deg': 0.0})

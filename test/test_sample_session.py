@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from imu_calibration import documents
-from imu_calibration.cli import main
+from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.cli.main import main
 
 BAG = Path(__file__).parents[1] / 'bags' / 'sample_session'
 
 
 def load(path):
     """Return the calibration in a file."""
-    return documents.calibration_from_text(Path(path).read_text())
+    return calibration_from_text(Path(path).read_text())
 
 
 @pytest.fixture(scope='module')
@@ -58,8 +59,8 @@ def test_compare_with_the_truth(output, capsys):
 
 def test_compensated_bag(output, tmp_path):
     """The corrected topic stands beside the others and is closer to the reference."""
-    from imu_calibration.evaluation import before_and_after, session_truth
-    from imu_calibration.turntable import Table
+    from imu_calibration.compensation.evaluation import before_and_after, session_truth
+    from imu_calibration.reference.table import Table
     from msg_adapters.bag import open_recording
     corrected = tmp_path / 'corrected'
     assert main(['compensate', str(BAG), '--calibration', str(output / 'calibration.yaml'), '--output', str(corrected)]) == 0

@@ -6,22 +6,23 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import yaml
-
-from imu_calibration.errors import InputError
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.joint_trajectory import TableMotion, trajectory_from
-from imu_calibration.live_calibration import LiveSettings
-from imu_calibration.live_simulation import LiveSimulation
-from imu_calibration.noise import NoiseModel
-from imu_calibration.profiles import make_profile
-from imu_calibration.settings import WindowSettings
-from imu_calibration.simulation import SimulationOptions, simulate
 from live_sessions import TABLE, make_session
+
+from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.errors import InputError
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.simulation.joint_trajectory import TableMotion, trajectory_from
+from imu_calibration.simulation.live import LiveSimulation
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import NoiseModel
+from imu_calibration.simulation.session import SimulationOptions, simulate
 from msg_adapters.write import write_session
 
 pytest.importorskip('rclpy')
-from imu_calibration.nodes.processes import node_command  # noqa: E402
 from live_station import ROOT, Station, taken  # noqa: E402
+
+from imu_calibration.nodes.processes import node_command  # noqa: E402
 
 START = 1_800_000_000
 
@@ -99,7 +100,7 @@ def test_the_wander_goes_on_from_block_to_block():
 
 
 def test_parameter_files_hold_the_defaults_of_the_settings():
-    from imu_calibration.live_by_hand import LiveByHandSettings
+    from imu_calibration.by_hand.live import LiveByHandSettings
     from imu_calibration.nodes.bag_player_node import PlayerSettings
     from imu_calibration.nodes.calibration_node import CalibrationNodeSettings
     from imu_calibration.nodes.simulator_node import SimulatorSettings

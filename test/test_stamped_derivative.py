@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from imu_calibration.differentiation import CausalDerivative
-from imu_calibration.stamped_derivative import WARM_UP, StampedDerivative, typical_period
 from test_differentiation import slopes
+
+from imu_calibration.compensation.angular_acceleration import WARM_UP, CausalDerivative, StampedDerivative, typical_period
 
 PERIOD_NS = 5_000_000
 

@@ -5,9 +5,9 @@ import pytest
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
-from imu_calibration.settings import WindowSettings
-from imu_calibration.still_search import find_still
-from imu_calibration.stream_check import clean_samples
+from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.segmentation.stream_cleaning import clean_samples
+from imu_calibration.segmentation.window_settings import WindowSettings
 
 HZ = 100
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.stream_check import StreamCheck, clean_samples
+from imu_calibration.segmentation.stream_cleaning import StreamCheck, clean_samples
 
 S = 10 ** 9
 START = 1_700_000_000 * S

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration import gathering, least_squares
-from imu_calibration.estimation import solve
-from imu_calibration.gathering import gather
-from imu_calibration.profiles import make_profile
+from imu_calibration.calibration import collector as gathering
+from imu_calibration.calibration.collector import gather
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation import accumulator as least_squares
+from imu_calibration.estimation.solver import solve
+from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.samples import SampleBlock
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping(yaml.safe_load(config_file('table_three_axis.yaml').read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.earth import earth_rate_n
 from imu_calibration.errors import InputError
-from imu_calibration.joint_motion import JointMotion
-from imu_calibration.reference import skew
-from imu_calibration.turntable import Joint, Table, axis_error_directions, reference_motion, tilt, with_axis_errors
+from imu_calibration.reference.earth import earth_rate_n
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.reference_motion import skew
+from imu_calibration.reference.table import Joint, Table, axis_error_directions, tilt, with_axis_errors
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
               'gravity': 9.81}

@@ -9,10 +9,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from validation import arm_live, ferraris, held_out, mpu9150, run, simulated_table, xsens   # noqa: E402
-from validation.recordings import load, reference   # noqa: E402
-from validation.second_opinions import Forward, fit_norm   # noqa: E402
-from validation.section import Section   # noqa: E402
+from validation import arm_live, ferraris, held_out, mpu9150, run, simulated_table, xsens  # noqa: E402
+from validation.recordings import load, reference  # noqa: E402
+from validation.second_opinions import Forward, fit_norm  # noqa: E402
+from validation.section import Section  # noqa: E402
 
 G = 9.81
 

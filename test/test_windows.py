@@ -6,12 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_calibration.errors import InputError
-from imu_calibration.motion_chunks import JOINT_WAIT
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.settings import WindowSettings
-from imu_calibration.trajectory import MotionBuilder, Profile
-from imu_calibration.turntable import Table, reference_motion
-from imu_calibration.windows import MotionGatherer
+from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
 START = 1_700_000_000 * 10 ** 9
 NAMES = ('outer', 'middle', 'inner')

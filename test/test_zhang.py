@@ -6,12 +6,23 @@ import numpy as np
 import pytest
 from figures import show
 
-from imu_calibration import zhang
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.zhang_designs import DESIGNS, average_headings, design_runs, face, oscillation, skewed_axes, spin, stack_runs, two_axis
-from imu_calibration.zhang_joint import PARAM_NAMES, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
+from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.papers.zhang2017_designs import (
+    DESIGNS,
+    average_headings,
+    design_runs,
+    face,
+    oscillation,
+    skewed_axes,
+    spin,
+    stack_runs,
+    two_axis,
+)
+from imu_calibration.papers.zhang2017_joint_fit import PARAM_NAMES, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
 
-G = zhang.STANDARD_GRAVITY
+G = STANDARD_GRAVITY
 MG = 1e-3 * G
 PRINTED = zhang.printed_static_model()
 COSINES = zhang.static_model_from_matrix(PRINTED.matrix, PRINTED.bias).cosines

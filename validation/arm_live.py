@@ -9,11 +9,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand_document import calibrate_recording_by_hand
-from imu_calibration.compensation import Transfer, compensate
-from imu_calibration.documents import calibration_from_text, calibration_to_text
+from imu_calibration.by_hand.relative_arm import clipped, estimate_arm
+from imu_calibration.by_hand.workflow import calibrate_recording_by_hand
+from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
+from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.nodes.processes import NodeProcesses, local_environment
-from imu_calibration.relative_arm import clipped, estimate_arm
 from msg_adapters.bag import open_recording
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.by_hand import KnownTurn, calibrate_by_hand
+from imu_calibration.by_hand.calibrate import KnownTurn, calibrate_by_hand
 from validation.recordings import load, reference
 from validation.second_opinions import FACES, TURNS, accelerometer_of, ferraris, installed
 from validation.section import Section, text
@@ -114,4 +114,3 @@ def run(folder, plots):
                      sensitivity='estimates it' if sensitivity else 'leaves it out, since six attitudes do not show it',
                      weak=', '.join(weak) or 'nothing'))
     return section
-

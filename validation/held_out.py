@@ -3,9 +3,10 @@
 import numpy as np
 from scipy.stats import t
 
-from imu_calibration.by_hand import calibrate_by_hand
-from imu_calibration.still_search import find_still
-from validation.ferraris import GRAVITY, NAME as FERRARIS, RATE_HZ, calibrate_sections, known_turns
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.segmentation.static_detector import find_still
+from validation.ferraris import GRAVITY, RATE_HZ, calibrate_sections, known_turns
+from validation.ferraris import NAME as FERRARIS
 from validation.recordings import BY_HAND, gravity_of, label, load, reference
 from validation.second_opinions import FACES, Forward, accelerometer_of, ferraris, fit_norm, installed
 from validation.section import Section, text

@@ -14,15 +14,14 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
-from imu_calibration import __version__   # noqa: E402
-from imu_calibration.errors import ImuCalibrationError   # noqa: E402
-from validation.recordings import VARIABLE, data_folder   # noqa: E402
-from validation.section import Section, claims_table, text   # noqa: E402
+from imu_calibration import __version__  # noqa: E402
+from imu_calibration.errors import ImuCalibrationError  # noqa: E402
+from validation.recordings import VARIABLE, data_folder  # noqa: E402
+from validation.section import Section, claims_table, text  # noqa: E402
 
 SECTIONS = ('shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'held_out', 'inspecting', 'diagnosing')
 HEADING = '## How good is it\n'
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
-
 
 
 def versions():

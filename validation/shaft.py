@@ -1,16 +1,17 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
-from imu_calibration import workflow
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.documents import from_text
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.turntable import Table
+from imu_calibration.reference.table import Table
 from msg_adapters.bag import open_recording
 from validation.recordings import SHAFT
 from validation.section import Section, text
 
 KNOWN = {'shaft_pitch_slow': ('yy', 0.985), 'shaft_yaw_medium': ('zz', 1.005)}
 """Which entry lies along the shaft, and its known value."""
-WITH_LAG = workflow.CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
+WITH_LAG = CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
 LAG = ('gyroscope.gyro_bandwidth.time_constant', 'reference.time_offset.offset')
 
 
@@ -25,9 +26,9 @@ def calibrations(folder, name):
     """Return {'default', 'with lag': Calibration or the refusal as text}."""
     table, blocks = read(folder, name)
     found = {}
-    for what, options in (('default', workflow.CalibrationOptions()), ('with lag', WITH_LAG)):
+    for what, options in (('default', CalibrationOptions()), ('with lag', WITH_LAG)):
         try:
-            found[what] = workflow.calibrate([lambda: iter(blocks)], table, options).calibration
+            found[what] = calibrate([lambda: iter(blocks)], table, options).calibration
         except ImuCalibrationError as error:
             found[what] = str(error)
     return found

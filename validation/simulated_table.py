@@ -8,9 +8,9 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration import workflow
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.reference.table import Joint, Table
 from imu_calibration.samples import ImuSamples, JointSamples
-from imu_calibration.turntable import Joint, Table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 from validation.figures import new_figure
@@ -84,7 +84,7 @@ def calibrate_through_a_bag(imu, joints):
         write_session(path, imu, joints)
         with open_recording(path) as recording:
             blocks = list(recording.blocks(table.joint_names))
-    return workflow.calibrate([lambda: iter(blocks)], table).calibration
+    return calibrate([lambda: iter(blocks)], table).calibration
 
 
 def compare(calibration):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.by_hand import calibrate_by_hand
-from imu_calibration.still_search import find_still
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.segmentation.static_detector import find_still
 from validation.recordings import gravity_of, load, nominal_of, reference
 from validation.section import Section, listed, text
 

@@ -4,9 +4,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from imu_calibration import documents, workflow
-from imu_calibration.cli import files, recordings
-from imu_calibration.cli.fleet_pool import jobs_for, process_mapper
+from imu_calibration import files
+from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.cli import recordings
+from imu_calibration.cli.pool import jobs_for, process_mapper
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import show_calibration, warn
 
@@ -43,18 +47,18 @@ def _into(folder, options, settings, table):
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
         provenance = hashing.submit(recordings.provenance_of, options.bags, options)
         if table is None:
-            result = workflow.calibrate_without_table(sources, settings, options.gravity)
+            result = calibrate_without_table(sources, settings, options.gravity)
         else:
             result = _on_table(sources, table, settings, options.bags, jobs)
         result = replace(result, calibration=replace(result.calibration, provenance=result.calibration.provenance | provenance.result()))
     warn(result.calibration.statistics['preflight'])
-    text = documents.calibration_to_text(result.calibration)
+    text = calibration_to_text(result.calibration)
     if not options.no_report:
-        from imu_calibration.report import calibration_report
+        from imu_calibration.report.calibration_page import calibration_report
         files.write_text(folder / 'report.html', calibration_report(result))
     files.write_text(folder / 'calibration.yaml', text)
     show_calibration(result, folder, report=not options.no_report)
-    return workflow.exit_code(result)
+    return exit_code(result)
 
 
 def _on_table(sources, table, settings, bags, jobs):
@@ -63,4 +67,4 @@ def _on_table(sources, table, settings, bags, jobs):
     names = [name if names.count(name) == 1 else str(bag) for name, bag in zip(names, bags, strict=True)]
     with progress_bar('recordings', len(bags) if jobs > 1 else 0, 'recordings') as advance:
         mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-        return workflow.calibrate(sources, table, settings, mapper=mapper, names=names)
+        return calibrate(sources, table, settings, mapper=mapper, names=names)

@@ -1,7 +1,7 @@
 """``imu_calibration compare``: whether two calibrations agree."""
 
-from imu_calibration import comparison
-from imu_calibration.cli import files
+from imu_calibration import files
+from imu_calibration.calibration import comparison
 from imu_calibration.cli.show import console
 from imu_calibration.units import for_people, with_sd
 

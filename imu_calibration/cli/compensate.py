@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from imu_calibration.compensation_stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
-from imu_calibration.cli import files, recordings
+from imu_calibration import files
+from imu_calibration.cli import recordings
 from imu_calibration.cli.progress import progress_bar
+from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
 
 NAME = 'compensate'

@@ -2,10 +2,13 @@
 
 import json
 
-from imu_calibration import documents, workflow, workflow_diagnosis
-from imu_calibration.cli import files, recordings
+from imu_calibration import files
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.cli import recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, warn
+from imu_calibration.diagnosis.workflow import diagnose_recording, diagnose_without_table
 
 NAME = 'diagnose'
 HELP = 'Show what the model gets wrong, name the cause, extend the model, and measure the gain on data that were not fitted.'
@@ -35,17 +38,17 @@ def _into(folder, options, settings, table):
     provenance = recordings.provenance_of([options.bag], options)
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:
-            result = workflow_diagnosis.diagnose_without_table(source, settings, options.gravity, provenance, advance)
+            result = diagnose_without_table(source, settings, options.gravity, provenance, advance)
         else:
-            result = workflow_diagnosis.diagnose_recording(source, table, settings, provenance, advance)
+            result = diagnose_recording(source, table, settings, provenance, advance)
     warn(result.calibration.statistics['preflight'])
-    from imu_calibration.report import diagnosis_report
+    from imu_calibration.report.diagnosis_page import diagnosis_report
     page = diagnosis_report(result)
     files.write_text(folder / 'diagnosis.json', json.dumps(result.document, indent=1) + '\n')
     files.write_text(folder / 'report.html', page)
-    files.write_text(folder / 'calibration.yaml', documents.calibration_to_text(result.calibration))
+    files.write_text(folder / 'calibration.yaml', calibration_to_text(result.calibration))
     out = console()
     for line in result.lines:
         out.print(line, soft_wrap=True)
     out.print(f'written: diagnosis.json, calibration.yaml and report.html in {folder}', soft_wrap=True)
-    return workflow.exit_code(result)
+    return exit_code(result)

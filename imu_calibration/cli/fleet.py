@@ -1,6 +1,7 @@
 """``imu_calibration fleet``: many units, one result each, a summary table."""
 
-from imu_calibration.cli import files, recordings
+from imu_calibration import files
+from imu_calibration.cli import recordings
 
 NAME = 'fleet'
 HELP = 'Calibrate a folder of many units: one result each, and a summary table with the spread of each parameter.'

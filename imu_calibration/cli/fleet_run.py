@@ -5,12 +5,14 @@ import io
 import math
 from argparse import Namespace
 
-from imu_calibration.cli import files
-from imu_calibration.cli.fleet_pool import cluster_mapper, jobs_for, process_mapper
+from imu_calibration import files
+from imu_calibration.calibration.fleet import FleetStep, fleet_exit_code, summarise
 from imu_calibration.cli.fleet_units import find_units, unit_of
+from imu_calibration.cli.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, warn
-from imu_calibration.fleet import FleetStep, fleet_exit_code, summarise
+from imu_calibration.report.calibration_page import calibration_report
+from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
 
 HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest', 'highest_unit')
@@ -24,7 +26,7 @@ def run_fleet(options, table, settings):
     folder = files.make_folder(options.output)
     with progress_bar('units', len(units), 'units') as advance:
         mapper = _mapper(options, len(units), lambda result: advance(1))
-        results = mapper(FleetStep(table, settings, with_report=not options.no_report), units)
+        results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
     spreads = summarise(results)
     for result in results:
         for name, text in (result.files or {}).items():
@@ -101,6 +103,4 @@ def show_fleet(results, spreads, folder):
 
 def summary_html(results, spreads):
     """Return the summary as one page."""
-    from jinja2 import Environment, PackageLoader
-    template = Environment(loader=PackageLoader('imu_calibration'), autoescape=True).get_template('fleet.html')
-    return template.render(results=results, columns=COLUMNS, rows=[shown(spread) for spread in spreads])
+    return render('fleet.html', results=results, columns=COLUMNS, rows=[shown(spread) for spread in spreads])

@@ -3,9 +3,9 @@
 from functools import partial
 from pathlib import Path
 
+from imu_calibration.calibration.fleet import Unit
 from imu_calibration.cli import recordings
 from imu_calibration.errors import InputError
-from imu_calibration.fleet import Unit
 
 STORAGE = ('.db3', '.mcap', '.bag')
 

@@ -2,13 +2,16 @@
 
 from collections import Counter
 
-from imu_calibration import workflow
-from imu_calibration.cli import files, recordings
+from imu_calibration import files
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.cli import recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.preflight import REFUSE, Preflight, unusable
-from imu_calibration.stream_check import StreamCheck
+from imu_calibration.preflight.checks import Preflight, unusable
+from imu_calibration.preflight.finding import REFUSE
+from imu_calibration.segmentation.stream_cleaning import StreamCheck
 
 NAME = 'inspect'
 HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions found, and which parameters the recording can determine.'
@@ -86,7 +89,7 @@ def _step(step_ns):
 def _judge(options, settings, table, out, code):
     source = recordings.source_of(options.bag, options, table.joint_names)
     try:
-        result = workflow.calibrate([source], table, settings)
+        result = calibrate([source], table, settings)
     except ImuCalibrationError as error:
         out.print(f'not usable for calibration: {error}', soft_wrap=True, markup=False)
         return 3
@@ -100,4 +103,4 @@ def _judge(options, settings, table, out, code):
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
     for direction in result.calibration.undetermined:
         out.print(f'needs: {direction["needs"]}  ({", ".join(direction["parameters"])})', soft_wrap=True)
-    return max(code, workflow.exit_code(result))
+    return max(code, exit_code(result))

@@ -6,9 +6,8 @@ from importlib import import_module
 
 import imu_calibration
 
-VERBS = {'inspect': 'inspect', 'calibrate': 'calibrate', 'compensate': 'compensate', 'diagnose': 'diagnose', 'simulate': 'simulate',
-         'compare': 'compare', 'arm': 'relative', 'fleet': 'fleet'}
-"""Verb -> module."""
+VERBS = ('inspect', 'calibrate', 'compensate', 'diagnose', 'simulate', 'compare', 'arm', 'fleet')
+"""Each is a module of this package with NAME, HELP, `add_arguments` and `run`."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -28,7 +27,7 @@ def make_parser(verb=None):
     parser.add_argument('--version', action='version', version=f'imu_calibration {imu_calibration.__version__}')
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, parser_class=OneLineParser)
     for name in [verb] if verb in VERBS else VERBS:
-        module = import_module(f'imu_calibration.cli.{VERBS[name]}')
+        module = import_module(f'imu_calibration.cli.{name}')
         verb = verbs.add_parser(module.NAME, help=module.HELP, description=module.HELP)
         module.add_arguments(verb)
         verb.set_defaults(run=module.run)

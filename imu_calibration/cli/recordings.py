@@ -4,13 +4,14 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from imu_calibration.cli import files
+from imu_calibration import files
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.errors import InputError
-from imu_calibration.gathering import NominalScaling
 from imu_calibration.resources import config_file
-from imu_calibration.settings import WindowSettings, describe, override
-from imu_calibration.workflow import CalibrationOptions
+from imu_calibration.samples import NominalScaling
+from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.settings import describe, override
 from msg_adapters.bag import open_recording
 from msg_adapters.read_ahead import read_ahead
 
@@ -100,8 +101,6 @@ def source_of(path, options, joint_names=None, want_joints=True, imu_topic=None,
     """Return a callable that yields the blocks of a recording, each time anew."""
     topics = (imu_topic or options.imu_topic, getattr(options, 'joint_topic', None), getattr(options, 'temperature_topic', None))
     return partial(read_blocks, str(path), topics, joint_names, want_joints, Path(path).name, quiet)
-
-
 
 
 def provenance_of(paths, options):

@@ -1,7 +1,7 @@
 """What the verbs print: short tables on standard output."""
 
-from imu_calibration import workflow
-from imu_calibration.preflight import SEVERITIES
+from imu_calibration.calibration.result import summary
+from imu_calibration.preflight.finding import SEVERITIES
 from imu_calibration.units import for_people, with_sd
 
 
@@ -40,7 +40,7 @@ def show_calibration(result, folder, report=True):
     """Print the parameters, the verdict and where the files are."""
     from rich.table import Table
     out, calibration = console(), result.calibration
-    verdict, lines = workflow.summary(result)
+    verdict, lines = summary(result)
     table = Table(title=None, box=None, pad_edge=False)
     for heading in ('parameter', 'value', 'sd', 'unit', 'status'):
         table.add_column(heading, justify='right' if heading in ('value', 'sd') else 'left')

@@ -5,16 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration import documents
-from imu_calibration.calibration import Calibration
-from imu_calibration.cli import files
+from imu_calibration import documents, files
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile, profile_names
+from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
-from imu_calibration.sensor_model import SensorModel
-from imu_calibration.simulation import SimulationOptions, hidden_effect, random_values, simulate
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.profiles import make_profile, profile_names
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values, simulate
 
 NAME = 'simulate'
 HELP = 'Write a bag from a simulated session on a turntable, and truth.yaml beside its data.'
@@ -57,7 +56,7 @@ def run(options):
     write_session(options.output, imu, joints, temperature, storage=options.storage, **packed)
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), ('determined',) * len(values), settings.frame_id,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': options.seed, 'profile': options.profile}})
-    files.write_text(f'{options.output}/truth.yaml', documents.calibration_to_text(truth))
+    files.write_text(f'{options.output}/truth.yaml', calibration_to_text(truth))
     files.write_text(f'{options.output}/table.yaml', documents.to_text(table.to_mapping()))
     print(f'written: {options.output} ({profile.duration:.0f} s, {len(imu)} Imu, {len(joints)} JointState), with truth.yaml and table.yaml')
     return 0

@@ -1,7 +1,6 @@
-"""What the model gets wrong: the cause, by evidence on windows that were held out, and what stays unexplained."""
+"""
+What the model gets wrong, and why.
 
-from imu_calibration.diagnosis.diagnose import diagnose
-from imu_calibration.diagnosis.document import to_mapping
-from imu_calibration.diagnosis.result import Candidate, Diagnosis, Finding
-
-__all__ = ['Candidate', 'Diagnosis', 'Finding', 'diagnose', 'to_mapping']
+In: windows and a sensor model. Out: a `Diagnosis`: findings, the extended model, the gain on held-out windows.
+Read `diagnose` first.
+"""

@@ -4,19 +4,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.diagnosis import censoring
-from imu_calibration.diagnosis.candidates import testable_effects
-from imu_calibration.diagnosis.extended import extended_solution
-from imu_calibration.diagnosis.gain import Gain, heldout_gain, residual_traces
+from imu_calibration.diagnosis.explained_share import Explained, pruned, sensors_of
+from imu_calibration.diagnosis.extended_model import extended_solution
+from imu_calibration.diagnosis.gain import Gain, heldout_gain
+from imu_calibration.diagnosis.linearisation import Attempt, without_saturation
+from imu_calibration.diagnosis.questions import testable_effects
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
-from imu_calibration.diagnosis.sentences import sentence
-from imu_calibration.diagnosis.separation import separating_motion
-from imu_calibration.diagnosis.session_fit import Attempt, without_saturation
-from imu_calibration.diagnosis.stories import Explained, pruned, sensors_of
+from imu_calibration.diagnosis.saturation import (
+    find_saturation,
+    may_be_clipped,
+    measured,
+    noise_at_rest,
+    predictions,
+    simple_fit,
+    without_clipped,
+)
+from imu_calibration.diagnosis.sentences import candidates_of, sentence
+from imu_calibration.diagnosis.separating_motion import separating_motion
+from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.diagnosis.unexplained import unexplained
-from imu_calibration.diagnosis.verdicts import candidates_of
-from imu_calibration.effects import find_effect
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import find_effect
 from imu_calibration.errors import NotObservableError
 
 LINEARISATIONS = 3
@@ -142,22 +150,22 @@ def with_joints_of(model, table):
 
 def _without_clipping(windows, table, model):
     """Return (windows without samples that a limit spoils, the limits found)."""
-    suspects = [sensor for sensor in SENSORS if censoring.may_be_clipped(windows, sensor)]
+    suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
     if not suspects:
         return windows, []
-    limits = {sensor: float(max(np.abs(censoring.measured(w, sensor)).max() for w in windows)) for sensor in suspects}
-    noise_sd = {sensor: censoring.noise_at_rest(windows, sensor) for sensor in SENSORS}
+    limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
+    noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
     kept, found = windows, []
     for _ in range(2):
-        fit = censoring.simple_fit(kept, table, model)
-        predicted = censoring.predictions(windows, table, model, fit)
-        kept = censoring.without_clipped(windows, predicted, limits, noise_sd)
-    fit = censoring.simple_fit(kept, table, model)
-    predicted = censoring.predictions(windows, table, model, fit)
-    found = [limit for limit in (censoring.find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
+        fit = simple_fit(kept, table, model)
+        predicted = predictions(windows, table, model, fit)
+        kept = without_clipped(windows, predicted, limits, noise_sd)
+    fit = simple_fit(kept, table, model)
+    predicted = predictions(windows, table, model, fit)
+    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
     if not found:
         return windows, []
-    return censoring.without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found
+    return without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found
 
 
 def _assembled(windows, table, found):

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import chi2
 
-from imu_calibration.diagnosis.session_noise import KINDS, normal_matrix, white_means
+from imu_calibration.diagnosis.noise import KINDS, normal_matrix, white_means
 from imu_calibration.effects.base import SENSORS
 
 FOLDS = 6

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.bands import band_misfit
-from imu_calibration.diagnosis.session_noise import white_noise
+from imu_calibration.diagnosis.noise import white_noise
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.band_misfit import band_misfit
 
 STRONG = 1e-9
 """Directions of scaled columns with less than this share of the largest eigenvalue do not count."""

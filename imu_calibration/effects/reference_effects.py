@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration import turntable
-from imu_calibration.chain import rotation
 from imu_calibration.effects.base import Effect
+from imu_calibration.reference.kinematics import rotation
+from imu_calibration.reference.table import shifted, tilt, with_encoder_harmonics
 
-ARCMIN = np.pi / 180 / 60
 LAGUERRE = np.polynomial.laguerre.laggauss(5)
 """Nodes and weights that turn an exponential lag into a weighted mean of delays: int e^-x f(t - tau x) dx."""
 ORDERS = (1, 2)
@@ -16,7 +15,7 @@ ORDERS = (1, 2)
 
 
 def _tilt(table, motion, values):
-    return [(1.0, turntable.tilt(table, values), motion)]
+    return [(1.0, tilt(table, values), motion)]
 
 
 def _tilt_derivative(ref):
@@ -45,17 +44,17 @@ def _zero(table, motion, values):
 def _harmonics(table, motion, values):
     amplitudes = np.reshape(values, (-1, len(ORDERS), 2))
     for index, order in enumerate(ORDERS):
-        motion = turntable.with_encoder_harmonics(motion, order, amplitudes[:, index, 0], amplitudes[:, index, 1])
+        motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], amplitudes[:, index, 1])
     return [(1.0, table, motion)]
 
 
 def _late(table, motion, values):
-    return [(1.0, table, turntable.shifted(motion, values[0]))]
+    return [(1.0, table, shifted(motion, values[0]))]
 
 
 def _lag(table, motion, values):
     """First-order low-pass of time constant tau: y = int e^-x u(t - tau x) dx, by Gauss-Laguerre quadrature."""
-    return [(weight, table, turntable.shifted(motion, values[0] * node)) for node, weight in zip(*LAGUERRE)]
+    return [(weight, table, shifted(motion, values[0] * node)) for node, weight in zip(*LAGUERRE)]
 
 
 def _earth(values, point):
@@ -98,4 +97,3 @@ def reference_effects(joint_names):
         _lag_effect('accelerometer'),
         _lag_effect('gyroscope'),
     )
-

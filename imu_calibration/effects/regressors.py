@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.reference import lever_matrix
+from imu_calibration.reference.reference_motion import lever_matrix
 
 SQUARES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 CUBES = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (1, 1, 0), (1, 1, 2), (2, 2, 0), (2, 2, 1), (0, 1, 2))

@@ -2,12 +2,10 @@
 
 import numpy as np
 
+from imu_calibration.constants import DEG, MILLI_G, STANDARD_GRAVITY
 from imu_calibration.effects.base import MATRIX, PRODUCTS, VECTOR, Effect
 from imu_calibration.effects.regressors import cube_coefficients, signed_coefficients, square_coefficients
 
-MG = 9.80665e-3
-G = 9.80665
-DEG = np.pi / 180
 INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 
@@ -79,8 +77,8 @@ def _pair(sensor):
     short, group, unit = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[sensor], INPUT[sensor], UNIT[sensor]
     accel = sensor == 'accelerometer'
     what = 'accelerometer' if accel else 'gyroscope'
-    small = MG if accel else 0.01 * DEG
-    full = G if accel else 100 * DEG
+    small = MILLI_G if accel else 0.01 * DEG
+    full = STANDARD_GRAVITY if accel else 100 * DEG
     poses, fast = ('static_dense', 'centrifuge') if accel else ('three_speeds', 'three_speeds')
     return (
         Effect('bias', sensor, VECTOR, (3,), unit, small, 2.0 if accel else 0.2, f'The {what} has an offset.', ('static_poses',), 'exact',
@@ -91,35 +89,35 @@ def _pair(sensor):
                f'The {what} output bends with the square of its input (K2), so that equal inputs of opposite sign do not give opposite readings.',
                (poses, fast), 'exact', groups=(group + '_squares',),
                coefficients=_along_axis(f'{short}_quadratic', group + '_squares', square_coefficients),
-               plausible=(('consumer', 4e-4 / G if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: 0.1 % / 0.5 % of range'),)),
+               plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: 0.1 % / 0.5 % of range'),)),
         Effect(f'{short}_scale_asymmetry', sensor, VECTOR, (3,), '1', 1e-3 if not accel else 1e-3, 0.05,
                f'The {what} scale factor differs between positive and negative input.', (poses, fast), 'exact', groups=(group + '_signed',),
                coefficients=_along_axis(f'{short}_scale_asymmetry', group + '_signed', signed_coefficients),
                plausible=(('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),)),
         Effect(f'{short}_thermal_bias', sensor, VECTOR, (3,), f'{unit}/K', 0.1 * small, 10 * small, f'The {what} bias follows the temperature.',
                ('warm_up',), 'exact', groups=('temperature',), coefficients=_thermal_bias(f'{short}_thermal_bias'), needs=('temperature',),
-               plausible=(('consumer', 2 * MG if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),)),
+               plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),)),
         Effect(f'{short}_thermal_scale', sensor, VECTOR, (3,), '1/K', 1e-4, 0.01, f'The {what} scale factor follows the temperature.', ('warm_up',),
                'exact', groups=(group + '_temperature',), coefficients=_thermal_scale(f'{short}_thermal_scale', group + '_temperature'),
                needs=('temperature',) if accel else ('temperature', 'rotation'), plausible=(('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),)),
         Effect(f'{short}_bias_drift', sensor, VECTOR + ('time_constant',), (4,), (unit, unit, unit, 's'), small, 50 * small,
                f'The {what} bias settles after turn-on like 1 - exp(-t / time constant), with no temperature to explain it.', ('warm_up',), 'none',
                groups=(f'{short}_warm_up',), coefficients=_drift(f'{short}_bias_drift', f'{short}_warm_up'),
-               plausible=(('consumer', 20 * MG if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),)),
+               plausible=(('consumer', 20 * MILLI_G if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),)),
         Effect(f'{short}_saturation', sensor, ('level',), (), unit, 0.01 * full, 100 * full,
                f'The {what} output is clipped: it cannot follow inputs beyond its range.', ('fast_spin',), 'flagged', prior=np.inf),
     )
 
 
 ACCELEROMETER = _pair('accelerometer') + (
-    Effect('accel_cubic', 'accelerometer', VECTOR, (3,), '(m/s^2)^-2', MG / G**3, 100 * MG / G**3,
+    Effect('accel_cubic', 'accelerometer', VECTOR, (3,), '(m/s^2)^-2', MILLI_G / STANDARD_GRAVITY**3, 100 * MILLI_G / STANDARD_GRAVITY**3,
            'The accelerometer output bends with the cube of its input (K3), so that its scale factor changes with the input.',
            ('centrifuge',), 'exact', groups=('force_cubes',), coefficients=_along_axis('accel_cubic', 'force_cubes', cube_coefficients),
-           plausible=(('consumer', 1e-4 / G**2, 'field catalogue 6.1: some 10 ug/g^3'),)),
-    Effect('accel_cross_product', 'accelerometer', PRODUCTS, (3, 3), '(m/s^2)^-1', MG / G**2, 100 * MG / G**2,
+           plausible=(('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),)),
+    Effect('accel_cross_product', 'accelerometer', PRODUCTS, (3, 3), '(m/s^2)^-1', MILLI_G / STANDARD_GRAVITY**2, 100 * MILLI_G / STANDARD_GRAVITY**2,
            'The accelerometers are pendulums that give way: products of specific-force components enter the output (Avrutov 2017, eq. 4).',
            ('static_dense',), 'exact', groups=('force_squares',), coefficients=_products('accel_cross_product', 'force_squares'),
-           plausible=(('consumer', 1e-3 / G, 'Avrutov 2017, sample 2: 1 mV/g^2'),)),
+           plausible=(('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),)),
     Effect('accel_size_effect', 'accelerometer', MATRIX, (3, 3), 'm', 1e-3, 0.03,
            'The three accelerometers sit at different points: each has a lever arm of its own (Zhang 2017, eq. 11-17).',
            ('oscillate_x', 'oscillate_y', 'oscillate_z'), 'exact', groups=('lever',), coefficients=_size_effect, needs=('rotation',),
@@ -130,10 +128,10 @@ ACCELEROMETER = _pair('accelerometer') + (
 )
 
 GYROSCOPE = _pair('gyroscope') + (
-    Effect('gyro_g_sensitivity', 'gyroscope', MATRIX, (3, 3), '(rad/s)/(m/s^2)', 0.01 * DEG / G, 1.0 * DEG / G,
+    Effect('gyro_g_sensitivity', 'gyroscope', MATRIX, (3, 3), '(rad/s)/(m/s^2)', 0.01 * DEG / STANDARD_GRAVITY, 1.0 * DEG / STANDARD_GRAVITY,
            'The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).', ('static_poses',), 'exact',
            groups=('force',), coefficients=_linear('gyro_g_sensitivity', 'force'),
-           plausible=(('consumer', 0.1 * DEG / G, 'ADIS16460 data sheet: 0.01 deg/s/g'),)),
+           plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),)),
     Effect('gyro_rate_product', 'gyroscope', PRODUCTS, (3, 3), '(rad/s)^-1', 1e-3, 0.3,
            'Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).', ('two_axis',), 'exact',
            groups=('rate_squares',), coefficients=_products('gyro_rate_product', 'rate_squares'), needs=('rotation',),

@@ -9,10 +9,11 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from imu_calibration import accumulator_state
-from imu_calibration.cli import files
-from imu_calibration.live_by_hand import LiveByHand, LiveByHandSettings
-from imu_calibration.live_calibration import LiveCalibration, LiveSettings
+from imu_calibration import files
+from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
+from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.nodes.batches import BatchSubscription
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, accumulator_file
@@ -21,8 +22,8 @@ from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
 from imu_calibration.resources import config_file
-from imu_calibration.settings import WindowSettings, setting
-from imu_calibration.workflow import CalibrationOptions
+from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.settings import setting
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.live import LiveGatherer
 

@@ -6,14 +6,14 @@ import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from imu_calibration.documents import calibration_to_text
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.calibration.result import summary
+from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis
 from imu_calibration.errors import ImuCalibrationError, NotObservableError
-from imu_calibration.live_calibration import SolvePacer
-from imu_calibration.live_diagnosis import DiagnosisState
-from imu_calibration.live_streams import StreamState, StreamWatch
+from imu_calibration.files import write_whole
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
-from imu_calibration.nodes.whole_files import write_whole
-from imu_calibration.workflow import summary
+from imu_calibration.preflight.stream_watch import StreamState, StreamWatch
 
 PERIOD = 0.1
 """Seconds between two looks at what arrived."""
@@ -80,7 +80,7 @@ class CalibrationWorker(threading.Thread):
         self.state = WorkerState(groups=self.live.groups())
         self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch(joints=not by_hand)
         self._by_hand, self._diagnosis = by_hand, DiagnosisThread(0.0 if by_hand else self.live.settings.diagnosis_period)
-        self._diagnosed = 0
+        self._diagnosed, self._windows = 0, self._new_diagnosis()
         self._asked, self._lock, self._wake, self._ending = [], threading.Lock(), threading.Event(), False
         self._n_solutions, self._new_windows, self._closed, self._saved = 0, self.live.n_windows > 0, True, (time.monotonic(), 0)
         self._trouble = ''
@@ -138,6 +138,7 @@ class CalibrationWorker(threading.Thread):
             self._closed = False
         if windows:
             self._new_windows = True
+            self._windows.add([] if self._by_hand else windows)
             residuals = self.live.residuals(windows)
             if residuals is not None and len(residuals):
                 self.on_residuals(residuals)
@@ -172,7 +173,7 @@ class CalibrationWorker(threading.Thread):
 
     def _diagnose_when_due(self):
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(self.live.question, n_windows > self._diagnosed)
+        self._diagnosis.ask_when_due(lambda: self._windows.question(self.live), n_windows > self._diagnosed)
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
 
@@ -198,13 +199,17 @@ class CalibrationWorker(threading.Thread):
         self._save_accumulator(pending=True)
         return f'written: {self.save_file} and {self.accumulator_file.name}'
 
+    def _new_diagnosis(self):
+        settings = self.live.settings
+        return LiveDiagnosis(0 if self._by_hand or not settings.diagnosis_period else settings.diagnosis_samples)
+
     def _save_accumulator(self, pending):
         write_whole(self.accumulator_file, self.live.saved(pending), to_disk=pending)
         self._saved = (time.monotonic(), self.live.n_windows)
 
     def _reset(self):
         self.live = self.make_live(resume=False)
-        self._new_windows, self._closed, self._diagnosed = False, True, 0
+        self._new_windows, self._closed, self._diagnosed, self._windows = False, True, 0, self._new_diagnosis()
         self._diagnosis.forget()
         return 'started anew; the last calibration stays published until there is another one'
 

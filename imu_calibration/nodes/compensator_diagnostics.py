@@ -6,8 +6,8 @@ from time import monotonic
 
 import numpy as np
 
-from imu_calibration.calibration import DETERMINED
-from imu_calibration.compensation import outside_conditions
+from imu_calibration.calibration.document import DETERMINED
+from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 
 SERIOUS = ('frame_id', 'not an Imu message')

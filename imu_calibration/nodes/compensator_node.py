@@ -9,15 +9,15 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from imu_calibration.calibration import implausible
-from imu_calibration.compensation_stream import refuse_corrected, requested_transfer
-from imu_calibration.documents import calibration_from_text, version_of
+from imu_calibration.calibration.document import calibration_from_text, implausible
+from imu_calibration.compensation.stream import refuse_corrected, requested_transfer
+from imu_calibration.documents import version_of
 from imu_calibration.errors import DocumentError, ImuCalibrationError, InputError
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.live_compensation import LiveCompensation
+from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
 

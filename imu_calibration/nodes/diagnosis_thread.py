@@ -3,8 +3,8 @@
 import threading
 import time
 
-from imu_calibration.live_calibration import SolvePacer
-from imu_calibration.live_diagnosis import FAILED, OFF, DiagnosisState
+from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.diagnosis.live import FAILED, OFF, DiagnosisState
 
 SHARE = 0.2
 """Share of the time that diagnosing takes at most."""

@@ -13,23 +13,22 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from imu_calibration.calibration import DETERMINED, Calibration
-from imu_calibration.cli import files
-from imu_calibration.documents import calibration_to_text
+from imu_calibration import files
+from imu_calibration.calibration.document import DETERMINED, Calibration, calibration_to_text
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.joint_trajectory import TableMotion
-from imu_calibration.live_simulation import LiveSimulation
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
-from imu_calibration.noise import GRADES
-from imu_calibration.profiles import make_profile
+from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
-from imu_calibration.sensor_model import SensorModel
 from imu_calibration.settings import setting
-from imu_calibration.simulation import SimulationOptions, random_values
-from imu_calibration.turntable import Table
+from imu_calibration.simulation.joint_trajectory import TableMotion
+from imu_calibration.simulation.live import LiveSimulation
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, random_values
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows
 
 STRETCH = 0.2

@@ -9,7 +9,7 @@ from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.preflight.extremes import Extremes
 from imu_calibration.preflight.rest import find_rest
 from imu_calibration.preflight.turning import relate_turns
-from imu_calibration.stream_check import StreamCheck, StreamStatistics
+from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStatistics
 
 STREAMS = ('imu', 'joints', 'temperature')
 IRREGULAR = 0.1

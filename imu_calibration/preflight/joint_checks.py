@@ -2,7 +2,10 @@
 
 import numpy as np
 
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
+from imu_calibration.preflight.checks import refuse
 from imu_calibration.preflight.finding import REFUSE, Finding
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
@@ -121,3 +124,32 @@ def _mount_rpy_deg(matrix, table):
     if np.cos(pitch) < 1e-3:
         return np.degrees([0.0, pitch, np.arctan2(-mat_ls[0, 1], mat_ls[1, 1])]) + 0.0
     return np.degrees([np.arctan2(mat_ls[2, 1], mat_ls[2, 2]), pitch, np.arctan2(mat_ls[1, 0], mat_ls[0, 0])]) + 0.0
+
+
+def check_units(gathered, model, table=None):
+    """
+    Refuse recordings whose units are plainly not SI, or whose axes are not those of the table.
+
+    Compares the length of the specific force at rest with gravity, and rates and forces with those that the joints imply.
+
+    Raises
+    ------
+    InputError
+        Naming the likely unit, or how the axes lie.
+
+    """
+    rows = gathered.accumulator.rows
+    static = [row for row in rows if row.kind == 'static']
+    if static:
+        length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
+        check_force(length)
+    refuse(against_joints(gathered, model, table))
+
+
+def check_force(length):
+    """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
+    if 0.8 < length < 1.25:
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
+                         f'give --nominal with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}')
+    if not 3.0 < length < 30.0:
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')

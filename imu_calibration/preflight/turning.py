@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.reference import skew
+from imu_calibration.reference.reference_motion import skew
 
 LARGEST_TURN = 0.7
 """Turns of gravity from chunk to chunk above it are left out, rad."""

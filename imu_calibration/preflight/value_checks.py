@@ -2,16 +2,13 @@
 
 import numpy as np
 
-from imu_calibration.noise import STANDARD_GRAVITY
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, Finding
 from imu_calibration.units import significant
 
-DEG = 180.0 / np.pi
-SENSORS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
+CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
 GRAVITY_SHARE = 0.02
-LARGE_BIAS = 0.3
-"""m/s^2."""
 FASTEST = 100.0
 """rad/s, 5700 deg/s: hardly any gyroscope measures more."""
 FASTEST_DEG = 5000.0
@@ -55,9 +52,9 @@ def rate_unit(evidence):
     if turning is not None:
         ratio = 1.0 / turning.factor
         came = f'angular rates must be in rad/s, they are {significant(ratio)} times what turns the measured gravity: '
-        if 0.6 < ratio / DEG < 1.6:
+        if 0.6 < ratio * DEG < 1.6:
             yield Finding('rate_unit', REFUSE, f'{came}they look like deg/s; convert them in the driver or give --nominal FILE with gyroscope_scale 57.29578')
-        elif 0.6 < ratio * DEG < 1.6:
+        elif 0.6 < ratio / DEG < 1.6:
             yield Finding('rate_unit', REFUSE, f'{came}they look as if converted from deg/s twice; convert once, or give --nominal FILE with '
                           'gyroscope_scale 0.01745329')
         elif not 0.5 < ratio < 2.0:
@@ -95,7 +92,7 @@ def frozen(evidence):
     chunks, range_ = evidence.chunks, evidence.chunks.range
     if not len(chunks):
         return
-    for sensor, part, _ in SENSORS:
+    for sensor, part, _ in CHANNELS:
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
@@ -131,7 +128,7 @@ def _in_long_runs(flags):
 
 def clipping(evidence):
     """No output piles up at the end of its range."""
-    for sensor, part, unit in SENSORS:
+    for sensor, part, unit in CHANNELS:
         fine = evidence.quiet_range[part] > FINE * evidence.resolution[part]
         least = CLIP_RATE * evidence.quiet_range[part]
         if sensor == 'accelerometer':
@@ -143,7 +140,7 @@ def clipping(evidence):
                 words.append(f'{"xyz"[axis]} {sum(counts)}')
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
         if words:
-            people = f' ({level * DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
+            people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
             yield Finding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
                           'what is beyond is lost, move less or choose a wider range', samples=total)
 
@@ -178,13 +175,13 @@ def resolution(evidence):
     """The step of the converter is finer than the noise."""
     if evidence.rest is None:
         return
-    for sensor, part, unit in SENSORS:
+    for sensor, part, unit in CHANNELS:
         step, range_ = evidence.resolution[part], evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
         coarse = (step > ROUNDING) & (4 * step > range_)
         if coarse.any():
             size = step[coarse].max()
-            people = f'{size * DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
+            people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
             yield Finding('resolution', NOTE, f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
                           'are rounded too')
 

@@ -1,6 +1,6 @@
-"""The reports: one self-contained HTML page each, that a person reads and a colleague believes."""
+"""
+Pages that people look at.
 
-from imu_calibration.report.calibration_page import calibration_report
-from imu_calibration.report.diagnosis_page import diagnosis_report
-
-__all__ = ['calibration_report', 'diagnosis_report']
+In: a `CalibrationResult` or a `Diagnosis`. Out: one self-contained HTML page each.
+Read `calibration_page` first.
+"""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.error_budget import error_budget
+from imu_calibration.calibration.error_budget import error_budget
 from imu_calibration.report.figures import INK, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.report.observability_section import short_name

@@ -1,6 +1,7 @@
 """The report of a calibration: the verdict first, then everything that supports it."""
 
-from imu_calibration.calibration import DETERMINED
+from imu_calibration.calibration.document import DETERMINED
+from imu_calibration.calibration.verdict import judge, requested
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -13,7 +14,6 @@ from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import UNIT, residual_section
 from imu_calibration.report.window_errors import window_errors
 from imu_calibration.report.worked_sample import worked_sample
-from imu_calibration.verdict import judge, requested
 
 
 def calibration_report(result):

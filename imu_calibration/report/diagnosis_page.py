@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
@@ -99,7 +100,7 @@ def variables(traces):
     if traces.temperature_c is not None:
         found['temperature, °C'] = ('temperature', traces.temperature_c)
     for k, axis in enumerate('xyz'):
-        found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / 9.80665)
+        found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
         found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
     for k in range(traces.position.shape[1]):
         found[f'angle of joint {k + 1}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * traces.position[:, k]))))

@@ -37,8 +37,8 @@ def draw(name, size, paint, label):
 
     """
     import matplotlib
-    from matplotlib.figure import Figure
     from markupsafe import Markup, escape
+    from matplotlib.figure import Figure
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})

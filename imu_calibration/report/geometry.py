@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from imu_calibration.compensation import arms_of
-from imu_calibration.derived import PAIRS, derive, in_paper_units
+from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
+from imu_calibration.compensation.compensate import arms_of
+from imu_calibration.constants import DEG
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import AXIS, GREY, INK, draw
 from imu_calibration.report.numbers import fixed, pair
-from imu_calibration.units import DEG, decimals
+from imu_calibration.units import decimals
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.compensation import compensate
-from imu_calibration.compensation_covariance import Uncertainty
+from imu_calibration.compensation.compensate import compensate
+from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.estimation.standard_motions import _attitudes
 from imu_calibration.navigation import strapdown
-from imu_calibration.observability import _attitudes
-from imu_calibration.reference import Reference, lever_matrix
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.reference_motion import Reference, lever_matrix
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 from imu_calibration.report.numbers import text
-from imu_calibration.turntable import reference_motion
 
 SECONDS = 50.0
 """Length of the runs at rest, the papers' own."""

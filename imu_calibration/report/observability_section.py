@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.estimation import make_prior
-from imu_calibration.observability import tolerance_scaled_singular_values
+from imu_calibration.estimation.observability import tolerance_scaled_singular_values
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text
 

@@ -1,8 +1,8 @@
 """Where the calibration comes from: recording, table, settings, what was used and what was dropped."""
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.report.numbers import fixed, in_unit, text
 from imu_calibration.settings import describe
-from imu_calibration.workflow import CalibrationOptions
 
 
 def recording_facts(result):

@@ -4,6 +4,6 @@
 def render(template, **content):
     """Return the HTML of one of the package's templates."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    environment = Environment(loader=PackageLoader('imu_calibration', 'templates'), autoescape=True, undefined=StrictUndefined,
+    environment = Environment(loader=PackageLoader('imu_calibration.report', 'templates'), autoescape=True, undefined=StrictUndefined,
                               trim_blocks=True, lstrip_blocks=True)
     return environment.get_template(template).render(**content)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration import observability
-from imu_calibration.calibration import DETERMINED, HELD, IN_REFERENCE
-from imu_calibration.estimation import make_prior
+from imu_calibration.calibration.document import DETERMINED, HELD, IN_REFERENCE
+from imu_calibration.estimation import observability
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
 TITLES = {'bias': 'bias', 'matrix': 'matrix (scale factors and axis directions)', 'accel_size_effect': 'size effect: origin to the sensitive point of each axis',

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.report.numbers import fixed, text
-from imu_calibration.zhang import axis_readings
 
 LEVEL = 0.02
 """Windows whose mean specific force differs from 1 g by more than this share turn through the vertical and have no reading at 1 g."""

@@ -3,9 +3,9 @@
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import predict
 from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
 from imu_calibration.report.numbers import in_unit, text
-from imu_calibration.sensor_model import predict
 from imu_calibration.units import for_people
 
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.workflow import window_residuals
+from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.estimation.accumulator import restrict
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +76,26 @@ def _by_hand(result):
     return WindowErrors(time, np.full(len(force), 'static'), {'accelerometer': force, 'gyroscope': rate}, {'accelerometer': true, 'gyroscope': zero},
                         {'accelerometer': force - true, 'gyroscope': rate}, {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
                         {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
+
+
+def window_residuals(result):
+    """
+    Return residuals per window before and after: what a nominal sensor would show, and what the model leaves.
+
+    Returns
+    -------
+    dict
+        'time', 'kind', 'count', and per sensor 'before', 'after', each shape (n_windows, 3): residuals of window means.
+
+    """
+    solution, rows = result.solution, result.gathered.accumulator.rows
+    wide, narrow = result.gathered_model, result.model
+    accumulator = result.gathered.accumulator if wide is narrow else restrict(result.gathered.accumulator, wide, narrow)
+    found = {'time': np.array([r.time for r in rows]), 'kind': [r.kind for r in rows], 'count': np.array([r.count for r in rows])}
+    nominal = narrow.start()
+    for sensor in SENSORS:
+        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
+        after, before = coefficients(narrow, sensor, solution.values), coefficients(narrow, sensor, np.where(np.isfinite(nominal), nominal, 0.0))
+        found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
+                         'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
+    return found

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from imu_calibration.compensation import arms_of, compensate, invertible
-from imu_calibration.reference import lever_matrix
+from imu_calibration.compensation.compensate import arms_of, compensate, invertible
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.report.numbers import fixed, text
-from imu_calibration.turntable import reference_motion
 
 
 def worked_sample(result):

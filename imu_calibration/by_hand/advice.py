@@ -1,0 +1,92 @@
+"""What to do next when a calibration by hand leaves a parameter weak: the pose or turn that would help most."""
+
+import itertools
+
+import numpy as np
+
+from imu_calibration.by_hand.model import GYRO_MATRIX, unpack
+from imu_calibration.effects.base import AXES
+from imu_calibration.reference.reference_motion import skew
+
+STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d))
+"""Six faces, twelve edges and eight corners turned up."""
+
+
+def missing_motion(model, factor, values, statuses, tolerances, pose_sd, turn_sd):
+    """
+    Name the standard pose or turn that lowers the worst sd of each sensor most.
+
+    The declared standard motions (26 directions up; turns of 180 deg about each sensor axis held level, in two attitudes)
+    are added to the equations one at a time and the predicted sd over tolerance is compared.
+
+    Parameters
+    ----------
+    model : HandModel
+    factor : array, shape (n, n)
+        Weighted equations so far.
+    values : array, shape (n,)
+    statuses : sequence of str
+    tolerances : array, shape (n,)
+    pose_sd, turn_sd : float
+        Accuracy expected of one more pose (m/s^2) and turn (rad).
+
+    Returns
+    -------
+    tuple of dict
+        {'parameters': {name: sd over tolerance}, 'needs': sentence} for each sensor that is not fully determined.
+
+    """
+    advice = []
+    groups = ((model.index_of('accelerometer'), _pose_candidates(model, values, pose_sd)),
+              (model.index_of('gyroscope'), _turn_candidates(model, turn_sd)))
+    for index, candidates in groups:
+        lacking = [k for k in index if statuses[k] != 'determined']
+        if not lacking:
+            continue
+        before = _predicted(factor, model.priors, tolerances)
+        scores = [(_score(_predicted(np.vstack([factor, rows]), model.priors, tolerances)[lacking]), needs) for rows, needs in candidates]
+        best = min(scores, key=lambda s: s[0])
+        advice.append({'parameters': {model.param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
+    return tuple(advice)
+
+
+def _score(ratio):
+    """Return one number for how bad a set of sd over tolerance is; the excess in each parameter counts, the worst most."""
+    return float(np.sum(np.maximum(ratio, 1.0)**2))
+
+
+def _predicted(rows, priors, tolerances):
+    factor = np.linalg.qr(np.vstack([rows, np.diag(1 / priors)]), mode='r')
+    return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
+
+
+def _pose_candidates(model, values, sd):
+    bias, matrix, *_ = unpack(values)
+    for up in STANDARD_POSES:
+        # temperature and time as at the reference point: one more pose there says nothing of thermal effects
+        rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], np.zeros(1), np.full(1, model.model.temperature_ref_c))[1]
+        yield rows / sd, f'hold it still with {_direction(up)} up'
+
+
+def _direction(up):
+    return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
+
+
+def _turn_candidates(model, sd):
+    """Half turns about each axis held level, gravity first along either of the other two."""
+    for axis, first in itertools.permutations(range(3), 2):
+        about, up = np.eye(3)[axis], np.eye(3)[first]
+        carried = -up  # after half a turn about a level axis
+        across = np.array([about, np.cross(about, up)])
+        rows = np.zeros((2, model.size))
+        rows[:, GYRO_MATRIX] = (across @ skew(carried) @ _psi_by_matrix(about)).reshape(2, 9)
+        yield rows / sd, (f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
+                          'still before and after')
+
+
+def _psi_by_matrix(about, angle=np.pi):
+    """Derivative of the rotation error in the turned frame by the matrix entries, near the identity, shape (3, 9)."""
+    cross = skew(about)
+    # integral over the turn of the rotation still to come, C(angle - t)
+    to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross
+    return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)

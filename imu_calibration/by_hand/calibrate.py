@@ -1,0 +1,294 @@
+"""Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.by_hand.advice import missing_motion
+from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
+from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
+from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes, g_sensitivity_evidence, known_turn_data
+from imu_calibration.by_hand.solver import solve_joint
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.settings import setting
+
+GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
+"""x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
+PUBLISHED = (*BASE_NAMES[:3], *(f'accelerometer.matrix.{a}{b}' for a in 'xyz' for b in 'xyz'), *BASE_NAMES[9:])
+"""Order of the parameters in the result; further effects follow."""
+POSES_LEAST = 4
+"""Fewer attitudes leave even the accelerometer's biases to the prior."""
+PASSES = 4
+"""Solutions at most, when the columns of a warm-up have to be taken anew."""
+SETTLED = 0.03
+"""Relative change of a time constant below which its columns stay."""
+G_SENSITIVITY_P = 1e-3
+"""The response of the gyroscope to attitude enters the model when chance would show it less often."""
+POSES_FULL = 9
+"""The nine accelerometer parameters take one equation per attitude."""
+
+
+@dataclass(frozen=True)
+class ByHandSettings:
+    """Numbers for calibration by hand."""
+
+    pose_apart: float = setting(0.2, 'rad', 'attitudes closer than this count as one pose', (0.001, 1.5), '')
+    turn_maximum: float = setting(30.0, 's', 'longer stretches between two poses are not used for the gyroscope', (0.5, 3600.0),
+                                  'too small: few turns; too large: gyroscope drift and clipping enter')
+    gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
+                         'too large: rotation is lost in holes and shows as turn scatter')
+    pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
+    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it',
+                                   (0.0, 1.0), '')
+    turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
+    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0),
+                                   'too small: scales too sure')
+    known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
+                                   'too small: misalignments too sure')
+    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it",
+                                 symptom="off: it shows as drift and turn scatter")
+
+
+@dataclass(frozen=True)
+class KnownTurn:
+    """A turn of known angle about a body axis that stays put."""
+
+    start: int
+    """First sample."""
+    stop: int
+    """After the last sample."""
+    axis: tuple
+    """Unit vector in the sensor frame; turns counter-clockwise seen from its tip."""
+    angle: float
+    """rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandCalibration:
+    """Forward model ``measured = bias + matrix @ true (+ g-sensitivity @ force)`` of both sensors, with its uncertainty."""
+
+    param_names: tuple
+    """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
+    values: np.ndarray
+    """Parameters in `param_names` order, SI, shape (n,)."""
+    covariance: np.ndarray
+    """Covariance of `values`, shape (n, n)."""
+    statuses: tuple
+    """'determined', 'weak' or 'held' for each parameter."""
+    tolerances: np.ndarray
+    """Sd that would be good enough, shape (n,)."""
+    priors: np.ndarray
+    """Sd before any data, shape (n,)."""
+    gravity: float
+    """Reference, m/s^2."""
+    gauge: dict
+    """Conventions of origin and axes."""
+    advice: tuple
+    """({'parameters': {name: sd over tolerance}, 'needs': motion}, ...) for what is not determined."""
+    statistics: dict
+    """Counts, noise, scatter, chi-square: plain numbers."""
+    poses: Poses
+    """The poses that were used."""
+    state: State
+    """Directions and drifts of the poses, and the parameters in the order of `model`."""
+    model: HandModel
+    """What was estimated."""
+    information: np.ndarray
+    """Information of the data alone, in the order of `model`, shape (m, m)."""
+
+    @property
+    def sd(self):
+        """Standard deviation of each parameter, shape (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, name):
+        """Return the parameter called `name`."""
+        return float(self.values[self.param_names.index(name)])
+
+    def sd_of(self, name):
+        """Return the standard deviation of the parameter called `name`."""
+        return float(self.sd[self.param_names.index(name)])
+
+    @property
+    def accelerometer(self):
+        """(bias, matrix) of the accelerometer."""
+        return unpack(self.state.values)[:2]
+
+    @property
+    def gyroscope(self):
+        """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
+        part = self.model.parts.get(('gyroscope', 'gyro_g_sensitivity'))
+        return (*unpack(self.state.values)[2:], np.zeros((3, 3)) if part is None else self.state.values[part].reshape(3, 3))
+
+    def compensate(self, force, rate, time=None, temperature_c=None):
+        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` where effects ask for them."""
+        return self.model.compensate(self.state.values, force, rate, time, temperature_c)
+
+    def norm_residuals(self, force=None):
+        """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
+        if force is None:
+            return self.model.norm_rows(self.state.values, self.poses.force, self.poses.time, self.poses.temperature_c)[0]
+        return self.model.norm_rows(self.state.values, force)[0]
+
+
+def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
+                      tolerances=None, accelerometer=None, gyroscope=None, temperature_c=None):
+    """
+    Calibrate accelerometer and gyroscope from poses held still and the turns between them.
+
+    One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
+    pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
+    drifts and turns is estimated along. A wrong `gravity` is the same as a common scale of the accelerometer.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        In SI units, or in counts with `nominal`; stamps must not go backwards.
+    gravity, gravity_sd : float
+        Local gravity and its sd, m/s^2.
+    stills : sequence of slices or (start, stop), optional
+        Intervals at rest; found by `windows.find_still` when not given.
+    settings : ByHandSettings
+    nominal : gathering.NominalScaling, optional
+        Conversion from counts; the result then refers to the converted values.
+    known_turns : sequence of KnownTurn
+        Full turns by hand, beside what gravity says.
+    tolerances : dict, optional
+        {sensor: {effect: sd that is good enough}}; the catalogue's where not given.
+    accelerometer, gyroscope : tuple of str, optional
+        Effects to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
+    temperature_c : array, optional
+        Temperature at the samples, shape (n,).
+
+    Returns
+    -------
+    HandCalibration
+
+    Raises
+    ------
+    NotObservableError
+        With fewer than four different attitudes.
+
+    """
+    imu = imu if nominal is None else nominal.apply(imu)
+    data = gather_by_hand(imu, stills, settings, known_turns, temperature_c)
+    return solve_by_hand(data.poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
+
+
+@dataclass(frozen=True, eq=False)
+class HandData:
+    """What a recording without a table says: poses and turns."""
+
+    poses: Poses
+    """Means over the intervals at rest."""
+    turns: list
+    """`TurnData` between consecutive poses, then those of known angle."""
+    statistics: dict
+    """Attitudes, turns left out, noise and period of the samples."""
+
+
+def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), temperature_c=None):
+    """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
+    time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    poses, noise = average_poses(imu, _as_ranges(imu, stills), temperature_c)
+    attitudes = distinct_attitudes(poses.force, settings.pose_apart)
+    if attitudes < POSES_LEAST:
+        raise NotObservableError(
+            f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
+            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
+    turns, dropped = collect_turns(time, imu, poses, noise, settings, temperature_c)
+    turns += [known_turn_data(time, imu, turn, noise, settings, temperature_c) for turn in known_turns]
+    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise})
+
+
+def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None,
+                  point=None):
+    """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
+    fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
+    default, evidence = _gyroscope_effects(poses, settings)
+    reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
+    model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c, point=point or {}), gravity)
+    _check_temperature(model, poses)
+    for _ in range(PASSES):
+        found = solve_joint(model, poses, turns, gravity_sd, fallback)
+        settled, model = _settled(model, found), model.at(found.state.values)
+        if settled:
+            break
+    goals = model.tolerances(tolerances or {})
+    statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
+    pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
+    turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
+    advice = missing_motion(model, found.factor, found.state.values, statuses, goals, pose_sd, turn_sd)
+    statistics = {**statistics, **evidence, **_statistics(model, found, poses, turns)}
+    names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
+    index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
+    covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
+    return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
+                           tuple((*statuses, 'determined')[k] for k in index), np.append(goals, goals[3])[index],
+                           np.append(model.priors, 0.0)[index], gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
+                           found.factor.T @ found.factor)
+
+
+def _settled(model, found):
+    """Return whether the columns of warm-ups were taken close enough to where the solution lies."""
+    for (_, name), part in model.parts.items():
+        if name.endswith('_bias_drift') and not found.held[part][-1]:
+            known = model.model.full_point()[name][-1]
+            if abs(found.state.values[part][-1] / known - 1) > SETTLED:
+                return False
+    return True
+
+
+def _check_temperature(model, poses):
+    thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
+    if thermal and poses.temperature_c is None:
+        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or leave it out')
+
+
+def _gyroscope_effects(poses, settings):
+    """Return (the gyroscope's effects when nothing is asked for, what the poses say about g-sensitivity)."""
+    if settings.g_sensitivity not in ('auto', 'on', 'off'):
+        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
+    evidence = g_sensitivity_evidence(poses)
+    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
+                                                and evidence['g_sensitivity_heldout_ratio'] < 1)
+    return ('bias', 'matrix', 'gyro_g_sensitivity') if wanted else ('bias', 'matrix'), evidence
+
+
+def _statuses(sd, held, tolerances):
+    return tuple('held' if h else 'determined' if s <= t else 'weak' for s, h, t in zip(sd, held, tolerances))
+
+
+def _statistics(model, found, poses, turns):
+    before, after = (model.norm_rows(values, poses.force, poses.time, poses.temperature_c)[0] for values in (model.nominal, found.state.values))
+    sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
+    spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
+    result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
+              'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
+              'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}
+    for index, name in enumerate(COMPONENTS):
+        result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
+        result[f'{name}_dof'] = float(found.scatter.dof[index])
+    return result
+
+
+def _rising(time):
+    """Spread repeated stamps over the step that follows: their order is known, their moments are not."""
+    if np.all(np.diff(time) > 0):
+        return time
+    kept = np.concatenate([[True], np.diff(time) > 0])
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))
+
+
+def _as_ranges(imu, stills):
+    if stills is None:
+        stills = find_still(imu)
+    ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
+    ranges = [(a, b) for a, b in ranges if b - a >= 2]
+    if not ranges:
+        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
+                                 'got no interval at rest; hold the IMU still for a second or more in each attitude')
+    return ranges

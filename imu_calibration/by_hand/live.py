@@ -1,0 +1,217 @@
+"""Calibration by hand while the IMU is being turned: poses are counted, what is missing is named, the answer is that of the recording."""
+
+import copy
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import POSES_LEAST
+from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.sample_store import HandStore
+from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
+from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, result_by_hand
+from imu_calibration.calibration.effect_states import hand_group_states, waiting_groups
+from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import SensorModel, parse_effects
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.samples import ImuSamples
+from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.settings import setting
+
+SEARCH_SHARE = 0.05
+"""Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
+SEARCH_STEP = 0.5
+"""Rest is looked for after so many seconds of new samples, at the earliest."""
+_FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes',
+                'gyroscope': 'turn it from one attitude to the next, within half a minute'}
+MOST_POSES = 200
+"""The time of the joint estimate grows with the third power of their number; the oldest are forgotten."""
+
+
+@dataclass(frozen=True)
+class LiveByHandSettings:
+    """What a calibration by hand keeps, and its reference."""
+
+    gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
+                             (0.0, 30.0), 'all three accelerometer scales are wrong together')
+    hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
+                                'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
+                                'too small: poses are forgotten, diagnostics say so')
+
+
+class LiveByHand:
+    """
+    One session without a table as it happens: `push` what arrives, `solve` when it is due.
+
+    The samples are cleaned, searched and solved by the functions that read recordings, and they are all kept while they fit: the answer
+    is that of `workflow.calibrate_without_table` on the same samples. When they no longer fit (`hand_samples`) it is the answer to the
+    samples that are left. A clock that is set anew, which a recording is refused for, is taken as a pause.
+
+    Parameters
+    ----------
+    options : CalibrationOptions
+        What to estimate.
+    settings : LiveSettings
+    by_hand : LiveByHandSettings
+    saved : bytes, optional
+        What `saved` of an earlier run returned.
+    clock : callable
+        Seconds of a steady clock.
+
+    Raises
+    ------
+    InputError
+        When an effect is asked for that needs a table, or temperatures.
+
+    """
+
+    def __init__(self, options, settings, by_hand=LiveByHandSettings(), saved=None, clock=time.monotonic):
+        self.options, self.settings, self._clock = options, settings, clock
+        self._names = {sensor: None if text is None else parse_effects(sensor, text)
+                       for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
+        self._gravity = by_hand.gravity or None
+        _check_model(self.model)
+        self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
+        if saved is not None:
+            self._store.load(saved)
+        self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
+        self.found, self.result = NOTHING, None
+        self._search(self._store)
+
+    @property
+    def model(self):
+        """The model, as far as it is known before a solution."""
+        return SensorModel(*(names or ('bias', 'matrix') for names in self._names.values()))
+
+    @property
+    def n_windows(self):
+        """Poses at the last search."""
+        return len(self.found.rests)
+
+    @property
+    def counts(self):
+        """Samples that could not be used, by reason."""
+        counts = dict(self._drops)
+        for reason, count in self._check.counts.items():
+            counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
+        return {reason: count for reason, count in counts.items() if count}
+
+    def push(self, block):
+        """Take what arrived and return the poses that are over and were not returned before, as mean ImuSamples, one each, in a list."""
+        for reason, count in (block.dropped or {}).items():
+            self._drops[reason] = self._drops.get(reason, 0) + count
+        imu = block.imu
+        if imu is None or not len(imu):
+            return []
+        imu = imu if self.options.nominal is None else self.options.nominal.apply(imu)
+        self._store.add(self._check.push(imu))
+        self._unsearched += len(imu)
+        period = self._check.statistics().period
+        if self._unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
+            return []
+        start, self._unsearched = self._clock(), 0
+        self._search(self._store)
+        if self._store.forget(self.found.rests, MOST_POSES):
+            self._search(self._store)
+        self._pacer.note(start, self._clock())
+        return self._newly_over()
+
+    def _search(self, store):
+        imu = store.samples()
+        if imu is not None and len(imu) > 2:
+            self.found = look_for_poses(imu, self.options.windows)
+
+    def _newly_over(self):
+        imu, found = self._store.samples(), self.found
+        over = found.rests if not found.resting else found.rests[:-1]
+        new = [k for k, rest in enumerate(over) if self._reported_ns is None or imu.stamp_ns[rest.start] > self._reported_ns]
+        if new:
+            self._reported_ns = int(imu.stamp_ns[over[new[-1]].stop - 1])
+        middle = [(found.rests[k].start + found.rests[k].stop) // 2 for k in new]
+        return [ImuSamples(self._store.true_stamps(imu.stamp_ns[[m]]), found.poses.force[[k]], found.poses.rate[[k]], imu.frame_id)
+                for k, m in zip(new, middle)]
+
+    def solve(self, pending=False, provenance=None):
+        """
+        Solve what was gathered and return the CalibrationResult, which stays in `result`.
+
+        Parameters
+        ----------
+        pending : bool
+            Count the last sample in, which may yet turn out to be a stray; the rest that goes on counts in any case.
+        provenance : dict, optional
+            For the document.
+
+        Raises
+        ------
+        NotObservableError
+            With fewer than four different attitudes.
+        InputError
+            When the units are plainly wrong.
+
+        """
+        store = self._store
+        if pending:
+            store = store.copy()
+            store.add(copy.deepcopy(self._check).finish())
+        imu = store.samples()
+        if imu is None or len(imu) < 3:
+            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes held still, no sample came yet; '
+                                     'check the topic')
+        self._search(store)
+        recording = HandRecording(imu, None, self.counts)
+        solved = calibrate_samples_by_hand(recording, self._gravity, self.options.tolerances, provenance, *self._names.values(),
+                                           stills=self.found.rests)
+        self.result = result_by_hand(*solved, self.options)
+        return self.result
+
+    def needs_linearising(self):
+        """Return False: the solution is iterated to its end."""
+        return False
+
+    def saved(self, pending=False):
+        """Return the samples as bytes, for `saved` of another run."""
+        return self._store.to_bytes()
+
+    def residuals(self, poses):
+        """
+        Return measured minus predicted of poses from `push`, as ImuSamples, or None before the first solution.
+
+        The direction of gravity in a pose is estimated, so that of the specific force only the length can differ from what is
+        predicted; the rate is compared with zero.
+        """
+        if self.result is None or not poses:
+            return None
+        mean, hand = ImuSamples.concatenate(poses), self.result.solution
+        true, _ = hand.compensate(mean.force_s, mean.rate_s)
+        bias, matrix = hand.accelerometer
+        gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
+        resting_bias, _, sensitivity = hand.gyroscope
+        rate_s = mean.rate_s - resting_bias - gravity_s @ sensitivity.T
+        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ matrix.T, rate_s, mean.frame_id)
+
+    def groups(self):
+        """Return the GroupState of every effect."""
+        if self.result is None:
+            return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
+        return hand_group_states(self.result)
+
+    def question(self):
+        """Return None: what the model gets wrong is asked of recordings."""
+
+    def status(self):
+        """Return the HandStatus: what there is, and the pose or turn that helps most."""
+        status = hand_status(self.found, self.result and self.result.calibration, self._gravity is None)
+        return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
+
+
+def _check_model(model):
+    """Refuse effects that need a table, and those of temperature: live, no temperatures are kept with the poses."""
+    thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
+    if thermal:
+        raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
+                         "record a bag and run 'imu_calibration calibrate BAG', or leave it out")
+    HandModel(model, STANDARD_GRAVITY)

@@ -1,0 +1,207 @@
+"""The parameters of a calibration by hand: bias and matrix of both sensors, and further effects straight from the catalogue."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.effects.sensor_model import SensorModel, prior_sds
+from imu_calibration.errors import InputError
+from imu_calibration.reference.reference_motion import Reference
+
+LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+"""Entries of the accelerometer matrix that the gauge leaves free."""
+FIXED = ('accelerometer.matrix.xy', 'accelerometer.matrix.xz', 'accelerometer.matrix.yz')
+"""Zero by the choice of axes."""
+BASE_NAMES = (
+    *(f'accelerometer.bias.{a}' for a in AXES), *(f'accelerometer.matrix.{AXES[i]}{AXES[j]}' for i, j in LOWER),
+    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES))
+"""Parameters that every calibration by hand has, in their order."""
+N_BASE = len(BASE_NAMES)
+ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
+BASE_NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
+"""Zero bias, identity matrices."""
+UNKNOWN_BY_HAND = ('lever', 'attitude')
+"""Column groups that need more than gravity in poses and the rates between them."""
+REPEATS = 4
+"""Fixed-point steps that invert an effect: each gains a factor of its size against the input, a thousand or more."""
+
+
+def possible_by_hand(effect):
+    """Return whether gravity in poses and the turns between them can show an effect: it has columns, and none of them asks for a table."""
+    return bool(effect.groups) and effect.warp is None and not set(effect.groups) & set(UNKNOWN_BY_HAND)
+
+
+def unpack(values):
+    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
+    matrix = np.zeros((3, 3))
+    for value, (i, j) in zip(values[3:9], LOWER):
+        matrix[i, j] = value
+    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """
+    A SensorModel without table: `BASE_NAMES`, then the further effects of the accelerometer, then those of the gyroscope.
+
+    Raises
+    ------
+    InputError
+        When an effect needs a table.
+
+    """
+
+    model: SensorModel
+    """The effects; bias and matrix of both sensors are among them."""
+    gravity: float
+    """Reference, m/s^2."""
+
+    def __post_init__(self):
+        """Refuse what cannot be seen by hand."""
+        strange = [e.name for e in self.model.effects if e.name not in ('bias', 'matrix') and not possible_by_hand(e)]
+        if strange:
+            raise InputError(f'calibration by hand knows gravity and the turns between poses, {", ".join(strange)} cannot be seen from them; '
+                             'give --table, or leave it out')
+
+    @cached_property
+    def extras(self):
+        """Effects beyond bias and matrix, in parameter order."""
+        return [e for e in self.model.effects if e.name not in ('bias', 'matrix')]
+
+    @cached_property
+    def parts(self):
+        """(sensor, effect name) -> slice of the parameter vector, for the further effects."""
+        ends = np.cumsum([N_BASE] + [e.size for e in self.extras])
+        return {(e.sensor, e.name): slice(a, b) for e, a, b in zip(self.extras, ends, ends[1:])}
+
+    @cached_property
+    def param_names(self):
+        """SENSOR.EFFECT.COMPONENT of each parameter."""
+        return (*BASE_NAMES, *(name for e in self.extras for name in e.param_names()))
+
+    @property
+    def size(self):
+        """Number of parameters."""
+        return len(self.param_names)
+
+    @cached_property
+    def nominal(self):
+        """Values before any data, shape (n,)."""
+        start = self.model.start()
+        return np.concatenate([BASE_NOMINAL, *(start[self.model.slices[e.sensor, e.name]] for e in self.extras)])
+
+    @cached_property
+    def priors(self):
+        """Standard deviations about `nominal` before any data, shape (n,)."""
+        sds = {(e.sensor, e.name): prior_sds(e) for e in self.model.effects}
+        base = [sds[tuple(name.split('.')[:2])][0] for name in BASE_NAMES]
+        return np.concatenate([base, *(sds[e.sensor, e.name] for e in self.extras)])
+
+    def tolerances(self, given):
+        """Return the standard deviations that are good enough, shape (n,); the catalogue's where `given` has none."""
+        known = {(e.sensor, e.name): e.tolerance for e in self.model.effects}
+        keys = [tuple(name.split('.')[:2]) for name in self.param_names]
+        return np.array([given.get(sensor, {}).get(effect, known[sensor, effect]) for sensor, effect in keys], float)
+
+    def index_of(self, sensor):
+        """Return the parameters of one sensor, bias and matrix first."""
+        base = range(9) if sensor == 'accelerometer' else range(9, N_BASE)
+        return np.array([*base, *(k for (s, _), part in self.parts.items() if s == sensor for k in range(part.start, part.stop))])
+
+    def extra_index(self, sensor):
+        """Return the parameters of the further effects of one sensor."""
+        return self.index_of(sensor)[9 if sensor == 'accelerometer' else 12:]
+
+    def at(self, values):
+        """Return the same model with the columns of warm-ups taken at `values`."""
+        return HandModel(self.model.at(self.in_model_order(values)), self.gravity)
+
+    def in_model_order(self, values):
+        """Return the parameters in the order of the SensorModel."""
+        known = dict(zip(self.param_names, values)) | dict.fromkeys(FIXED, 0.0)
+        return np.array([known[name] for name in self.model.param_names])
+
+    def further(self, sensor, values, force, rate, time=None, temperature_c=None):
+        """
+        Return what the further effects add to the output of a sensor, and its derivative by their parameters.
+
+        Parameters
+        ----------
+        force, rate : arrays, shape (m, 3)
+            True specific force and rate.
+        time : array, optional
+            Seconds since the first sample, shape (m,).
+        temperature_c : array, optional
+            Shape (m,); needed by thermal effects.
+
+        Returns
+        -------
+        tuple
+            Output, shape (m, 3), and columns, shape (m, 3, p) in the order of `extra_index`.
+
+        """
+        effects = [e for e in self.extras if e.sensor == sensor]
+        output, columns = np.zeros((len(force), 3)), [np.zeros((len(force), 3, 0))]
+        if not effects:
+            return output, columns[0]
+        ref = _reference(force, rate, time, temperature_c, self.gravity)
+        point, own = self.model.full_point(), self.model.values_of(sensor, self.in_model_order(values))
+        for effect in effects:
+            basis = {group: GROUPS[group](ref, point) for group in effect.groups}
+            coefficients, slopes = _coefficients(effect, own, point)
+            output = output + sum(basis[group] @ block for group, block in coefficients.items())
+            columns.append(sum(np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()))
+        return output, np.concatenate(columns, axis=2)
+
+    def compensate(self, values, force, rate, time=None, temperature_c=None):
+        """Return true specific force and rate for readings of shape (m, 3)."""
+        bias_f, matrix_f, bias_w, matrix_w = unpack(values)
+        true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
+        for _ in range(REPEATS if self.extras else 0):
+            more_f, more_w = (self.further(s, values, true_f, true_w, time, temperature_c)[0] for s in SENSORS)
+            true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
+        return true_f, true_w
+
+    def norm_rows(self, values, force, time=None, temperature_c=None):
+        """
+        Return ``|true force| - gravity`` of mean readings at rest, shape (k,), and minus its derivative by all parameters, shape (k, n).
+
+        Parameters
+        ----------
+        force : array, shape (k, 3)
+            Mean readings at rest.
+        time, temperature_c : arrays, optional
+            Shape (k,).
+
+        """
+        _, matrix, *_ = unpack(values)
+        true = self.compensate(values, force, np.zeros_like(force), time, temperature_c)[0]
+        norm = np.linalg.norm(true, axis=1)
+        back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
+        columns = np.zeros((len(force), self.size))
+        columns[:, 0:3] = back
+        for place, (i, j) in enumerate(LOWER, 3):
+            columns[:, place] = back[:, i] * true[:, j]
+        slopes = self.further('accelerometer', values, true, np.zeros_like(true), time, temperature_c)[1]
+        columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
+        return norm - self.gravity, columns
+
+
+def _reference(force, rate, time, temperature_c, gravity):
+    time = np.zeros(len(force)) if time is None else np.asarray(time, float)
+    return Reference(time, np.zeros((len(force), 3, 3)), force, rate, np.zeros_like(force), gravity, temperature_c)
+
+
+def _coefficients(effect, own, point):
+    """Return {group: coefficients (w, 3)} and {group: derivative by the effect's own values (w, 3, p)}, by complex steps."""
+    found = effect.coefficients(own, point)
+    slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
+    for k in range(effect.size):
+        moved = own[effect.name].astype(complex)
+        moved[k] += 1e-30j
+        for group, block in effect.coefficients({**own, effect.name: moved}, point).items():
+            slopes[group][..., k] = np.imag(block) / 1e-30
+    return found, slopes

@@ -1,0 +1,125 @@
+"""From samples to the data of a calibration by hand: means over the poses held still, and the turns between them."""
+
+import numpy as np
+from scipy.special import fdtrc
+
+from imu_calibration.by_hand.equations import Poses, TurnData
+
+
+def average_poses(imu, ranges, temperature_c=None):
+    """
+    Return (Poses, noise): means over the intervals, with the sd that the noise within them leaves.
+
+    `temperature_c` is that of the samples, shape (n,), when it was recorded.
+
+    The noise need not be white: means of pieces of half a second or more say by how much sums of samples scatter beyond it.
+    """
+    force = [imu.force_s[a:b] for a, b in ranges]
+    rate = [imu.rate_s[a:b] for a, b in ranges]
+    count = np.array([len(f) for f in force], float)[:, None]
+    force_sd, force_colour = _pooled_noise(force)
+    rate_sd, rate_colour = _pooled_noise(rate)
+    start, stop = np.array(ranges).T
+    poses = Poses(np.array([f.mean(0) for f in force]), np.array([w.mean(0) for w in rate]), force_sd * force_colour / np.sqrt(count),
+                  rate_sd * rate_colour / np.sqrt(count), start, stop, 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0]),
+                  None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges]))
+    period = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
+    return poses, {'force_noise_sd': force_sd.tolist(), 'rate_noise_sd': rate_sd.tolist(), 'force_noise_colour': force_colour.tolist(),
+                   'rate_noise_colour': rate_colour.tolist(), 'period': period}
+
+
+def _pooled_noise(parts, pieces=8):
+    """Return (sd of single samples, factor by which means of pieces scatter more than white noise), each shape (3,)."""
+    floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
+    within = np.sqrt(np.median([p.var(0, ddof=1) for p in parts], axis=0)) + floor
+    ratios = []
+    for part in parts:
+        length = len(part) // pieces
+        if length >= 4:
+            means = part[:length * pieces].reshape(pieces, length, 3).mean(1)
+            # differences of neighbours: a slow drift belongs to the scatter between poses, not here
+            ratios.append(0.5 * np.mean(np.diff(means, axis=0)**2, axis=0) * length / within**2)
+    if not ratios:
+        return within, np.ones(3)
+    ratio, margin = np.mean(ratios, axis=0), 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
+    return within, np.sqrt(np.where(ratio > 1 + margin, ratio, 1.0))
+
+
+def distinct_attitudes(force, apart):
+    """Return how many of the mean readings (k, 3) point in directions more than `apart` rad from each other."""
+    kept = []
+    for direction in force / np.linalg.norm(force, axis=1, keepdims=True):
+        if all(np.arccos(np.clip(direction @ other, -1, 1)) > apart for other in kept):
+            kept.append(direction)
+    return len(kept)
+
+
+def collect_turns(time, imu, poses, noise, settings, temperature_c=None):
+    """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
+    turns, dropped, rate = [], {}, imu.rate_s
+    limit = max(settings.gap, 5 * noise['period'])
+    extreme = np.max(np.abs(rate), axis=0)
+    for first in range(len(poses.start) - 1):
+        piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
+        reason = _unusable(time[piece], rate[piece], extreme, limit, settings.turn_maximum)
+        if reason:
+            dropped[reason] = dropped.get(reason, 0) + 1
+            continue
+        density = np.mean((np.array(noise['rate_noise_sd']) * noise['rate_noise_colour'])**2) * noise['period']
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
+                              temperature_c=None if temperature_c is None else temperature_c[piece]))
+    return turns, dropped
+
+
+def _unusable(time, rate, extreme, gap, longest):
+    if time[-1] - time[0] > longest:
+        return 'too long'
+    if np.max(np.diff(time)) > gap:
+        return 'gap'
+    at_limit = np.abs(rate) >= extreme  # three equal extreme readings in a row: the range ended, not the motion
+    if np.any(at_limit[:-2] & at_limit[1:-1] & at_limit[2:]):
+        return 'clipped'
+    return ''
+
+
+def known_turn_data(time, imu, turn, noise, settings, temperature_c=None):
+    """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
+    axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
+    along = np.outer(axis, axis)
+    cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
+    piece = slice(turn.start, turn.stop)
+    density = np.mean(np.square(noise['rate_noise_sd'])) * noise['period']
+    noise_variance = density * (time[piece][-1] - time[piece][0])
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
+                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+
+
+def g_sensitivity_evidence(poses):
+    """
+    Test whether the gyroscope's readings at rest follow the direction of gravity, beyond their scatter from pose to pose.
+
+    Returns
+    -------
+    dict
+        `g_sensitivity_p_value` of the F test of ``rate = bias + sensitivity @ force`` against the bias alone, and
+        `g_sensitivity_heldout_ratio`, the rms with over that without it for poses left out one at a time.
+
+    """
+    count = len(poses.force)
+    if count < 8:
+        return {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
+    full = np.column_stack([np.ones(count), poses.force])
+    (kept, kept_out), (rest, rest_out) = _residuals(poses.rate, full), _residuals(poses.rate, full[:, :1])
+    scale = np.sqrt(np.mean(rest**2, axis=0)) + 1e-300
+    square = [np.sum((r / scale)**2) for r in (kept, rest)]
+    dof = 3 * (count - 4)
+    ratio = (square[1] - square[0]) / 9 / max(square[0] / dof, 1e-300)
+    heldout = np.sqrt(np.sum((kept_out / scale)**2) / np.sum((rest_out / scale)**2))
+    return {'g_sensitivity_p_value': float(fdtrc(9, dof, ratio)), 'g_sensitivity_heldout_ratio': float(heldout)}
+
+
+def _residuals(values, design):
+    """Return residuals of least squares, and those of each row when it is left out."""
+    basis = np.linalg.qr(design)[0]
+    residual = values - basis @ (basis.T @ values)
+    return residual, residual / np.maximum(1 - np.sum(basis**2, axis=1), 1e-6)[:, None]

@@ -1,0 +1,339 @@
+"""Where one IMU sits relative to another on the same rigid body, from their readings in motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import ByHandSettings, calibrate_by_hand
+from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, make_windows
+from imu_calibration.by_hand.relative_arm_fit import Rows, fit_arm, jackknife_covariance, lever_rows, response
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.reference.reference_motion import skew
+from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.settings import setting
+
+NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
+"""Differences of the accelerometers' biases and stamps, and the gyroscopes' lateness against the accelerometers."""
+ARM_PRIOR = 1.0
+"""m; an arm whose sd exceeds half of it counts as not seen."""
+ARM_TOLERANCE = 1e-3
+"""m; the sd that is good enough."""
+UNCALIBRATED_SCALE_SD = 0.03
+"""Scale and misalignment of a consumer gyroscope that no poses calibrated."""
+DELAY_ROUNDS = 5
+"""The delay shifts the windows of the rates until nothing is left of it."""
+WINDOWS_LEAST = 40
+"""Fewer say little about eight numbers and their scatter."""
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Numbers for the estimate of a relative arm."""
+
+    window: float = setting(0.12, 's', 'length of the windows over which the motion is integrated; never below eight samples', (0.004, 5.0),
+                            'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
+    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
+                                  (0.0, 0.9), 'too small: resting windows rule the noise estimate')
+    cluster: float = setting(2.0, 's', 'errors are taken as independent between stretches of this length', (0.1, 100.0),
+                             'too small: sd too small')
+    gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeArm:
+    """Position and attitude of IMU B in the frame of IMU A."""
+
+    arm: np.ndarray
+    """From A's sensitive point to B's, in A's frame, m, shape (3,)."""
+    covariance: np.ndarray
+    """Covariance of `arm`, shape (3, 3)."""
+    mat_ab: np.ndarray
+    """Rotation, B's frame to A's, shape (3, 3)."""
+    time_offset: float
+    """How late B's stamps are against A's, s."""
+    statuses: tuple
+    """'determined' (sd within 1 mm) or 'weak' for x, y, z."""
+    diagnostics: dict
+    """Plain numbers: windows, clipped share, residuals, nuisances, what the calibration added to the sd."""
+
+    @property
+    def arm_sd(self):
+        """Standard deviation of `arm`, m, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def lines(self):
+        """Return the remarks for a person to read."""
+        d = self.diagnostics
+        turn = np.degrees(np.linalg.norm(_rotation_vector(self.mat_ab)))
+        yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
+        yield (f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
+               f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
+               f'down to {d["residual_rms"]:.2f} m/s^2')
+        if not d['calibrated']:
+            yield 'no poses at rest to calibrate the two IMUs with: scale errors of a consumer gyroscope are in the sd'
+        for axis, status in zip('xyz', self.statuses):
+            if status != 'determined':
+                yield f'the arm along {axis} is weak; twist fast about the other two axes'
+
+
+def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY, calibration_a=None, calibration_b=None):
+    """
+    Estimate the arm r of ``f_B - f_A = alpha x r + omega x (omega x r)`` between two IMUs on one rigid body.
+
+    Both sides are integrated over short windows with the same smooth weight; alpha enters as minus the integral of the
+    weight's derivative times the rate, so nothing is differentiated. Windows with clipped samples are left out. Biases,
+    scales and axes come from a calibration by hand of each IMU, made from the poses in the same recording when not given.
+
+    Parameters
+    ----------
+    imu_a, imu_b : ImuSamples
+        Cleaned samples of the same recording, SI.
+    settings : ArmSettings
+    gravity : float
+        m/s^2.
+    calibration_a, calibration_b : HandCalibration, optional
+
+    Returns
+    -------
+    RelativeArm
+
+    Raises
+    ------
+    InputError
+        When the recordings do not overlap.
+    NotObservableError
+        When the motion does not show the arm; the message names the component.
+
+    """
+    _require_overlap(imu_a, imu_b)
+    start = int(imu_a.stamp_ns[0])
+    a, b = (_Stream.make(imu, start, gravity, given, settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
+    rotation = _relative_rotation(a, b, settings)
+    delay = 0.0
+    for _ in range(DELAY_ROUNDS):
+        rows = _build_rows(a, b, rotation, delay, settings)
+        fit = fit_arm(rows)
+        delay += fit.values[-1]
+        if abs(fit.values[-1]) < 1e-5:
+            break
+    return _result(rows, fit, delay, rotation, (a, b), settings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stream:
+    """One IMU, compensated."""
+
+    time: np.ndarray
+    force: np.ndarray
+    rate: np.ndarray
+    flagged: np.ndarray
+    calibration: object
+    poses: object
+    period: float
+
+    @classmethod
+    def make(cls, imu, start_ns, gravity, calibration, settings):
+        time = 1e-9 * (imu.stamp_ns - start_ns)
+        keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps carry no new moment
+        imu, time = imu.select(keep), time[keep]
+        period = float(np.median(np.diff(time)))
+        made_here = calibration is None
+        calibration = _calibrate(imu, gravity) if made_here else calibration
+        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
+        poses = calibration.poses if made_here and calibration is not None else None
+        return cls(time, *_compensated(imu, calibration), flagged, calibration, poses, period)
+
+
+def clipped(values):
+    """
+    Return which samples touch the end of the range, shape (n,).
+
+    The end of the range shows as the largest reading of one sign, over all axes, coming up again and again; a largest reading
+    that came twice or less is the motion's own. The two ends may differ by one count.
+    """
+    flagged = np.zeros(len(values), bool)
+    for signed in (values, -values):
+        at_end = signed >= signed.max() - 1e-9 * np.abs(signed).max()
+        if np.sum(at_end) > 2:
+            flagged |= np.any(at_end, axis=1)
+    return flagged
+
+
+def _calibrate(imu, gravity):
+    try:
+        return calibrate_by_hand(imu, gravity, find_still(imu), ByHandSettings())
+    except NotObservableError:
+        return None
+
+
+def _compensated(imu, calibration):
+    if calibration is not None:
+        return calibration.compensate(imu.force_s, imu.rate_s)
+    still = find_still(imu)
+    bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
+    return imu.force_s, imu.rate_s - bias
+
+
+def _require_overlap(imu_a, imu_b):
+    if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
+        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics')
+    overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
+    if overlap <= 0:
+        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; '
+                         'check the clocks')
+
+
+def _length(a, b, settings):
+    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
+
+
+def _centres(a, b, offset, length):
+    """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
+    step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
+    begin = max(a.time[0], b.time[0] - offset) + margin
+    end = min(a.time[-1], b.time[-1] - offset) - margin
+    if end - begin < step:
+        raise InputError(f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer')
+    first = a.time[np.searchsorted(a.time, begin)]
+    return first + step * np.arange(int((end - first) / step) + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rotation:
+    """How B's axes and clock lie against A's."""
+
+    mat_ab: np.ndarray
+    cov: np.ndarray
+    offset: float
+
+
+def _relative_rotation(a, b, settings, rounds=4):
+    """Return the rotation from the directions at rest where both were calibrated, else from the rates; the offset from the rates."""
+    offset, length = 0.0, _length(a, b, settings)
+    for _ in range(rounds):
+        centres = _centres(a, b, offset, length)
+        over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+        free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
+        over_a, over_b = over_a.select(free), over_b.select(free)
+        rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
+        mat_ab = _align(rate_a, rate_b)
+        offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
+    at_rest = _directions_at_rest(a, b, offset)
+    pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
+    mat_ab = _align(*pairs)
+    residual = pairs[0] - pairs[1] @ mat_ab.T
+    cross = skew(pairs[0])
+    information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
+    return _Rotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
+
+
+def _align(vectors_a, vectors_b):
+    """Return the rotation closest to ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
+    left, _, right = np.linalg.svd(vectors_a.T @ vectors_b)
+    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+
+
+def _directions_at_rest(a, b, offset):
+    """Return mean forces of both over the times when both rest, or None when there are too few directions."""
+    if a.poses is None or b.calibration is None:
+        return None
+    pairs = []
+    for first, last in zip(a.poses.start, a.poses.stop):
+        begin, end = a.time[first], a.time[last - 1]
+        in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
+        if in_b.stop - in_b.start >= 2:
+            pairs.append((a.force[first:last].mean(0), b.force[in_b].mean(0)))
+    return tuple(np.array(pairs).swapaxes(0, 1)) if len(pairs) >= 4 else None
+
+
+def _build_rows(a, b, rotation, delay, settings):
+    """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
+    length, offset = _length(a, b, settings), rotation.offset
+    centres = _centres(a, b, offset, length)
+    force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+    rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
+    free = ~(force_a.touches(a.flagged) | force_b.touches(b.flagged) | rate_a.touches(a.flagged) | rate_b.touches(b.flagged))
+    in_a = b.rate @ rotation.mat_ab.T
+    alpha_a, alpha_b = rate_a.slope(a.rate), rate_b.slope(in_a)
+    products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, in_a))
+    strength = np.sqrt(0.25 * np.sum((alpha_a + alpha_b)**2, axis=1) + np.trace(products, axis1=1, axis2=2)**2)
+    moving = strength > settings.motion_share * np.quantile(strength, 0.99)
+    keep = free & moving
+    if keep.sum() < WINDOWS_LEAST:
+        raise NotObservableError(f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
+                                 'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes')
+    lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
+    later, sooner = (make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1))
+    # half of the difference of two gyroscopes is the error of their mean, as far as they err independently
+    noise = np.mean((alpha_b - alpha_a)[keep]**2) / 4
+    force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
+    return Rows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
+                (later - sooner) / (2 * lag), _products(rate_a.select(keep).slope, a.rate), force_a.select(keep).slope(a.force),
+                force, float(noise), float(np.mean(~free[moving])), length)
+
+
+def _products(integrate, rate):
+    """Return the integrals of ``rate rate^T``, shape (n_windows, 3, 3)."""
+    return integrate((rate[:, :, None] * rate[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
+
+
+def _rotation_covariance(fit, rows, rotation):
+    """What the uncertainty of the rotation between the IMUs adds."""
+    shift = response(fit, -skew(rows.force))
+    return (shift @ rotation.cov @ shift.T)[:3, :3]
+
+
+def _calibration_covariance(fit, rows, a, b):
+    """What the uncertainty of the gyroscopes' matrices adds: ``rate -> (1 - E) rate`` with the sd of E."""
+    columns = []
+    for p in range(3):
+        for q in range(3):
+            turn = np.zeros((3, 3))
+            turn[p, q] = 1.0
+            product = rows.products @ turn.T
+            columns.append(-lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ fit.values[:3])
+    shift = response(fit, np.stack(columns, axis=2))
+    spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4  # the mean of both rates is used
+    return (shift @ spread @ shift.T)[:3, :3]
+
+
+def _matrix_covariance(calibration):
+    if calibration is None:
+        return UNCALIBRATED_SCALE_SD**2 * np.eye(9)
+    index = [calibration.param_names.index(f'gyroscope.matrix.{p}{q}') for p in 'xyz' for q in 'xyz']
+    return calibration.covariance[np.ix_(index, index)]
+
+
+def _result(rows, fit, delay, rotation, streams, settings):
+    motion = jackknife_covariance(fit, rows.centres, settings.cluster)[:3, :3]
+    calibration, turned = _calibration_covariance(fit, rows, *streams), _rotation_covariance(fit, rows, rotation)
+    total = motion + calibration + turned
+    sd = np.sqrt(np.diag(total))
+    _require_seen(fit.seen, sd)
+    diagnostics = {
+        'windows': len(rows.centres), 'window': rows.length, 'clipped_share': rows.clipped_share,
+        'calibrated': all(s.calibration is not None for s in streams),
+        'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
+        'signal_rms': float(np.sqrt(np.mean(rows.difference**2))), 'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
+        'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))), 'attenuation': float(1 - fit.seen[0].min()),
+        'motion_sd': np.sqrt(np.diag(motion)).tolist(), 'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
+        'rotation_sd': np.sqrt(np.diag(turned)).tolist(), **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])}}
+    statuses = tuple('determined' if s <= ARM_TOLERANCE else 'weak' for s in sd)
+    return RelativeArm(fit.values[:3], total, rotation.mat_ab, rotation.offset, statuses, diagnostics)
+
+
+def _require_seen(seen, sd):
+    """Refuse when some direction of the arm shows in the gyroscopes' noise only, or hardly at all."""
+    shares, directions = seen
+    direction = directions[:, np.argmin(shares)]
+    worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
+    if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
+        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
+                                 f'it shows is not noise and the sd is {np.max(sd):.2g} m; twist fast about the axes other than {"xyz"[worst]} too')
+
+
+def _rotation_vector(matrix):
+    angle = np.arccos(np.clip((np.trace(matrix) - 1) / 2, -1, 1))
+    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    return axis / 2 if angle < 1e-6 else axis * angle / (2 * np.sin(angle))

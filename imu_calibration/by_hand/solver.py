@@ -1,0 +1,158 @@
+"""The joint estimate of a calibration by hand: Gauss-Newton, scatter beyond the noise, what to hold, covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.by_hand.equations import State, build_system, moved
+from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, unpack
+from imu_calibration.estimation.variance_components import Scatter, estimate_scatter
+
+ITERATIONS = 15
+"""Gauss-Newton steps at most; four to six are usual."""
+LOOSE = 1e4
+"""How much the priors are relaxed when the data alone are asked: enough to show nothing of them, little enough for rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Joint estimate."""
+
+    state: State
+    """Parameters, directions and drifts."""
+    covariance: np.ndarray
+    """Covariance of the parameters, shape (n, n)."""
+    held: np.ndarray
+    """True where the prior's value was kept, shape (n,)."""
+    scatter: Scatter
+    """Scatter of poses, drifts and turns beyond the noise."""
+    factor: np.ndarray
+    """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (n, n)."""
+    steps: int
+    """Gauss-Newton steps taken."""
+
+
+def solve_joint(model, poses, turns, gravity_sd, fallback):
+    """
+    Estimate all parameters from poses and turns.
+
+    Parameters
+    ----------
+    model : HandModel
+        Parameters, priors, gravity.
+    poses : Poses
+    turns : list of TurnData
+    gravity_sd : float
+        Sd of gravity, m/s^2.
+    fallback : array, shape (3,)
+        Variances of `COMPONENTS` where the data are too few to estimate them.
+
+    Returns
+    -------
+    Solution
+
+    """
+    memory, priors = {}, model.priors
+    state = _first_state(model, poses)
+    every = np.ones(model.size, bool)
+    state, scatter, steps = _iterate(model, state, poses, turns, every, priors, fallback, fallback, memory)
+    held = choose_held(_factor(model, state, poses, turns, scatter, memory), priors)
+    state = State(np.where(held, model.nominal, state.values), state.up, state.drift)
+    start = np.maximum(scatter.variance, 0.01 * fallback)
+    state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
+    factor = _factor(model, state, poses, turns, scatter, memory)
+    cov = _covariance(factor, ~held, held, priors, state.values, gravity_sd / model.gravity)
+    return Solution(state, cov, held, scatter, factor, steps + more)
+
+
+def choose_held(factor, priors):
+    """
+    Return which parameters the data say next to nothing about, shape (n,).
+
+    One after the other, the parameter whose sd (given those held so far) is largest in units of the prior's, while that
+    exceeds one half.
+
+    """
+    held = np.zeros(len(priors), bool)
+    while not np.all(held):
+        free = ~held
+        ratio = np.zeros(len(priors))
+        ratio[free] = _data_sd(factor[:, free] * priors[free])
+        worst = int(np.argmax(ratio))
+        if ratio[worst] <= 0.5:
+            break
+        held[worst] = True
+    return held
+
+
+def _data_sd(scaled):
+    """Return the sd of parameters in units of their priors, all but unlimited where the data are silent."""
+    factor = np.linalg.qr(np.vstack([scaled, np.eye(scaled.shape[1]) / LOOSE]), mode='r')
+    return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
+
+
+def _first_state(model, poses):
+    """Fit the norms alone, then take directions and the gyroscope's bias from the poses."""
+    values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
+    for _ in range(ITERATIONS):
+        residual, columns = model.norm_rows(values, poses.force, poses.time, poses.temperature_c)
+        rows = np.vstack([columns[:, ACCELEROMETER] / (1e-3 * gravity), np.diag(1 / priors[ACCELEROMETER])])
+        target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[ACCELEROMETER] / priors[ACCELEROMETER]])
+        step = np.linalg.lstsq(rows, target, rcond=None)[0]
+        values[ACCELEROMETER] += step
+        if np.max(np.abs(step)) < 1e-10:
+            break
+    bias, matrix, *_ = unpack(values)
+    true = np.linalg.solve(matrix, (poses.force - bias).T).T
+    values[GYRO_BIAS] = poses.rate.mean(0)
+    return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
+
+
+def _iterate(model, state, poses, turns, free, priors, variance, fallback, memory):
+    """Repeat steps and scatter estimates until neither moves."""
+    count = len(poses.start)
+    scatter = Scatter(np.array(variance, float), np.full(len(fallback), np.inf), np.full(len(fallback), np.nan))
+    for number in range(1, ITERATIONS + 1):
+        system = build_system(model, state, poses, turns, memory)
+        design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),
+                            np.hstack([np.zeros((free.sum(), 5 * count)), np.eye(model.size)[free][:, free]])])
+        residual = np.concatenate([system.residual, (model.nominal - state.values)[free]])
+        noise = np.concatenate([system.noise, priors[free]**2])
+        group = np.concatenate([system.component, np.full(free.sum(), -1)])
+        before = scatter.variance
+        if number > 2:  # the first steps leave errors of linearisation that are not scatter
+            scatter = estimate_scatter(design, residual, noise, group, scatter.variance, fallback)
+        root = np.sqrt(scatter.total(noise, group))
+        orthogonal, factor = np.linalg.qr(design / root[:, None])
+        reduced = scipy.linalg.solve_triangular(factor, orthogonal.T @ (residual / root))
+        step = np.zeros(5 * count + model.size)
+        step[np.concatenate([np.ones(5 * count, bool), free])] = reduced
+        state = moved(state, step, count)
+        settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
+        if number > 3 and settled and np.linalg.norm(factor @ reduced) < 1e-3:  # in units of the joint sd
+            break
+    return state, scatter, number
+
+
+def _factor(model, state, poses, turns, scatter, memory):
+    """Return the triangular factor of the parameters with directions and drifts eliminated, at inflated variances."""
+    system = build_system(model, state, poses, turns, memory)
+    root = np.sqrt(scatter.total(system.noise, system.component, inflated=True))
+    full = np.linalg.qr(np.hstack([system.nuisance, system.main]) / root[:, None], mode='r')
+    return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]
+
+
+def _covariance(factor, free, held, priors, values, gravity_ratio):
+    """Covariance of all parameters; those held bring their prior into the others."""
+    cov = np.zeros((len(priors), len(priors)))
+    root = np.linalg.qr(factor[:, free], mode='r')
+    inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)))
+    influence = np.zeros((len(priors), held.sum()))
+    influence[held] = np.eye(held.sum())
+    influence[free] = -np.linalg.lstsq(factor[:, free], factor[:, held], rcond=None)[0]
+    cov[np.ix_(free, free)] = inverse @ inverse.T
+    cov += influence @ np.diag(priors[held]**2) @ influence.T
+    common = np.zeros(len(priors))
+    common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]  # matrix / gravity is all that poses at rest see
+    return cov + gravity_ratio**2 * np.outer(common, common)

@@ -1,0 +1,114 @@
+"""How far a calibration by hand has come: poses, attitudes and turns so far, and the direction or motion that is missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST, ByHandSettings
+from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes
+from imu_calibration.calibration.verdict import SCALES
+from imu_calibration.segmentation.static_detector import find_still
+
+FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
+"""The six directions that can be turned up."""
+SEEN = np.pi / 4
+"""A face counts as seen when an attitude lies within this angle of it, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the search for rest found in the samples so far."""
+
+    rests: list
+    """Ranges at rest (slice)."""
+    poses: object
+    """`Poses`, or None without any rest."""
+    attitudes: int
+    """Different attitudes."""
+    turns: int
+    """Turns between consecutive poses that can be used."""
+    dropped: dict
+    """Reason -> turns that cannot be used."""
+    resting: float
+    """How long the IMU has been at rest now, s; 0 while it moves."""
+
+
+NOTHING = Findings([], None, 0, 0, {}, 0.0)
+
+
+@dataclass(frozen=True)
+class HandStatus:
+    """How far a calibration by hand has come, for people."""
+
+    word: str
+    """'waiting' before a solution is possible, 'weak' while something is missing, or 'determined'."""
+    message: str
+    """One line: what there is, and what to do next."""
+    values: dict
+    """Figures by name."""
+
+
+def look_for_poses(imu, windows):
+    """Return the Findings in ImuSamples with rising stamps."""
+    rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
+    if not rests:
+        return NOTHING
+    settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
+    poses, noise = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
+    turns, dropped = collect_turns(seconds, imu, poses, noise, settings)
+    goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
+    resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
+    return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
+
+
+def hand_status(found, calibration, gravity_unknown):
+    """
+    Return the HandStatus.
+
+    Parameters
+    ----------
+    found : Findings
+    calibration : Calibration or None
+        The last solution.
+    gravity_unknown : bool
+        Whether the standard gravity stands in for the local one.
+
+    """
+    not_seen = unseen(found)
+    word, needs = _needs(found, not_seen, calibration, gravity_unknown)
+    values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
+              **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
+              'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
+    parts = [f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}']
+    if found.dropped:
+        parts.append('turns left out: ' + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items())))
+    if found.resting:
+        parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
+    parts += [f'next: {need}' for need in needs] if needs else ['everything is determined: save it']
+    return HandStatus(word, '; '.join(parts), values)
+
+
+def unseen(found):
+    """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
+    if found.poses is None:
+        return list(FACES)
+    up = found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
+    nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACES.items()}
+    return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
+
+
+def _needs(found, not_seen, calibration, gravity_unknown):
+    if found.attitudes < POSES_LEAST or calibration is None:
+        still = f'hold it still with {not_seen[0]} up' if not_seen else 'hold it still in an attitude between two faces'
+        more = f' (not seen yet: {", ".join(not_seen)})' if len(not_seen) > 1 else ''
+        return 'waiting', [f'{still}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
+    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
+    if not lacking:
+        return 'determined', []
+    if gravity_unknown and set(lacking) <= set(SCALES):
+        return 'weak', ["give the local gravity (parameter 'gravity'), which scales the accelerometer as a whole"]
+    return 'weak', list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+
+
+def _plural(count, noun):
+    return f'{count} {noun}' + ('' if count == 1 else 's')

@@ -1,0 +1,117 @@
+"""What was gathered as bytes and back: a session that is interrupted goes on where it was saved."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import DocumentError
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
+
+FORMAT = 'imu_calibration/accumulator/1'
+_MODEL = ('accelerometer', 'gyroscope', 'reference', 'joint_names')
+_PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
+
+
+def to_bytes(gathered, model):
+    """
+    Return a `Gathered` as an npz archive: numbers to the last bit, no pickled objects.
+
+    Parameters
+    ----------
+    gathered : Gathered
+        Its least-squares system, poses and counts; windows with samples are left out.
+    model : SensorModel
+        The model whose columns it holds.
+
+    """
+    rows, accumulator = gathered.accumulator.rows, gathered.accumulator
+    header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in _MODEL},
+              'temperature_ref_c': model.temperature_ref_c,
+              'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
+              'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
+              'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
+              'slow_rows': accumulator.slow_rows, **{name: getattr(gathered, name) for name in _PLAIN}}
+    arrays = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
+              'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
+              'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
+              'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
+              'poses': np.array([position for _, _, position in gathered.poses], float)}
+    for sensor in _sensors(rows):
+        for name in ('mean', 'noise_variance', 'inflation'):
+            arrays[f'{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
+    for name in ('within', 'slow'):
+        arrays |= {f'{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    return target.getvalue()
+
+
+def from_bytes(data, model):
+    """
+    Return the `Gathered` in an archive.
+
+    Raises
+    ------
+    DocumentError
+        When the bytes are no such archive, or it was gathered with another model.
+
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            header = json.loads(bytes(arrays['header']).decode())
+            _check(header, model)
+            return _gathered(header, arrays)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, IndexError, zipfile.BadZipFile) as error:
+        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this is not ({type(error).__name__}: {error}); '
+                            'remove it, or start without resume') from error
+
+
+def saved_model(data):
+    """Return the SensorModel whose columns a saved accumulator holds."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return _model(json.loads(bytes(arrays['header']).decode()))
+
+
+def _model(header):
+    point = {name: np.array(value, float) for name, value in header['point'].items()}
+    return SensorModel(*(tuple(header['model'][name]) for name in _MODEL), header['temperature_ref_c'], point)
+
+
+def _check(header, model):
+    if header.get('format') != FORMAT:
+        raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {header.get('format')!r}; remove it, or start without resume")
+    known = _model(header)
+    same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL)
+    same = same and known.temperature_ref_c == model.temperature_ref_c
+    if not same or known.point.keys() != model.point.keys() or any(np.any(known.point[n] != model.point[n]) for n in known.point):
+        raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
+                            f'asked for is {_text(model)}; start without resume, or with the old model')
+
+
+def _text(model):
+    return ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in _MODEL[:3])
+
+
+def _gathered(header, arrays):
+    numbers, whole = arrays['rows'], arrays['whole']
+    sensors = sorted(name[:-5] for name in arrays.files if name.endswith('.mean'))
+    columns = {sensor: [arrays[f'{sensor}.{name}'] for name in ('mean', 'noise_variance', 'inflation')] for sensor in sensors}
+    rows = []
+    for k, kind in enumerate(header['kinds']):
+        statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
+                      for sensor, (mean, variance, inflation) in columns.items()}
+        rows.append(WindowStatistics(kind, float(numbers[k, 0]), float(numbers[k, 1]), int(whole[k, 0]), statistics, int(whole[k, 1])))
+    within, slow = ({tuple(key): arrays[f'{name}.{number}'] for number, key in enumerate(header[name])} for name in ('within', 'slow'))
+    poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
+    plain = {name: header[name] for name in _PLAIN}
+    plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
+    return Gathered(Accumulator(rows, within, slow, header['slow_rows'], header['samples'], header['windows']), poses=poses, **plain)
+
+
+def _sensors(rows):
+    return sorted(rows[0].sensors) if rows else []

@@ -1,0 +1,85 @@
+"""Use cases as plain functions: the command line, the nodes and the tests call the same ones."""
+
+
+from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.document import tolerances_of
+from imu_calibration.calibration.from_solution import document
+from imu_calibration.calibration.gathered import join
+from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.errors import InputError
+from imu_calibration.estimation.accumulator import restrict
+from imu_calibration.estimation.solver import solve
+from imu_calibration.preflight.joint_checks import check_units
+
+
+def calibrate(sources, table, options=CalibrationOptions(), provenance=None, progress=None, mapper=map, names=None):
+    """
+    Calibrate from one or several recordings of the same IMU on a table.
+
+    Parameters
+    ----------
+    sources : sequence of callables
+        Each returns an iterator of SampleBlock when called; called again when effects must be linearised anew.
+    table : Table
+        The reference.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
+    progress : callable, optional
+        Called with the number of IMU samples read.
+    mapper : callable
+        Applies the map step to the recordings; `map`, or that of a pool.
+    names : sequence of str, optional
+        Names of the recordings for messages.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    InputError
+        When a recording cannot be used or is of another frame, with its name when there are several.
+
+    """
+    names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
+    model = choose_model(options, table, _first_temperature(sources, options))
+    for _ in range(PASSES):
+        step = GatherStep(table, model, options.windows, options.nominal, names, progress)
+        gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
+        result = finish(gathered, model, table, options, provenance)
+        again = linearise_again(model, result.solution)
+        if again is None:
+            break
+        model = again
+    return result
+
+
+def _first_temperature(sources, options):
+    """Return the first temperature of the first recording when a thermal effect asks for a reference temperature."""
+    if 'thermal' not in (options.accelerometer_model or '') + (options.gyroscope_model or ''):
+        return None
+    for block in sources[0]():
+        if block.temperature is not None and len(block.temperature):
+            return float(block.temperature.temperature_c[0])
+    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
+
+
+def finish(gathered, model, table, options=CalibrationOptions(), provenance=None):
+    """Solve what was gathered and judge it: the reduce step of calibration; the live node calls it after each window."""
+    narrow = settle_model(model, options, gathered)
+    accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    solution = solve(accumulator, narrow)
+    if options.accelerometer_model is None and _size_effect_unseen(solution):
+        smaller = narrow.without('accelerometer', 'accel_size_effect').without('accelerometer', 'lever_arm')
+        solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
+    tolerances = tolerances_of(narrow, options.tolerances)
+    calibration = document(solution, tolerances, table, gathered, provenance)
+    return CalibrationResult(calibration, solution, gathered, table, narrow, model, tolerances, options)
+
+
+def _size_effect_unseen(solution):
+    part = solution.model.slices.get(('accelerometer', 'accel_size_effect'))
+    return part is not None and bool(solution.held[part].all())

@@ -1,0 +1,138 @@
+"""From a stream of samples to a least-squares system: one recording at a time, to be merged."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration.gathered import KEPT_SAMPLES, KEPT_STATISTICS, Gathered, naming
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import NominalScaling, SampleBlock
+from imu_calibration.segmentation.window_settings import WindowSettings
+
+
+class Collector:
+    """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
+
+    def __init__(self, table, model: SensorModel, settings=WindowSettings(), nominal=None, session=0, keep=True):
+        from imu_calibration.segmentation.window_finder import MotionGatherer
+        self.table, self.model, self.nominal, self.session, self.keep = table, model, nominal, session, keep
+        self.gatherer = MotionGatherer(table, settings)
+        self.gathered = Gathered()
+        self._adapter_drops = {}
+
+    def push(self, block: SampleBlock):
+        """Take a block and return the windows that it completed."""
+        for reason, count in (block.dropped or {}).items():
+            self._adapter_drops[reason] = self._adapter_drops.get(reason, 0) + count
+        if block.imu is not None and len(block.imu):
+            if self.nominal is not None:
+                block = replace(block, imu=self.nominal.apply(block.imu))
+            self._note_imu(block.imu)
+        if block.temperature is not None and len(block.temperature):
+            self._note_temperature(block.temperature.temperature_c)
+        return self._take(self.gatherer.push(block))
+
+    def finish(self):
+        """Close the last window and return what was gathered."""
+        self._take(self.gatherer.finish())
+        self.update_counts()
+        return self.gathered
+
+    def update_counts(self):
+        """Bring the counts up to date."""
+        counts = dict(self.gatherer.counts)
+        for reason, count in self._adapter_drops.items():
+            counts[reason] = counts.get(reason, 0) + count
+        self.gathered.counts = counts
+
+    def _note_imu(self, imu):
+        found = self.gathered
+        if found.first_stamp_ns is None:
+            found.first_stamp_ns, found.frame_id = int(imu.stamp_ns[0]), imu.frame_id
+        found.last_stamp_ns = max(int(imu.stamp_ns[-1]), found.last_stamp_ns or 0)
+
+    def _note_temperature(self, temperature_c):
+        finite = temperature_c[np.isfinite(temperature_c)]
+        if len(finite):
+            low, high = self.gathered.temperature_c or (np.inf, -np.inf)
+            self.gathered.temperature_c = (float(min(low, finite.min())), float(max(high, finite.max())))
+
+    def _take(self, windows):
+        return [self._reduce(window) for window in windows if window.kind != 'unused']
+
+    def _reduce(self, window):
+        reduced = reduce_window(window, self.model, self.table, self.session)
+        found = self.gathered
+        found.accumulator.add(reduced)
+        found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
+        if window.kind == 'static':
+            found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
+            del found.poses[:-KEPT_STATISTICS]
+        else:
+            found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
+        if self.keep:
+            self._store(window, reduced)
+        return reduced
+
+    def _store(self, window, reduced: WindowStatistics):
+        found = self.gathered
+        if len(found.windows) < KEPT_STATISTICS:
+            found.windows.append(reduced)
+        if window.kind != 'static' and sum(len(w.time) for w in found.kept) + len(window.time) <= KEPT_SAMPLES:
+            found.kept.append(window)
+
+
+def gather(blocks, table, model, settings=WindowSettings(), nominal=None, session=0, keep=True, progress=None):
+    """
+    Reduce one recording to a `Gathered`: the map step of calibration.
+
+    Parameters
+    ----------
+    blocks : iterable of SampleBlock
+        The recording in file order.
+    progress : callable, optional
+        Called with the number of IMU samples read so far.
+
+    Raises
+    ------
+    InputError
+        At the end of the recording, when it cannot give a right result (`preflight`).
+
+    """
+    collector, count = Collector(table, model, settings, nominal, session, keep), 0
+    preflight = Preflight(table.gravity_value, nominal)
+    for block in preflight.watch(blocks):
+        collector.push(block)
+        count += 0 if block.imu is None else len(block.imu)
+        if progress is not None:
+            progress(count)
+    gathered = collector.finish()
+    gathered.findings = preflight.findings
+    return gathered
+
+
+@dataclass(frozen=True)
+class GatherStep:
+    """The map step with its arguments bound, so that it can be sent to another process or machine."""
+
+    table: Table
+    """The reference."""
+    model: SensorModel
+    """Defines the columns."""
+    windows: WindowSettings = WindowSettings()
+    """How windows are found."""
+    nominal: NominalScaling | None = None
+    """For recordings in volts or counts."""
+    names: tuple = ()
+    """Names of the recordings for messages; with several of them an error names the one at fault."""
+    progress: object = None
+    """Called with the number of IMU samples read so far."""
+
+    def __call__(self, numbered):
+        """Return the Gathered of a recording, given (its number, callable that yields its blocks)."""
+        session, source = numbered
+        with_name = naming(self.names, session)
+        return with_name(gather, source(), self.table, self.model, self.windows, self.nominal, session, progress=self.progress)

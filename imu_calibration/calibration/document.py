@@ -1,0 +1,267 @@
+"""The calibration: what a recording says about an IMU, as a document that people and nodes exchange."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.documents import from_text, to_text
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import find_effect
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import DocumentError, InputError
+
+FORMAT = 'imu_calibration/1'
+SECTIONS = SENSORS + ('reference',)
+DETERMINED, WEAK, HELD = 'determined', 'weak', 'held'
+IN_REFERENCE = ('lever_arm', 'accel_bandwidth', 'gyro_bandwidth')
+"""Effects of a sensor that a document lists under `reference`: they belong to the table and the session."""
+CONDITION_LIMIT = 20.0
+"""A sensor matrix with a larger condition number cannot belong to three independent axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Parameters with covariance and status, and the conditions under which they were found."""
+
+    model: SensorModel
+    """Effects and their order."""
+    values: np.ndarray
+    """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
+    covariance: np.ndarray
+    """Covariance of the values, shape (n_params, n_params)."""
+    status: tuple
+    """'determined', 'weak' or 'held' for each parameter."""
+    frame_id: str = ''
+    """Sensor frame."""
+    gauge: dict = field(default_factory=dict)
+    """Origin of the arms and the sensor axes, by convention."""
+    undetermined: tuple = ()
+    """Weak directions: {'parameters': {name: weight}, 'needs': motion}."""
+    statistics: dict = field(default_factory=dict)
+    """Residual rms, noise, chi-square, windows, samples dropped."""
+    conditions: dict = field(default_factory=dict)
+    """Temperature range, largest rate, gravity, duration, date."""
+    provenance: dict = field(default_factory=dict)
+    """Software version, bag names and hashes, options."""
+
+    @property
+    def param_names(self):
+        """Names in the order of `values`."""
+        return self.model.param_names
+
+    @property
+    def sd(self):
+        """Standard deviations, shape (n_params,)."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+
+    def value(self, sensor, effect):
+        """Return the value of one effect in its documented shape."""
+        found = find_effect(sensor, effect, self.model.joint_names)
+        return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
+
+    def has(self, sensor, effect):
+        """Return whether the model contains the effect."""
+        return (sensor, effect) in self.model.slices
+
+    def noise(self, sensor):
+        """Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics."""
+        found = self.statistics.get(sensor, {})
+        white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
+        return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
+
+    def all_determined(self):
+        """Return whether every parameter is determined."""
+        return all(status == DETERMINED for status in self.status)
+
+
+def statuses(model, sd, held, tolerances):
+    """
+    Return the status of each parameter.
+
+    Parameters
+    ----------
+    tolerances : ndarray, shape (n_params,)
+        Largest standard deviation of a determined parameter.
+
+    """
+    return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances))
+
+
+def tolerances_of(model, overrides=None):
+    """
+    Return the tolerance of each parameter of a model, shape (n_params,).
+
+    Parameters
+    ----------
+    overrides : dict, optional
+        {section: {effect: tolerance}} in SI, as in config/tolerances.yaml.
+
+    """
+    overrides = overrides or {}
+    return np.concatenate([np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance))) for e in model.effects])
+
+
+def to_mapping(calibration):
+    """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
+    document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
+    for section in SECTIONS:
+        document[section] = _section(calibration, section)
+    document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
+    document['joint_names'] = list(calibration.model.joint_names)
+    document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
+    document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
+    for name in ('statistics', 'conditions', 'provenance'):
+        document[name] = _plain(getattr(calibration, name))
+    return document
+
+
+def _members(model, section):
+    return [e for e in model.effects if (e.name in IN_REFERENCE and section == 'reference') or (e.sensor == section and e.name not in IN_REFERENCE)]
+
+
+def _section(calibration, section):
+    effects = _members(calibration.model, section)
+    entries = {'effects': [effect.name for effect in effects]}
+    for effect in effects:
+        part = calibration.model.slices[effect.sensor, effect.name]
+        status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
+        entries[effect.name] = {
+            'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.sd[part].reshape(effect.shape)),
+            'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
+    return entries
+
+
+def _plain(value):
+    """Return value with arrays and numpy numbers turned into lists and Python numbers."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def from_mapping(document):
+    """
+    Return the calibration that a document describes.
+
+    Raises
+    ------
+    DocumentError
+        When the format is unknown or newer, a value is missing, not finite or implausible.
+
+    """
+    if not isinstance(document, dict):
+        raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; give a file written by 'imu_calibration calibrate'")
+    _check_format(document.get('format'))
+    try:
+        return _checked(_parse(document))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise DocumentError(f'a calibration document must have the parts of {FORMAT}, something is missing or misshapen '
+                            f'({type(error).__name__}: {error}); write it anew') from error
+
+
+def _check_format(found):
+    name, _, number = str(found).partition('/')
+    if name != 'imu_calibration' or not number.isdigit():
+        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {found!r}; give a file written by 'imu_calibration calibrate'")
+    if int(number) > int(FORMAT.partition('/')[2]):
+        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got '{found}'; update imu_calibration")
+
+
+def _parse(document):
+    joint_names = tuple(document.get('joint_names', ('outer', 'middle', 'inner')))
+    members = {section: [] for section in SECTIONS}
+    entries = {}
+    for section in SECTIONS:
+        part = document.get(section) or {'effects': []}
+        for name in part['effects']:
+            sensor = {'lever_arm': 'accelerometer', 'accel_bandwidth': 'accelerometer', 'gyro_bandwidth': 'gyroscope'}.get(name, section)
+            members[sensor].append(name)
+            entries[sensor, name] = part[name]
+    model = SensorModel(*(tuple(members[s]) for s in SECTIONS), joint_names=joint_names,
+                        temperature_ref_c=float(document.get('reference_temperature_c', 25.0)))
+    values, status = [], []
+    for effect in model.effects:
+        entry = entries[effect.sensor, effect.name]
+        values.append(_shaped(entry['value'], effect))
+        status += np.array(entry['status'], dtype=object).reshape(effect.size).tolist()
+    values = np.concatenate(values)
+    return Calibration(model.at(values), values, _covariance(document, model, entries), tuple(status), str(document.get('frame_id', '')),
+                       dict(document.get('gauge') or {}), tuple(document.get('undetermined_directions') or ()), document.get('statistics') or {},
+                       document.get('conditions') or {}, document.get('provenance') or {})
+
+
+def _shaped(value, effect):
+    array = np.asarray(value, float)
+    if array.shape != effect.shape:
+        raise DocumentError(f"'{effect.name}' must have shape {effect.shape}, got {array.shape}; correct the calibration file")
+    return array.ravel()
+
+
+def _covariance(document, model, entries):
+    """Return the covariance in the model's order; without one, the diagonal of the standard deviations."""
+    names = model.param_names
+    given = document.get('covariance')
+    if not given:
+        return np.diag(np.concatenate([np.asarray(entries[e.sensor, e.name]['sd'], float).ravel() for e in model.effects])**2)
+    order = [given['names'].index(name) for name in names]
+    return np.asarray(given['matrix'], float)[np.ix_(order, order)]
+
+
+def _checked(calibration):
+    saturation = np.array([name.endswith('saturation.level') for name in calibration.param_names], bool)
+    if not np.all(np.isfinite(calibration.values[~saturation])) or not np.all(np.isfinite(calibration.covariance)):
+        raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again')
+    if np.any(np.diag(calibration.covariance) < 0):
+        raise DocumentError('variances must not be negative, some are; calibrate again')
+    for sensor in SENSORS:
+        for needed in ('bias', 'matrix'):
+            if not calibration.has(sensor, needed):
+                raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
+        matrix = calibration.value(sensor, 'matrix')
+        condition = np.linalg.cond(matrix)
+        if not condition < CONDITION_LIMIT:
+            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {condition:.3g}; '
+                                'calibrate again with more attitudes')
+    return calibration
+
+
+def implausible(calibration):
+    """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
+    lines = []
+    for effect in calibration.model.effects:
+        if not effect.plausible:
+            continue
+        grade, largest, source = effect.plausible[-1]
+        values = calibration.values[calibration.model.slices[effect.sensor, effect.name]]
+        size = np.max(np.abs(values if effect.components[-1] != 'time_constant' or effect.size == 1 else values[:-1]))
+        if size > 10 * largest:
+            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
+                         f'({largest:.3g}; {source}): check units and axes')
+    return lines
+
+
+def calibration_to_text(calibration):
+    """Return a calibration as the YAML of its document."""
+    return to_text(to_mapping(calibration))
+
+
+def calibration_from_text(text):
+    """
+    Return the calibration in a YAML document.
+
+    Raises
+    ------
+    DocumentError
+        When it is no calibration, newer, or implausible.
+
+    """
+    try:
+        mapping = from_text(text, 'calibration document')
+    except InputError as error:
+        raise DocumentError(str(error)) from error
+    return from_mapping(mapping)

@@ -1,0 +1,80 @@
+"""What is known of each effect of a calibration that goes on: determined, weak, held or waiting, and the motion that is still needed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.document import HELD, WEAK
+from imu_calibration.estimation import observability
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+
+WAITING = 'waiting'
+"""Status of a parameter group before the first solution; then 'determined', 'weak' or 'held'."""
+
+
+@dataclass(frozen=True)
+class GroupState:
+    """What is known of one effect of one sensor."""
+
+    sensor: str
+    """'accelerometer', 'gyroscope' or 'reference'."""
+    effect: str
+    """Name of the effect."""
+    status: str
+    """The worst of its parameters: 'determined', 'weak', 'held', or 'waiting' before the first solution."""
+    parameter: str
+    """The parameter whose standard deviation is largest in tolerances."""
+    sd: float
+    """Its standard deviation, SI; NaN before the first solution."""
+    tolerance: float
+    """Its tolerance, SI."""
+    unit: str
+    """Unit of both."""
+    needs: str = ''
+    """The motion that is still needed."""
+    predicted_sd: float = float('nan')
+    """Standard deviation after one minute of that motion; NaN when it cannot be predicted."""
+
+
+def group_states(result):
+    """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
+    calibration, prior_sd = result.calibration, make_prior(result.model).sd
+    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, prior_sd)
+    names, sd, states = calibration.param_names, calibration.sd, []
+    for effect in calibration.model.effects:
+        part = calibration.model.slices[effect.sensor, effect.name]
+        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
+        status = calibration.status[part]
+        state = group_status(status)
+        text, predicted = needed.get(names[worst], ('', float('nan'))) if state != 'determined' else ('', float('nan'))
+        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
+                                 effect.unit_of(worst - part.start), text, predicted))
+    return states
+
+
+def group_status(statuses):
+    """Return the worst of the statuses of an effect's parameters."""
+    return next((kind for kind in (HELD, WEAK) if kind in statuses), 'determined')
+
+
+def waiting_groups(model):
+    """Return the GroupState of every effect of a model of which nothing is known yet."""
+    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
+    return [GroupState(e.sensor, e.name, WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
+            for e in model.effects]
+
+
+def hand_group_states(result):
+    """Return the GroupState of every effect of a calibration by hand."""
+    calibration, states = result.calibration, []
+    names, sd = calibration.param_names, calibration.sd
+    for effect in calibration.model.effects:
+        part = calibration.model.slices[effect.sensor, effect.name]
+        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
+        state = group_status(calibration.status[part])
+        own = set(names[part]) if state != 'determined' else set()
+        needs = next((item['needs'] for item in calibration.undetermined if own & set(item['parameters'])), '')
+        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
+                                 effect.unit_of(worst - part.start), needs))
+    return states

@@ -1,0 +1,250 @@
+"""
+Error budget as section V of Avrutov 2017 meant it: the standard error from noise beside what the reference contributes.
+
+The paper sums errors of the reference and of the outputs as if they were independent, with sign. Noise gives the covariance of the
+solution; a wrong reference that changes the predicted output by ``dA c`` moves the parameters by ``G^+ dA c``, where the rows err
+together when the table is not level and apart when an encoder is read anew in every pose.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.constants import ARCMIN, STANDARD_GRAVITY
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import columns, warped_reference
+from imu_calibration.effects.forward_equations import coefficient_jacobian, sensor_output
+from imu_calibration.estimation.noise_model import sessions_of
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import tilt
+from imu_calibration.settings import setting
+
+MOVING_SAMPLES = 20_000
+"""Samples of moving windows that are looked at: every so many of them stand for all."""
+DENSE_WINDOWS = 1500
+"""Up to this many windows the wander of the bias enters the weights in full."""
+
+
+@dataclass(frozen=True)
+class ReferenceErrors:
+    """Standard deviations of what the reference is made of."""
+
+    levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated', (0.0, 0.1))
+    joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, drawn anew in every window', (0.0, 0.1))
+    rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
+    gravity: float = setting(5e-4, 'm/s^2', 'local gravity, when the table description states no gravity_sd: 50 mGal, an anomaly of the normal field', (0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """Standard deviation of each parameter by cause."""
+
+    param_names: tuple
+    """Names in the order of the rows."""
+    causes: dict
+    """Cause -> standard deviations, shape (n_params,); 'noise' first."""
+    texts: dict
+    """Cause -> what was assumed."""
+
+    @property
+    def total(self):
+        """All causes together, shape (n_params,)."""
+        return np.sqrt(sum(part**2 for part in self.causes.values()))
+
+
+def error_budget(result, errors=ReferenceErrors()):
+    """
+    Return the ErrorBudget of a calibration on a table, or by hand (noise and gravity only).
+
+    First order, around the solution; weights as the solver takes them. Windows at rest enter all, moving windows as far as their
+    samples were kept.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    errors : ReferenceErrors
+
+    """
+    if result.table is None:
+        return _budget_by_hand(result, errors)
+    gravity_sd = result.table.gravity_sd if result.table.gravity_sd is not None else errors.gravity
+    causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
+    declared = _causes(result, errors, gravity_sd)
+    shifts = parameter_shifts(result, [change for _, _, _, changes in declared for change in changes])
+    start = 0
+    for name, text, scattered, changes in declared:
+        moved = shifts[start:start + len(changes)]
+        total = moved**2 if scattered else moved.sum(axis=1, keepdims=True)**2
+        causes[name], texts[name] = np.sqrt(total.sum(axis=(0, 1))), text
+        start += len(changes)
+    return ErrorBudget(tuple(result.solution.param_names), causes, texts)
+
+
+def _causes(result, errors, gravity_sd):
+    """Return (name, text, scattered, changes); a change turns (table, motion) into what they truly are, one sd away."""
+    found = []
+    if ('reference', 'table_tilt') not in result.solution.model.slices:
+        text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
+        found.append(('levelling', text, False, [_Tilted(errors.levelling * np.eye(2)[k]) for k in range(2)]))
+    text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, drawn anew in every window'
+    found.append(('joint position', text, True, [_Turned(errors.joint_position, k) for k in range(len(result.table.joints))]))
+    found.append(('table rate', f'rate wrong by {errors.rate:.2g} of itself in all windows', False, [_Faster(errors.rate)]))
+    found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [_Heavier(gravity_sd)]))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Tilted:
+    angles: np.ndarray
+
+    def __call__(self, table, motion):
+        return tilt(table, self.angles), motion
+
+
+@dataclass(frozen=True)
+class _Turned:
+    angle: float
+    joint: int
+
+    def __call__(self, table, motion):
+        return table, replace(motion, position=motion.position + self.angle * np.eye(motion.position.shape[1])[self.joint])
+
+
+@dataclass(frozen=True)
+class _Faster:
+    share: float
+
+    def __call__(self, table, motion):
+        factor = 1 + self.share
+        return table, replace(motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration)
+
+
+@dataclass(frozen=True)
+class _Heavier:
+    change: float
+
+    def __call__(self, table, motion):
+        return replace(table, gravity=table.gravity_value + self.change), motion
+
+
+def parameter_shifts(result, changes):
+    """
+    Return how each window's share of each change moves the parameters, shape (n_changes, n_windows, n_params).
+
+    Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
+    """
+    solution = result.solution
+    pieces = [_piece(result, *source, changes) for source in _sources(result)]
+    free = ~fixed_parameters(solution.model) & ~solution.held
+    prior = make_prior(solution.model)
+    normal = prior.root.T @ prior.root
+    right = np.zeros((len(changes), len(pieces), len(solution.values)))
+    for sensor in SENSORS:
+        for axis in range(3):
+            design = np.array([piece.mean[sensor][axis] for piece in pieces])
+            weighted = _weighted(solution.noise[sensor], axis, pieces, design)
+            normal = normal + weighted.T @ design
+            for k, piece in enumerate(pieces):
+                normal += piece.within[sensor][axis]
+                right[:, k] += np.outer(piece.change[sensor][:, axis], weighted[k]) + piece.within_change[sensor][:, axis]
+    index = np.flatnonzero(free)
+    scale = 1 / np.sqrt(np.diag(normal)[index])
+    inverse = np.linalg.pinv(normal[np.ix_(index, index)] * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    shifts = np.zeros_like(right)
+    shifts[:, :, index] = right[:, :, index] @ inverse
+    return shifts
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """One window: design and changes of the output, mean and centred, weighted where centred."""
+
+    kind: str
+    """'static', 'spin' or 'dynamic'."""
+    time: float
+    """Middle, s."""
+    session: int
+    """Recording."""
+    count: float
+    """Samples."""
+    mean: dict
+    """Sensor -> mean design of each axis, shape (3, n_params)."""
+    within: dict
+    """Sensor -> products of the centred design, shape (3, n_params, n_params)."""
+    change: dict
+    """Sensor -> mean change of the output, shape (n_changes, 3)."""
+    within_change: dict
+    """Sensor -> centred design times centred change, shape (n_changes, 3, n_params)."""
+
+
+def _sources(result):
+    """Yield (kind, time, session, count, stride, motion, temperature) of the windows at rest and of the moving ones that were kept."""
+    rows = {(row.session, row.time): row.count for row in result.gathered.accumulator.rows if row.kind == 'static'}
+    typical = float(np.median(list(rows.values()))) if rows else 1.0
+    zero = np.zeros((1, len(result.table.joints)))
+    for time, session, position in result.gathered.poses:
+        motion = JointMotion(np.array([time]), np.asarray(position)[None], zero, zero, zero)
+        yield 'static', time, session, rows.get((session, time), typical), 1, motion, None
+    stride = max(1, int(np.ceil(sum(len(w) for w in result.gathered.kept) / MOVING_SAMPLES)))
+    for number, window in enumerate(result.gathered.kept):
+        some = slice(None, None, stride)
+        temperature = None if window.temperature_c is None else window.temperature_c[some]
+        yield window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature
+
+
+def _piece(result, kind, time, session, count, stride, motion, temperature, changes):
+    model, values, table = result.solution.model, result.solution.values, result.table
+    temperature = _known(model, motion, temperature)
+    parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
+    for sensor in SENSORS:
+        ref = warped_reference(model, sensor, table, motion, temperature)
+        design = columns(model, sensor, table, motion, temperature, ref)
+        slope = coefficient_jacobian(model, sensor, values)
+        output = sensor_output(model, sensor, values, ref)
+        moved = np.array([_output(model, sensor, values, *change(table, motion), temperature) - output for change in changes]).reshape(-1, len(motion), 3)
+        mean = design.mean(axis=0)
+        parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
+        parts['change'][sensor] = moved.mean(axis=1)
+        variance = result.solution.noise[sensor].within_sd(kind)**2 / stride
+        centred = design - mean
+        rest = moved - moved.mean(axis=1, keepdims=True)
+        gram, cross = centred.T @ centred, np.einsum('nq,kna->kaq', centred, rest)
+        parts['within'][sensor] = np.stack([slope[:, a].T @ gram @ slope[:, a] / variance[a] for a in range(3)])
+        parts['within_change'][sensor] = np.stack([cross[:, a] @ slope[:, a] / variance[a] for a in range(3)], axis=1)
+    return _Piece(kind, time, session, count, **parts)
+
+
+def _known(model, motion, temperature):
+    """Return temperatures where the model needs them; at rest their mean was not kept and the reference temperature stands in."""
+    needs = any(name.endswith('temperature') for sensor in SENSORS for name, _ in model.groups(sensor))
+    return np.full(len(motion), model.temperature_ref_c) if needs and temperature is None else temperature
+
+
+def _output(model, sensor, values, table, motion, temperature):
+    return sensor_output(model, sensor, values, warped_reference(model, sensor, table, motion, temperature))
+
+
+def _weighted(noise, axis, pieces, design):
+    """Return V^-1 @ design for the means of one axis, V with offsets and, for sessions of moderate length, the wander."""
+    counts, times = np.array([p.count for p in pieces]), np.array([p.time for p in pieces])
+    own = noise.white_variance[axis] * noise.inflation[axis] / counts + noise.offset_sd**2
+    if not noise.wander_sd or len(pieces) > DENSE_WINDOWS:
+        return design / (own + noise.wander_sd**2)[:, None]
+    variance = np.diag(own)
+    for index in sessions_of(pieces):
+        apart = np.abs(np.subtract.outer(times[index], times[index]))
+        variance[np.ix_(index, index)] += noise.wander_sd**2 * np.exp(-apart / noise.wander_time)
+    return np.linalg.solve(variance, design)
+
+
+def _budget_by_hand(result, errors):
+    """Return noise and gravity: without a table there is no other reference. The gravity of a default value is in the sd already."""
+    solution, model = result.solution, result.model
+    causes, texts = {'noise': result.calibration.sd}, {'noise': 'noise, scatter of poses and turns, as this recording shows them'}
+    if solution.gravity == STANDARD_GRAVITY:
+        return ErrorBudget(tuple(model.param_names), causes, {'noise': texts['noise'] + ', and the gravity, which was not given'})
+    part = model.slices['accelerometer', 'matrix']
+    gravity = np.zeros(len(result.calibration.values))
+    gravity[part] = np.abs(result.calibration.values[part]) * errors.gravity / solution.gravity
+    return ErrorBudget(tuple(model.param_names), causes | {'gravity': gravity}, texts | {'gravity': f'gravity known to {errors.gravity:.2g} m/s²'})

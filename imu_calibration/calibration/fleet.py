@@ -1,0 +1,142 @@
+"""Many units: the map step calibrates one, the merge step compares them. Plain functions, for any scheduler."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.document import HELD, calibration_to_text
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.result import exit_code, summary
+from imu_calibration.errors import ImuCalibrationError, InputError
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One IMU with its recordings."""
+
+    name: str
+    """Name of the unit."""
+    sources: tuple
+    """Callables that yield the blocks of a recording, each time anew; they must survive pickling when sent elsewhere."""
+    bags: tuple = ()
+    """Names of the recordings."""
+    provenance: object = None
+    """Callable that returns bag hashes and options for the document, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnitResult:
+    """What calibrating one unit gave; small enough to be sent back."""
+
+    name: str
+    """Name of the unit."""
+    calibration: object = None
+    """The Calibration, or None when the unit was refused."""
+    verdict: str = 'refused'
+    """'good', 'weak', 'bad' or 'refused'."""
+    exit_code: int = 1
+    """0, 1 or 3, as for a single calibration."""
+    error: str = ''
+    """Why the unit was refused, one line."""
+    files: dict | None = None
+    """File name -> text."""
+
+
+@dataclass(frozen=True)
+class FleetStep:
+    """The map step with its arguments bound."""
+
+    table: object
+    """The Table on which every unit was recorded."""
+    options: CalibrationOptions = CalibrationOptions()
+    """What to estimate."""
+    report: object = None
+    """Callable that returns report.html of a CalibrationResult, or None; it must survive pickling when sent elsewhere."""
+
+    def __call__(self, unit):
+        """Return the UnitResult of a unit; whatever goes wrong with it is part of the result."""
+        try:
+            return self._calibrated(unit)
+        except ImuCalibrationError as error:
+            return UnitResult(unit.name, error=' '.join(str(error).split()))
+        except Exception as error:   # a fleet goes on past a unit, whatever is the matter with it
+            return UnitResult(unit.name, error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}')
+
+    def _calibrated(self, unit):
+        provenance = unit.provenance() if unit.provenance is not None else None
+        result = calibrate(unit.sources, self.table, self.options, provenance, names=unit.bags or None)
+        texts = {'calibration.yaml': calibration_to_text(result.calibration)}
+        if self.report is not None:
+            texts['report.html'] = self.report(result)
+        return UnitResult(unit.name, result.calibration, summary(result)[0], exit_code(result), files=texts)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One parameter over the units."""
+
+    name: str
+    """Name of the parameter."""
+    unit: str
+    """Its SI unit."""
+    count: int
+    """Units in which it is not held at its prior."""
+    mean: float
+    """Mean of its values."""
+    spread: float
+    """Standard deviation of its values over the units; NaN for fewer than two."""
+    typical_sd: float
+    """Root of the mean of its reported variances."""
+    lowest: tuple
+    """(value, unit's name) of the lowest one."""
+    highest: tuple
+    """(value, unit's name) of the highest one."""
+
+    @property
+    def ratio(self):
+        """How much more the units differ than the calibrations are uncertain."""
+        return self.spread / self.typical_sd if self.typical_sd > 0 else float('nan')
+
+
+def summarise(results):
+    """
+    Return the Spread of each parameter over the calibrated units: the merge step.
+
+    Raises
+    ------
+    InputError
+        When no unit was calibrated.
+
+    """
+    good = [result for result in results if result.calibration is not None]
+    if not good:
+        first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
+        raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}')
+    values, order, units = {}, [], {}
+    for result in good:
+        calibration = result.calibration
+        for effect in calibration.model.effects:
+            units |= {name: effect.unit_of(k) for k, name in enumerate(effect.param_names())}
+        for name, value, sd, status in zip(calibration.param_names, calibration.values, calibration.sd, calibration.status, strict=True):
+            if name not in values:
+                order.append(name)
+            values.setdefault(name, [])
+            if status != HELD:
+                values[name].append((float(value), float(sd), result.name))
+    return [_spread(name, units[name], values[name]) for name in order]
+
+
+def _spread(name, unit, found):
+    nothing = (float('nan'), '')
+    if not found:
+        return Spread(name, unit, 0, *[float('nan')] * 3, nothing, nothing)
+    value, sd = (np.array(column) for column in list(zip(*found, strict=True))[:2])
+    low, high = found[int(np.argmin(value))], found[int(np.argmax(value))]
+    spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')
+    return Spread(name, unit, len(value), float(value.mean()), spread, float(np.sqrt(np.mean(sd**2))), (low[0], low[2]), (high[0], high[2]))
+
+
+def fleet_exit_code(results):
+    """Return 0 when every unit ended with 0, else 3."""
+    return 0 if all(result.exit_code == 0 for result in results) else 3

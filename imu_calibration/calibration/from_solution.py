@@ -1,0 +1,79 @@
+"""From a solution to the content of the calibration document: statuses, weak directions, needed motions, statistics."""
+
+from datetime import datetime, timezone
+
+import numpy as np
+
+import imu_calibration
+from imu_calibration.calibration.document import Calibration, statuses
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation import observability
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.preflight.checks import unusable, warnings
+from imu_calibration.segmentation.window_cutter import dropped
+
+
+def document(solution, tolerances, table, gathered, provenance=None):
+    """Return the Calibration for a solution, with statuses, weak directions and the motions that would help."""
+    model = solution.model
+    covariance = with_gravity_uncertainty(solution, table)
+    sd = np.sqrt(np.diag(covariance))
+    prior = make_prior(model)
+    status = statuses(model, sd, solution.held, tolerances)
+    needed = observability.needed_motions(solution, tolerances, table.gravity_value, prior.sd)
+    directions = observability.weak_directions(covariance, tolerances, model.param_names)
+    undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
+    centred = ('accelerometer', 'lever_arm') in model.slices and ('accelerometer', 'accel_size_effect') in model.slices
+    gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
+    return Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
+                       statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
+
+
+def _need(weights, needed):
+    texts = [needed[name][0] for name in sorted(weights, key=lambda n: -abs(weights[n])) if name in needed]
+    return texts[0] if texts else 'more of the same motion'
+
+
+def with_gravity_uncertainty(solution, table):
+    """Return the covariance with the uncertainty of gravity, which scales the accelerometer matrix as a whole."""
+    if not table.gravity_sd:
+        return solution.covariance
+    direction = np.zeros(len(solution.values))
+    part = solution.model.slices['accelerometer', 'matrix']
+    direction[part] = solution.values[part] * table.gravity_sd / table.gravity_value
+    return solution.covariance + np.outer(direction, direction)
+
+
+def statistics(solution, gathered):
+    """Return the statistics section: noise, residuals, chi-square, windows, what was dropped."""
+    result = {}
+    for sensor in SENSORS:
+        noise = solution.noise[sensor]
+        result[sensor] = {
+            'noise_sd': noise.sample_sd(), 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd, 'wander_sd': noise.wander_sd,
+            'wander_time_s': noise.wander_time if noise.wander_sd else None, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
+            'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
+        if sensor in solution.session_biases:
+            result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
+    accumulator = gathered.accumulator
+    result['windows'] = dict(sorted(accumulator.windows.items()))
+    result['samples_used'] = dict(sorted(accumulator.samples.items()))
+    result['dropped'] = dropped(gathered.counts)
+    result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
+    return result | preflight_statistics(gathered.findings)
+
+
+def preflight_statistics(findings):
+    """Return the part of the statistics that says what a look at the recording found."""
+    return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
+
+
+def _finite(value):
+    return float(value) if np.isfinite(value) else None
+
+
+def conditions(gathered, table):
+    """Return the conditions section."""
+    date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
+    return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,
+            'gravity': table.gravity_value if table is not None else None, 'duration_s': gathered.duration, 'date': date}

@@ -1,0 +1,128 @@
+"""What the map step of a calibration leaves behind, and how the parts of several recordings join."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.estimation.accumulator import Accumulator
+
+KEPT_SAMPLES = 200_000
+"""Samples of moving windows kept for plots and for the autocorrelation of residuals."""
+
+
+KEPT_STATISTICS = 2000
+"""Windows whose full statistics are kept for residuals per window."""
+
+
+@dataclass(eq=False)
+class Gathered:
+    """What a recording leaves behind."""
+
+    accumulator: Accumulator = field(default_factory=Accumulator)
+    """The least-squares system."""
+    windows: list = field(default_factory=list)
+    """Reduced windows with their centred rows, the first KEPT_STATISTICS of them."""
+    kept: list = field(default_factory=list)
+    """Windows with all samples, as far as KEPT_SAMPLES reaches."""
+    poses: list = field(default_factory=list)
+    """(time, session, joint positions) of each static window."""
+    counts: dict = field(default_factory=dict)
+    """Samples used and dropped, gaps, by reason."""
+    frame_id: str = ''
+    """Frame of the first IMU message."""
+    first_stamp_ns: int | None = None
+    """First IMU stamp."""
+    last_stamp_ns: int | None = None
+    """Last IMU stamp."""
+    largest_rate: float = 0.0
+    """Largest rate of the reference, rad/s."""
+    largest_force: float = 0.0
+    """Largest measured component of specific force, m/s^2."""
+    temperature_c: tuple | None = None
+    """Lowest and highest temperature."""
+    findings: tuple = ()
+    """What a look at the recording found before anything was estimated (`preflight.Finding`)."""
+
+    @property
+    def duration(self):
+        """Seconds from the first to the last IMU stamp, recordings added."""
+        return 0.0 if self.first_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
+
+
+def merge(parts):
+    """Join what several recordings left behind: the merge step of calibration."""
+    parts = list(parts)
+    total = parts[0]
+    for part in parts[1:]:
+        total.accumulator.merge(part.accumulator)
+        total.windows = (total.windows + part.windows)[:KEPT_STATISTICS]
+        total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
+        total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
+        total.largest_rate = max(total.largest_rate, part.largest_rate)
+        total.largest_force = max(total.largest_force, part.largest_force)
+        total.frame_id = total.frame_id or part.frame_id
+        total.findings += part.findings
+        ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
+        total.temperature_c = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
+        if part.first_stamp_ns is not None:
+            total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
+            total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
+    return total
+
+
+def _within_reach(windows):
+    """Return the windows up to KEPT_SAMPLES samples."""
+    ends = np.cumsum([len(window.time) for window in windows])
+    return windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
+
+
+def _added(a, b):
+    return a + b if isinstance(a, (int, float)) and isinstance(b, (int, float)) else a or b
+
+
+def naming(names, session):
+    """Return a function that calls another one and, with several recordings, puts the recording's name before its error."""
+    def call(function, *arguments, **options):
+        try:
+            return function(*arguments, **options)
+        except ImuCalibrationError as error:
+            if len(names) < 2:
+                raise
+            raise type(error)(f'{names[session]}: {error}') from error
+    return call
+
+
+def join(parts, names, check):
+    """
+    Return the merged Gathered of several recordings.
+
+    Parameters
+    ----------
+    parts : list of Gathered
+        One per recording, in order.
+    names : sequence of str
+        Names of the recordings.
+    check : callable
+        Called with each part; raises when it cannot be used.
+
+    Raises
+    ------
+    InputError
+        When a recording has no window, another frame than the first, or does not pass the check, with its name.
+
+    """
+    for session, part in enumerate(parts):
+        naming(names, session)(check, part)
+        if len(parts) > 1:
+            part.findings = tuple(finding.named(names[session]) for finding in part.findings)
+            _require_like_the_first(parts[0], part, names[0], names[session])
+    return merge(parts)
+
+
+def _require_like_the_first(first, part, first_name, name):
+    if not part.accumulator.rows:
+        raise InputError(f'{name}: every recording must hold a static window, spin or dynamic stretch, this one has none; leave it out')
+    if part.frame_id != first.frame_id:
+        raise InputError(f"{name}: all recordings must come from one IMU, the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
+                         'calibrate different IMUs one by one')

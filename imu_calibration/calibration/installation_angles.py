@@ -1,0 +1,131 @@
+"""Scale factors and the nine installation angles that a sensor matrix contains, in the units of the papers as well."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.samples import NominalScaling
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """
+    What the matrix of one sensor says about its three sensing elements.
+
+    Row i of the matrix is ``scale_i * unit vector along element i`` (Zhang 2017, eq. 5-9, with the rows of the cosines made unit).
+    """
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    scale: np.ndarray
+    """Scale factor of each element, shape (3,)."""
+    scale_sd: np.ndarray
+    """Its standard deviation, shape (3,)."""
+    angles: np.ndarray
+    """Angle between element i and sensor axis j, rad, shape (3, 3)."""
+    angles_sd: np.ndarray
+    """Its standard deviation, rad, shape (3, 3)."""
+    between: np.ndarray
+    """Angles between the elements xy, yz, xz, rad, shape (3,)."""
+    between_sd: np.ndarray
+    """Their standard deviations, rad, shape (3,)."""
+    bias: np.ndarray
+    """Reading at zero input, SI, shape (3,)."""
+    bias_sd: np.ndarray
+    """Its standard deviation, shape (3,)."""
+    input_bias: np.ndarray
+    """Input that would give the same reading, ``matrix^-1 @ bias`` (Zhang 2017, eq. 8), SI, shape (3,)."""
+
+
+PAIRS = ((0, 1), (1, 2), (0, 2))
+
+
+def derive(calibration, sensor):
+    """
+    Return the `Derived` of one sensor, standard deviations to first order from the full covariance.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    sensor : str
+        'accelerometer' or 'gyroscope'.
+
+    """
+    matrix, bias = calibration.value(sensor, 'matrix'), calibration.value(sensor, 'bias')
+    parts = {name: calibration.model.slices[sensor, name] for name in ('matrix', 'bias')}
+    covariance = calibration.covariance[parts['matrix'], parts['matrix']]
+    scale, axes = split(matrix)
+    tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[:, None, None]  # d axes_i / d row_i
+    blocks = [covariance[3 * i:3 * i + 3, 3 * i:3 * i + 3] for i in range(3)]
+    scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
+    spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]
+    angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
+    between = np.array([_angle(axes[i], axes[j]) for i, j in PAIRS])
+    between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in PAIRS])
+    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[parts['bias']],
+                   np.linalg.solve(matrix, bias))
+
+
+def split(matrix):
+    """Return (scale factors, unit vectors along the elements) of a sensor matrix, shapes (3,) and (3, 3)."""
+    scale = np.linalg.norm(matrix, axis=1)
+    return scale, matrix / scale[:, None]
+
+
+def angles_of(axes):
+    """Return the angle between each unit vector and each coordinate axis, rad; exact for small angles too, shape (n, 3)."""
+    axes = np.asarray(axes, float)
+    across = np.stack([np.hypot(axes[:, j - 2], axes[:, j - 1]) for j in range(3)], axis=1)
+    return np.arctan2(across, axes)
+
+
+def _angle(first, second):
+    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
+
+
+def _angle_sd(axis, j, spread):
+    """Return the sd of the angle to coordinate axis j; near zero, where the angle has no slope, that of the tilt itself."""
+    others = [k for k in range(3) if k != j]
+    across, tilt = axis[others], spread[np.ix_(others, others)]
+    size = np.linalg.norm(across)
+    if size**2 <= np.trace(tilt):
+        return float(np.sqrt(np.trace(tilt) / 2))
+    if size < abs(axis[j]):
+        return float(np.sqrt(across @ tilt @ across) / size / abs(axis[j]))
+    return float(np.sqrt(spread[j, j]) / size)
+
+
+def _between_sd(axes, tangent, covariance, i, j):
+    slope = np.zeros(9)
+    slope[3 * i:3 * i + 3] = axes[j] @ tangent[i]
+    slope[3 * j:3 * j + 3] = axes[i] @ tangent[j]
+    sine = max(np.linalg.norm(np.cross(axes[i], axes[j])), 1e-9)
+    return float(np.sqrt(slope @ covariance @ slope) / sine)
+
+
+def in_paper_units(derived, nominal=None):
+    """
+    Return scale factors and biases in the units of the source papers, as (what, unit, values (3,), sds (3,)).
+
+    Accelerometers: V/g and V for a recording in volts (`nominal` given), else g/g and mg. Gyroscopes: V/(deg/s) and V, else the
+    plain ratio and deg/s.
+
+    Parameters
+    ----------
+    derived : Derived
+    nominal : NominalScaling, optional
+        The conversion with which the recording was read; None: it came in SI units.
+
+    """
+    accelerometer = derived.sensor == 'accelerometer'
+    size = STANDARD_GRAVITY if accelerometer else DEG
+    name = 'g' if accelerometer else '(deg/s)'
+    if nominal is None:
+        bias_factor, unit = (1e3 / STANDARD_GRAVITY, 'mg') if accelerometer else (1 / DEG, 'deg/s')
+        return (('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd), ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor))
+    nominal = nominal if isinstance(nominal, NominalScaling) else NominalScaling(**nominal)
+    offset, per_si = ((nominal.accelerometer_offset, nominal.accelerometer_scale) if accelerometer
+                      else (nominal.gyroscope_offset, nominal.gyroscope_scale))
+    return (('scale factor', f'V/{name}', derived.scale * per_si * size, derived.scale_sd * abs(per_si) * size),
+            ('bias', 'V', offset + derived.bias * per_si, derived.bias_sd * abs(per_si)))

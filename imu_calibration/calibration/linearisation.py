@@ -1,0 +1,56 @@
+"""Whether a solution lies too far from where its columns were taken, and where they should be taken instead."""
+
+import numpy as np
+
+PASSES = 6
+"""Passes over a recording at most, when effects have to be linearised anew."""
+
+
+LINEAR_STEPS = 25
+"""Steps of a numerical derivative (5 ms of a delay) over which a linearisation is believed in directions that are hardly seen."""
+
+
+def linearise_again(model, solution):
+    """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
+    return model.at(_values_in(model, solution, _cautious(solution))) if _needs_another_pass(model, solution) else None
+
+
+def _cautious(solution):
+    """
+    Return values to linearise at: those of the solution, but for directions that the recording hardly shows.
+
+    At zero a lag and a delay are the same to first order. What tells them apart, and how far, is only seen from a point where both act;
+    a full step along their difference would lead anywhere. So the step is the solution's with a pull of LINEAR_STEPS towards the point.
+    """
+    model, values = solution.model, solution.values
+    move, pull = np.zeros(len(values)), np.zeros(len(values))
+    for effect in model.relinearised:
+        if effect.warp is not None:
+            part = model.slices[effect.sensor, effect.name]
+            move[part], pull[part] = values[part] - model.warp_point(effect), (LINEAR_STEPS * effect.step)**-2
+    moving = np.flatnonzero(pull)
+    if not len(moving):
+        return values
+    known = np.linalg.inv(solution.covariance[np.ix_(moving, moving)])
+    kept = values.copy()
+    kept[moving] -= np.linalg.solve(known + np.diag(pull[moving]), pull[moving] * move[moving])
+    return kept
+
+
+def _needs_another_pass(model, solution):
+    """Return whether an effect moved so far from where its columns were taken that the first derivative no longer holds."""
+    for effect in model.relinearised:
+        if (effect.sensor, effect.name) not in solution.model.slices:
+            continue
+        part = solution.model.slices[effect.sensor, effect.name]
+        moved = np.abs(solution.values[part] - model.warp_point(effect))
+        if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
+            return True
+    return False
+
+
+def _values_in(model, solution, known):
+    values = model.start()
+    for effect in solution.model.effects:
+        values[model.slices[effect.sensor, effect.name]] = known[solution.model.slices[effect.sensor, effect.name]]
+    return values

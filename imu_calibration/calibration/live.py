@@ -1,0 +1,258 @@
+"""Calibration while the motion goes on: windows as they complete, a solution after them, the same answer as offline."""
+
+import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration.calibrate import finish
+from imu_calibration.calibration.collector import Collector
+from imu_calibration.calibration.effect_states import group_states, waiting_groups
+from imu_calibration.calibration.gathered import Gathered, merge
+from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.errors import InputError
+from imu_calibration.estimation.window_store import WindowStore
+from imu_calibration.preflight.joint_checks import check_units
+from imu_calibration.samples import ImuSamples
+from imu_calibration.settings import setting
+
+HELD_BACK = 200
+"""Blocks that wait for the first temperature at most, when a thermal effect needs one."""
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How often to solve, and what is kept and told."""
+
+    solve_share: float = setting(0.1, '1', 'largest share of the time that solving after each window may take', (0.001, 1.0),
+                                 'too small: results come late; too large: the node takes a whole core')
+    residual_rate: float = setting(20.0, 'Hz', 'residuals published per second of data, the others are left out; 0: none', (0.0, 10000.0),
+                                   'too large: more time goes into publishing than into calibrating')
+    store_samples: int = setting(300_000, '1', 'samples in motion kept for effects that must be linearised anew (table tilt, delays); '
+                                 'about 200 bytes each', (0, 100_000_000),
+                                 'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so')
+    diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth '
+                                      'of the time at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
+                                      'too small: the diagnosis takes a core from other programs')
+    diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each',
+                                     (1000, 100_000_000),
+                                     'too small: effects that need the whole session are not found')
+
+
+class LiveCalibration:
+    """
+    One session as it happens: `push` what arrives, `solve` when it is due.
+
+    Windows are found and reduced by the very objects that read recordings, and solved by the same functions, so the answer is
+    that of `workflow.calibrate` on the same samples. Memory is bounded: samples in reduced form, a bounded store of windows for
+    effects that must be linearised anew.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    options : CalibrationOptions
+        What to estimate.
+    settings : LiveSettings
+    earlier : Gathered, optional
+        What an earlier run left behind (see `accumulator_state`); this session is then merged with it.
+
+    """
+
+    def __init__(self, table, options=CalibrationOptions(), settings=LiveSettings(), earlier=None):
+        self.table, self.options, self.settings, self.earlier = table, options, settings, earlier
+        self._thermal = 'thermal' in (options.accelerometer_model or '') + (options.gyroscope_model or '')
+        self._waiting, self._collector = [], None
+        self.result = None
+        self.open_windows = []
+        """Windows that were still open at the last solution with `pending`, closed in a copy."""
+        if not self._thermal:
+            self._begin(None)
+
+    @property
+    def n_windows(self):
+        """Windows gathered so far, those of an earlier run included."""
+        parts = [self.earlier] + [self._collector and self._collector.gathered]
+        return sum(sum(part.accumulator.windows.values()) for part in parts if part)
+
+    @property
+    def counts(self):
+        """Samples of this run by what became of them."""
+        if self._collector is None:
+            return {}
+        self._collector.update_counts()
+        return dict(self._collector.gathered.counts)
+
+    @property
+    def model(self):
+        """The model whose columns are gathered; None while a thermal effect waits for the first temperature."""
+        return self._collector and self._collector.model
+
+    def push(self, block):
+        """
+        Take what arrived and return the windows that it completed (list of Window).
+
+        Raises
+        ------
+        InputError
+            When the joint states do not hold the table's joints.
+
+        """
+        if self._collector is None:
+            return self._push_before_temperature(block)
+        self._collector.push(block)
+        return self._completed()
+
+    def _completed(self):
+        return self._collector.take_completed()
+
+    def _push_before_temperature(self, block):
+        self._waiting.append(block)
+        del self._waiting[:-HELD_BACK]
+        if block.temperature is None or not len(block.temperature):
+            return []
+        self._begin(float(block.temperature.temperature_c[0]))
+        blocks, self._waiting = self._waiting, []
+        for held_back in blocks:
+            self._collector.push(held_back)
+        return self._completed()
+
+    def _begin(self, temperature_c):
+        model = choose_model(self.options, self.table, temperature_c)
+        session = 0
+        if self.earlier is not None:
+            session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
+        store = WindowStore(self.settings.store_samples, self.earlier is None)
+        self._collector = _LiveCollector(self.table, model, self.options, session, store)
+
+    def solve(self, pending=False, provenance=None):
+        """
+        Solve what was gathered and return the CalibrationResult, which stays in `result`.
+
+        Parameters
+        ----------
+        pending : bool
+            Count the windows in that are still open, as the end of a recording would; the session goes on as if nothing had
+            happened.
+        provenance : dict, optional
+            For the document.
+
+        Raises
+        ------
+        NotObservableError
+            When no window is complete yet, or nothing is determined.
+        InputError
+            When the units are plainly wrong.
+
+        """
+        if self._collector is None:
+            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
+        gathered, store, self.open_windows = self._collector.snapshot(pending)
+        model = self._collector.model
+        total = self._with_earlier(gathered)
+        check_units(total, model)
+        for _ in range(PASSES - 1):
+            result = finish(total, model, self.table, self.options, provenance)
+            moved = linearise_again(model, result.solution)
+            if moved is None or not store.complete:
+                break
+            model = moved
+            total = replace(total, accumulator=store.reduced(model, self.table, self._collector.session))
+        else:
+            result = finish(total, model, self.table, self.options, provenance)
+        self.result = result
+        return result
+
+    @property
+    def store_is_complete(self):
+        """Whether effects can be linearised anew."""
+        return self._collector is None or self._collector.store.complete
+
+    def needs_linearising(self):
+        """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
+        return self.result is not None and linearise_again(self.result.gathered_model, self.result.solution) is not None
+
+    def gathered(self, pending=False):
+        """Return everything that was gathered, an earlier run included, to be saved."""
+        if self._collector is None:
+            return self.earlier or Gathered()
+        return self._with_earlier(self._collector.snapshot(pending)[0])
+
+    def saved(self, pending=False):
+        """Return everything that was gathered as bytes, for an `earlier` of another run (see `accumulator_state`)."""
+        return accumulator_state.to_bytes(self.gathered(pending), self.model)
+
+    def _with_earlier(self, gathered):
+        if self.earlier is None:
+            return gathered
+        return merge([_copied(self.earlier), gathered])
+
+    def residuals(self, windows):
+        """
+        Return measured minus predicted of windows from `push`, as ImuSamples, or None before the first solution.
+
+        Every k-th sample, so that there are at most `residual_rate` per second.
+        """
+        if self.result is None or not windows or not self.settings.residual_rate:
+            return None
+        parts = [self._residual(window) for window in windows]
+        return ImuSamples.concatenate(parts)
+
+    def _residual(self, window):
+        model, values = self.result.model, self.result.solution.values
+        every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
+        pick = slice(every // 2 if len(window) > every // 2 else 0, None, every)
+        static = window.kind == 'static'
+        motion = window.motion if static else window.motion.select(pick)
+        temperature = window.temperature_c
+        if temperature is not None:
+            temperature = np.array([temperature.mean()]) if static else temperature[pick]
+        parts = [measured[pick] - columns(model, sensor, self.table, motion, temperature) @ coefficients(model, sensor, values)
+                 for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
+        return ImuSamples(window.stamp_ns[pick], *parts, self._collector.gathered.frame_id)
+
+    def groups(self):
+        """Return the GroupState of every effect."""
+        if self.result is None:
+            return waiting_groups(self.model) if self.model is not None else []
+        return group_states(self.result)
+
+
+class _LiveCollector(Collector):
+    """A Collector that hands completed windows on and keeps a bounded number of them."""
+
+    def __init__(self, table, model, options, session, store):
+        super().__init__(table, model, options.windows, options.nominal, session)
+        self.store, self._completed = store, []
+
+    def _store(self, window, reduced):
+        self._completed.append(window)
+        if self.model.relinearised:
+            self.store.add(window, reduced)
+
+    def take_completed(self):
+        """Return the windows since the last call."""
+        completed, self._completed = self._completed, []
+        return completed
+
+    def snapshot(self, pending):
+        """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
+        twin = copy.copy(self)
+        twin.gathered, twin.store, twin._completed = _copied(self.gathered), self.store.copy(), []
+        if pending:
+            twin.gatherer = copy.deepcopy(self.gatherer)
+            twin.finish()
+        else:
+            twin.update_counts()
+        return twin.gathered, twin.store, twin.take_completed()
+
+
+def _copied(gathered):
+    """Return a copy that shares only what nobody changes in place."""
+    accumulator = gathered.accumulator.copy()
+    return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), windows=[], kept=[], counts=dict(gathered.counts))

@@ -1,0 +1,18 @@
+"""When the next solution is due."""
+
+import numpy as np
+
+
+class SolvePacer:
+    """Says when the next solution is due, so that solving takes no more than a share of the time."""
+
+    def __init__(self, share):
+        self._share, self._next = share, -np.inf
+
+    def due(self, now):
+        """Return whether enough time has passed; `now` in s of a steady clock."""
+        return now >= self._next
+
+    def note(self, start, end):
+        """Take note of a solution that was worked on from `start` to `end`."""
+        self._next = start + (end - start) / self._share

@@ -1,0 +1,201 @@
+"""Good, weak or bad: whether a calibration may be used, why, and what to do next."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.document import HELD, WEAK, implausible
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.units import for_people, significant
+
+GOOD, BAD, NOTE = 'good', 'bad', 'note'
+MISFIT = 10.0
+"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
+LOOSE = 2.0
+"""From this factor on the misfit is worth a note."""
+LOST_SHARE = 0.05
+"""Losing more than this share of the samples is worth a look at the recording."""
+SCALES = tuple(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz')
+HAND_AXES = 'accelerometer_lower_triangular'
+"""The axes of a calibration by hand."""
+SHOWN_NAMES = 6
+"""Names listed one by one; of more, the groups are named."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One thing that speaks for or against the calibration."""
+
+    word: str
+    """'good', 'weak', 'bad', or 'note', which leaves the verdict alone."""
+    what: str
+    """What was seen."""
+    next: str
+    """What to do about it; empty when nothing has to be done."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict with its reasons, the gravest first."""
+
+    word: str
+    """'good', 'weak' or 'bad'."""
+    reasons: tuple
+    """Reason, ..."""
+
+    @property
+    def lines(self):
+        """Reasons and next steps, a line each."""
+        lines = []
+        for reason in self.reasons:
+            lines.append(reason.what if reason.word in (GOOD, self.word) else f'{reason.word}: {reason.what}')
+            lines += [f'next: {reason.next}'] if reason.next else []
+        return list(dict.fromkeys(lines))
+
+
+def requested(name):
+    """Return whether a parameter is the robot's business; table, clock and the common arm are nuisances."""
+    return not name.startswith('reference.') and '.lever_arm.' not in name
+
+
+def judge(calibration, tolerances):
+    """
+    Return the Verdict on a calibration.
+
+    Bad: a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
+    nothing was determined. Weak: a requested parameter is not determined to its tolerance. Good: neither.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    tolerances : ndarray, shape (n_params,)
+        Largest standard deviation of a determined parameter.
+
+    """
+    against = _implausible(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
+    word = BAD if any(r.word == BAD for r in against) else WEAK if against else GOOD
+    favour = [] if against else [_all_well(calibration, tolerances)]
+    order = (BAD, WEAK)
+    against = sorted(against, key=lambda r: order.index(r.word))
+    return Verdict(word, tuple(favour + against + _notes(calibration, tolerances)))
+
+
+def _implausible(calibration):
+    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description')
+            for line in implausible(calibration)]
+
+
+def _ratios(calibration, sensor):
+    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
+    return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
+
+
+def _quiet(calibration):
+    """Return what residuals in motion are compared with; without a rest only their own slow part is there, and lags show in the fast one."""
+    windows = calibration.statistics.get('windows')
+    return 'the noise at rest' if windows is None or windows.get('static') else 'their slow part (a lag or a late clock leaves that)'
+
+
+def _misfits(calibration):
+    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: the model leaves something out',
+                   "run 'imu_calibration diagnose' to find the cause")
+            for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if ratio > MISFIT]
+
+
+def _blind(calibration):
+    reasons = []
+    for sensor in SENSORS:
+        own = [s for n, s in zip(calibration.param_names, calibration.status) if n.startswith(sensor) and requested(n)]
+        if own and all(status == HELD for status in own):
+            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor)))
+    return reasons
+
+
+def _first_need(calibration, start=''):
+    needs = [d['needs'] for d in calibration.undetermined if any(name.startswith(start) for name in d['parameters'])]
+    return needs[0] if needs else 'record static poses and turns about all three axes'
+
+
+def _undetermined(calibration):
+    reasons = []
+    for status, text in ((WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
+        names = [n for n, s in zip(calibration.param_names, calibration.status) if s == status and requested(n)]
+        if status == WEAK and _gravity_unknown(calibration, names):
+            scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
+            reasons.append(Reason(WEAK, f'{listed(scale)}: the local gravity was not given, which scales them together', 'give it with --gravity'))
+        for next_step, members in _by_need(calibration, names).items():
+            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step))
+    return reasons
+
+
+def _gravity_unknown(calibration, names):
+    by_hand = calibration.gauge.get('axes') == HAND_AXES
+    return by_hand and calibration.conditions.get('gravity') == STANDARD_GRAVITY and set(SCALES) <= set(names)
+
+
+def _by_need(calibration, names):
+    """Return {motion: names}: each name with the motion of the weak direction in which it weighs most."""
+    found = {}
+    for name in names:
+        weights = [(abs(d['parameters'].get(name, 0.0)), d['needs']) for d in calibration.undetermined]
+        best = max(weights, default=(0.0, ''), key=lambda pair: pair[0])
+        if best[0] == 0.0:
+            same = [d['needs'] for d in calibration.undetermined if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])]
+            best = (1.0, same[0] if same else 'record the same motion for longer')
+        found.setdefault(best[1], []).append(name)
+    return found
+
+
+def listed(names):
+    """Return names in a sentence; of many, the groups with their numbers."""
+    if len(names) <= SHOWN_NAMES:
+        return ', '.join(names)
+    groups = {}
+    for name in names:
+        groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
+    return ', '.join(f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items())
+
+
+def _all_well(calibration, tolerances):
+    share = np.where([requested(n) for n in calibration.param_names], calibration.sd / tolerances, 0.0)
+    worst = int(np.argmax(share))
+    count = sum(requested(n) for n in calibration.param_names)
+    fit = [ratio for sensor in SENSORS for ratio in _ratios(calibration, sensor).values()]
+    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {_quiet(calibration)}' if fit else ''
+    return Reason(GOOD, f'all {count} parameters are within their tolerance (the closest, {calibration.param_names[worst]}, '
+                        f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', or compensator_node")
+
+
+def _notes(calibration, tolerances):
+    return _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
+
+
+def _loose(calibration):
+    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}',
+                   "see 'imu_calibration diagnose' when that matters to you")
+            for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
+
+
+def _unstable(calibration, tolerances):
+    """Return notes on biases that move from window to window by more than the tolerance on their mean."""
+    reasons = []
+    for sensor in SENSORS:
+        part = calibration.model.slices[sensor, 'bias']
+        scatter = float(np.max(calibration.noise(sensor)[1]))
+        if scatter > tolerances[part][0]:
+            factor, unit = for_people(calibration.model.effects[[e.sensor for e in calibration.model.effects].index(sensor)].unit_of(0))
+            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by {significant(scatter * factor, 2)} {unit}, more than '
+                                        'the tolerance on its bias: the mean is well known, the bias of the moment is not',
+                                  'let the IMU warm up and the table stand firm, or estimate the bias in use'))
+    return reasons
+
+
+def _lost(calibration):
+    dropped = calibration.statistics.get('dropped')
+    if not dropped:
+        return []
+    total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
+    text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
+    many = total > LOST_SHARE * max(used, 1)
+    return [Reason(NOTE, text, "look at the recording with 'imu_calibration inspect'" if many else '')]

@@ -1,0 +1,40 @@
+"""``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
+
+from imu_calibration.by_hand.workflow import read_imu
+from imu_calibration.cli import recordings
+from imu_calibration.cli.show import console, warn
+from imu_calibration.errors import InputError
+from imu_calibration.preflight.checks import Preflight, warnings
+from imu_calibration.units import with_sd
+
+NAME = 'arm'
+HELP = 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('bag', metavar='BAG')
+    parser.add_argument('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
+
+
+def run(options):
+    """Estimate and print."""
+    from imu_calibration.by_hand.relative_arm import estimate_arm
+    if len(options.imu_topic) != 2:
+        raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
+    imus = []
+    for topic in options.imu_topic:
+        options.joint_topic = options.temperature_topic = None
+        recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
+        blocks = recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()
+        preflight = Preflight()
+        imus.append(read_imu(preflight.watch(blocks))[0])
+        warn({'text': f'{topic}: {finding.text}'} for finding in warnings(preflight.findings))
+    result = estimate_arm(*imus)
+    out = console()
+    for axis, value, sd in zip('xyz', result.arm, result.arm_sd):
+        shown, spread = with_sd(value * 1e3, sd * 1e3)
+        out.print(f'{axis}: {shown} +- {spread} mm')
+    for line in result.lines():
+        out.print(line, soft_wrap=True)
+    return 0

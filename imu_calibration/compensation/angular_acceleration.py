@@ -1,0 +1,200 @@
+"""Angular acceleration from the measured rate: a causal filter whose delay and noise are known."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class CausalDerivative:
+    """
+    Slope of a straight line through the last `taps` samples of the rate.
+
+    The slope is that of the middle of the window: the delay is ``(taps - 1) / 2`` periods. The noise of the slope is
+    ``rate_sd * sqrt(12 / (taps (taps^2 - 1))) / period``, the smallest that a linear filter of that length can have.
+    """
+
+    taps: int
+    """Number of samples, at least 2."""
+    period: float
+    """Sampling period, s."""
+
+    @property
+    def delay(self):
+        """Delay of the angular acceleration, s."""
+        return (self.taps - 1) / 2 * self.period
+
+    @property
+    def weights(self):
+        """Weights of the newest to the oldest sample, 1/s, shape (taps,)."""
+        index = (self.taps - 1) / 2 - np.arange(self.taps)
+        return index / (index @ index) / self.period
+
+    def noise_sd(self, rate_sd):
+        """Return the standard deviation of the angular acceleration for white rate noise, rad/s^2."""
+        return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
+
+
+def choose_derivative(period, rate_sd, arm, force_sd, largest_delay=0.02):
+    """
+    Return the shortest window whose noise, through the arm, stays below a third of the accelerometer's own noise.
+
+    Parameters
+    ----------
+    period : float
+        Sampling period, s.
+    rate_sd, force_sd : float
+        Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the largest delay.
+    arm : float
+        Longest lever arm that the correction takes out, m.
+    largest_delay : float
+        The window does not grow beyond this delay, s.
+
+    """
+    longest = max(2, int(2 * largest_delay / period) + 1)
+    if not (rate_sd > 0 and force_sd > 0):
+        return CausalDerivative((longest + 2) // 2, period)
+    for taps in range(2, longest + 1):
+        derivative = CausalDerivative(taps, period)
+        if derivative.noise_sd(rate_sd) * arm <= force_sd / 3:
+            return derivative
+    return CausalDerivative(longest, period)
+
+
+RESET_NS = 1_000_000_000
+"""A larger step back is a new setting of the clock, a smaller one a sample that came late."""
+
+
+REFRESH = 1000
+"""The running sums are formed anew after so many samples, so that rounding does not add up."""
+
+
+EARLY, LATE = 0.5, 1.5
+"""A step between these many periods is a regular one."""
+
+
+WARM_UP = 16
+"""Steps from which the period is found."""
+
+
+class StampedDerivative:
+    """
+    Slope of a straight line through the last samples of a vector, updated one sample or one block at a time.
+
+    The samples count as equally spaced, as those of a sensor with a clock of its own are, whatever the jitter of their stamps; the
+    stamps say where some are missing. A hole shorter than the window is bridged by a straight line; after a longer one, or when
+    the clock is set back by more than a second, the window starts anew. A sample that is doubled or came late does not enter the
+    window and gets the derivative of the newest one. While the window is less than half full the derivative is zero.
+
+    Parameters
+    ----------
+    derivative : differentiation.CausalDerivative
+        Window and period.
+
+    """
+
+    def __init__(self, derivative):
+        self.taps, self.period = derivative.taps, derivative.period
+        self._period_ns = derivative.period * 1e9
+        self._least = max(2, (self.taps + 1) // 2)
+        self._scale = [0.0, 0.0, *(12.0 / (n * (n * n - 1.0)) / self.period for n in range(2, self.taps + 1))]
+        self._zero = (0.0, 0.0, 0.0)
+        self.resets = -1
+        self._restart()
+        self._newest, self.alpha = None, self._zero
+
+    def _restart(self):
+        self.resets += 1
+        self._window = deque()
+        self._sums = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._age = 0
+
+    def push(self, stamp_ns, x, y, z):
+        """Return the derivative (x, y, z) after one more sample, per second."""
+        if self._newest is not None:
+            step = (stamp_ns - self._newest) / self._period_ns
+            if not EARLY < step <= LATE:
+                if step <= EARLY and stamp_ns - self._newest > -RESET_NS:
+                    return self.alpha
+                self._hole(step, x, y, z)
+        self._newest = stamp_ns
+        self._add(x, y, z)
+        n = len(self._window)
+        if n < self._least:
+            self.alpha = self._zero
+        else:
+            sx, sy, sz, px, py, pz = self._sums
+            middle, scale = 0.5 * (n - 1), self._scale[n]
+            self.alpha = ((px - middle * sx) * scale, (py - middle * sy) * scale, (pz - middle * sz) * scale)
+        return self.alpha
+
+    def _add(self, x, y, z):
+        """Slide the window: S = sum of v_k, P = sum of k v_k, k from the oldest."""
+        window = self._window
+        sx, sy, sz, px, py, pz = self._sums
+        n = len(window)
+        if n == self.taps:
+            ox, oy, oz = window.popleft()
+            sx, sy, sz, n = sx - ox, sy - oy, sz - oz, n - 1
+            px, py, pz = px - sx, py - sy, pz - sz
+        window.append((x, y, z))
+        self._sums = (sx + x, sy + y, sz + z, px + n * x, py + n * y, pz + n * z)
+        self._age += 1
+        if self._age >= REFRESH:
+            self._refresh()
+
+    def _refresh(self):
+        values = np.array(self._window).reshape(-1, 3)
+        self._sums = (*values.sum(axis=0).tolist(), *(np.arange(len(values)) @ values).tolist())
+        self._age = 0
+
+    def _hole(self, step, x, y, z):
+        missing = round(step) - 1
+        if not self._window or step < 0 or missing >= self.taps:
+            self._restart()
+            return
+        ox, oy, oz = self._window[-1]
+        for k in range(1, missing + 1):
+            part = k / (missing + 1)
+            self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
+
+    def seed(self, other):
+        """Take over the past of another derivative of the same stream, as far as this window reaches."""
+        self._newest = other._newest
+        for x, y, z in list(other._window)[-self.taps:]:
+            self._add(x, y, z)
+
+    def push_block(self, stamp_ns, values):
+        """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
+        out = np.empty(values.shape)
+        steps = np.diff(stamp_ns) / self._period_ns
+        bounds = np.concatenate([[0], 1 + np.flatnonzero((steps <= EARLY) | (steps > LATE)), [len(values)]])
+        for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist()):
+            lead = min(end, start + self.taps + 1)
+            for k in range(start, lead):
+                out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
+            if lead < end and self._newest == stamp_ns[lead - 1]:
+                self._regular(stamp_ns, values, lead, end, out)
+            else:
+                for k in range(lead, end):
+                    out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
+        return out
+
+    def _regular(self, stamp_ns, values, start, end, out):
+        """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
+        from scipy.signal import lfilter  # here, because scipy.signal takes a second to import
+        taps = self.taps
+        index = (taps - 1) / 2 - np.arange(taps)
+        stretch = values[start - taps + 1:end]
+        out[start:end] = lfilter(index * self._scale[taps], [1.0], stretch, axis=0)[taps - 1:]
+        self._newest, self.alpha = int(stamp_ns[end - 1]), tuple(out[end - 1].tolist())
+        self._window = deque(map(tuple, values[end - taps:end].tolist()))
+        self._refresh()
+
+
+def typical_period(stamp_ns):
+    """Return the median of the steps ahead between stamps, s; None without one."""
+    steps = np.diff(np.asarray(stamp_ns, np.int64))
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * 1e-9 if len(steps) else None

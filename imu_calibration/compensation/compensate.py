@@ -1,0 +1,181 @@
+"""Compensation: the calibration inverted, with the lever-arm correction from the measured rate."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import sensor_output
+from imu_calibration.errors import InputError
+from imu_calibration.reference.reference_motion import Reference, lever_matrix
+
+ITERATIONS = 12
+"""Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
+CONVERGED = 1e-2
+"""
+Samples whose last step is larger (m/s^2, rad/s) lie where the non-linear effects cannot be undone; they become NaN.
+
+Close to zero input, where the asymmetry's sign is open, the steps go back and forth by up to 1e-3 and that is no failure.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """Samples after compensation, in the sensor frame and at the gauge's origin, or in the target frame and point."""
+
+    force: np.ndarray
+    """Specific force, m/s^2, shape (n, 3)."""
+    rate: np.ndarray
+    """Angular rate, rad/s, shape (n, 3)."""
+    flagged: np.ndarray
+    """True where the output cannot be trusted: the input was saturated, or too large for the inversion, shape (n,)."""
+    marks: np.ndarray
+    """Variance of saturated (force, rate): the square of the range, since the true value is not known better; else 0. Shape (n, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Another point and frame of the same rigid body."""
+
+    frame_id: str
+    """Name of the target frame."""
+    mat_ts: np.ndarray
+    """Turns sensor vectors into target vectors, shape (3, 3)."""
+    arm_t: np.ndarray
+    """From the target's origin to the sensor, in the target frame, m, shape (3,)."""
+
+    @classmethod
+    def from_pose(cls, frame_id, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0)):
+        """
+        Return the transfer to a frame in which the sensor sits at `xyz` (m), turned by `rpy`.
+
+        Parameters
+        ----------
+        xyz, rpy : sequence of 3 floats
+            Pose of the sensor in the target frame, as in a static transform or a URDF joint from target to sensor: roll, pitch,
+            yaw in rad about the fixed axes x, y, z.
+
+        """
+        if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
+            raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
+                             'correct it')
+        return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
+
+
+def invertible(model):
+    """Return the model with only those effects that compensation inverts."""
+    keep = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact') for sensor in SENSORS}
+    return replace(model, reference=(), **keep)
+
+
+def invertible_values(calibration):
+    """Return (model, values) of the part of a calibration that compensation inverts."""
+    model = invertible(calibration.model)
+    values = np.concatenate([calibration.values[calibration.model.slices[e.sensor, e.name]] for e in model.effects])
+    return model, values
+
+
+def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transfer=None):
+    """
+    Return corrected samples.
+
+    Solves ``measured = output(true)`` for both sensors together by fixed-point steps
+    ``x <- x + matrix^-1 (measured - output(x))``: gyroscope and accelerometer depend on one another through g-sensitivity
+    and lever arms.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What to undo; effects of the table and of the session are left alone.
+    force_s, rate_s : ndarray, shape (n, 3)
+        Measured specific force (m/s^2) and rate (rad/s) in the sensor frame.
+    alpha_s : ndarray, shape (n, 3)
+        Angular acceleration in the sensor frame, rad/s^2 (see `differentiation`).
+    temperature_c : ndarray, shape (n,), optional
+        Needed when the calibration has thermal effects.
+    transfer : Transfer, optional
+        Point and frame to move to: ``f_target = f_s - (alpha x r + omega x (omega x r))``.
+
+    """
+    model, values = invertible_values(calibration)
+    if temperature_c is None and needs_temperature(model):
+        raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
+    with np.errstate(over='ignore', invalid='ignore'):
+        true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
+    beyond = left > CONVERGED
+    true_force[beyond] = true_rate[beyond] = np.nan
+    marks = saturation_marks(calibration, force_s, rate_s)
+    flagged = marks.any(axis=1) | beyond
+    if transfer is None:
+        return Corrected(true_force, true_rate, flagged, marks)
+    return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged, marks)
+
+
+def needs_temperature(model):
+    """Return whether an effect of the model depends on temperature."""
+    return any('temperature' in effect.needs for effect in model.effects)
+
+
+def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
+    inverse = {s: np.linalg.inv(values[model.slices[s, 'matrix']].reshape(3, 3)) for s in SENSORS}
+    bias = {s: values[model.slices[s, 'bias']] for s in SENSORS}
+    measured = {'accelerometer': force_s, 'gyroscope': rate_s}
+    true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
+    attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
+    for _ in range(ITERATIONS):
+        change = np.zeros(len(force_s))
+        for sensor in ('gyroscope', 'accelerometer'):
+            ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, temperature_c)
+            step = (measured[sensor] - sensor_output(model, sensor, values, ref)) @ inverse[sensor].T
+            true[sensor] = true[sensor] + step
+            change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
+        if np.max(change, initial=0.0) < 1e-14:
+            break
+    given = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
+    return true['accelerometer'], true['gyroscope'], np.where(np.isnan(change) & given, np.inf, change)
+
+
+def moved(transfer, force_s, rate_s, alpha_s):
+    """Return (force, rate) at the target point in the target frame."""
+    force, rate, alpha = (vector @ transfer.mat_ts.T for vector in (force_s, rate_s, alpha_s))
+    return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
+
+
+def saturation_level(calibration, sensor):
+    """Return the reading from which a sensor counts as saturated, infinite without a saturation in the calibration."""
+    name = {'accelerometer': 'accel_saturation', 'gyroscope': 'gyro_saturation'}[sensor]
+    return float(calibration.value(sensor, name)) * (1 - 1e-6) if calibration.has(sensor, name) else np.inf
+
+
+def saturation_marks(calibration, force_s, rate_s):
+    """Return the square of the saturation level where a component of (force, rate) reaches it, else 0; shape (n, 2)."""
+    marks = np.zeros((len(force_s), 2))
+    for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
+        level = saturation_level(calibration, sensor)
+        if np.isfinite(level):
+            marks[np.any(np.abs(measured) >= level, axis=1), k] = level**2
+    return marks
+
+
+def arms_of(calibration):
+    """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
+    if not calibration.has('accelerometer', 'accel_size_effect'):
+        return np.zeros((3, 3))
+    return calibration.value('accelerometer', 'accel_size_effect')
+
+
+def outside_conditions(calibration, rate_s, temperature_c=None):
+    """Return lines that say where samples leave the range of the calibration (rate, temperature)."""
+    lines = []
+    largest = calibration.conditions.get('largest_rate')
+    fastest = float(np.max(np.linalg.norm(rate_s, axis=1), initial=0.0))
+    if largest is not None and fastest > 1.1 * largest + 0.1:
+        lines.append(f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use')
+    limits = calibration.conditions.get('temperature_range_c')
+    if limits and temperature_c is not None and len(temperature_c):
+        low, high = float(np.min(temperature_c)), float(np.max(temperature_c))
+        if low < limits[0] - 5 or high > limits[1] + 5:
+            lines.append(f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; '
+                         'calibrate there')
+    return lines

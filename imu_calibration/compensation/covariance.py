@@ -1,0 +1,111 @@
+"""Uncertainty of corrected samples: what noise and parameters do to them, to first order."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.compensation.compensate import invertible_values
+from imu_calibration.compensation.kernel import make_kernel
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import columns_at_point
+from imu_calibration.effects.forward_equations import coefficients_at_point
+from imu_calibration.reference.reference_motion import Reference
+
+STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
+"""Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """
+    How corrected force and rate follow their inputs at one sample.
+
+    The derivative of the rate is formed from the same readings as the rate, so their noise is correlated: the newest reading
+    enters both.
+    """
+
+    gain: np.ndarray
+    """d(force, rate) / d(measured force, measured rate, derivative of the measured rate), shape (6, 9)."""
+    parameters: np.ndarray
+    """Covariance of (force, rate) from the calibration's parameters, shape (6, 6)."""
+    newest: float
+    """Weight of the newest reading in the derivative, 1/s."""
+    earlier: float
+    """Sum of the squared weights of the earlier readings, 1/s^2."""
+
+    def covariances(self, force_cov, rate_cov, with_parameters=True):
+        """
+        Return the covariances of corrected (force, rate), each shape (3, 3).
+
+        ``A N_f A' + (B + w C) N_w (B + w C)' + v C N_w C'`` with A, B, C the gains by force, rate and derivative, w the newest
+        weight and v the earlier ones; plus the parameters' share.
+        """
+        results = []
+        for k in (0, 3):
+            by_force, by_rate, by_derivative = (self.gain[k:k + 3, j:j + 3] for j in (0, 3, 6))
+            now = by_rate + self.newest * by_derivative
+            total = by_force @ force_cov @ by_force.T + now @ rate_cov @ now.T
+            total = total + self.earlier * (by_derivative @ rate_cov @ by_derivative.T)
+            results.append(total + self.parameters[k:k + 3, k:k + 3] if with_parameters else total)
+        return tuple(results)
+
+
+class Uncertainty:
+    """
+    Makes the `Sensitivity` at any sample.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    transfer : compensation.Transfer, optional
+    derivative : differentiation.CausalDerivative, optional
+        Where the angular acceleration comes from; None: it is not used.
+
+    """
+
+    def __init__(self, calibration, transfer=None, derivative=None):
+        self._model, self._values = invertible_values(calibration)
+        self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
+        self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
+        index = [np.arange(len(calibration.values))[calibration.model.slices[e.sensor, e.name]] for e in self._model.effects]
+        index = np.concatenate(index)
+        self._covariance = calibration.covariance[np.ix_(index, index)]
+        self._slopes = [self._coefficient_slopes(sensor) for sensor in SENSORS]
+        weights = np.zeros(1) if derivative is None else derivative.weights
+        self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
+        self.noise = tuple(np.diag(calibration.noise(sensor)[0]**2) for sensor in SENSORS)
+
+    def _coefficient_slopes(self, sensor):
+        """Return d(coefficients) / d(parameters), shape (n_params, n_columns, 3), by complex steps."""
+        steps = 1e-30j * np.eye(len(self._values))
+        return np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
+
+    def at(self, force=(0.0, 0.0, 9.8), rate=(0.0, 0.0, 0.0), derivative=(0.0, 0.0, 0.0), dt=0.0):
+        """
+        Return the Sensitivity at a measured sample.
+
+        Parameters
+        ----------
+        force, rate, derivative : sequence of 3 floats
+            Measured specific force, rate, and derivative of the rate.
+        dt : float
+            Temperature above the calibration's reference temperature, K.
+
+        """
+        sample = np.concatenate([force, rate, derivative])
+        gain = np.stack([self._slope(sample, step, dt) for step in np.diag(STEPS)], axis=1)
+        true = self._inside(*sample.tolist(), dt)
+        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], dt)
+        jacobian = gain[:, :6] @ jacobian
+        return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier)
+
+    def _slope(self, sample, step, dt):
+        above, below = self._kernel(*(sample + step).tolist(), dt), self._kernel(*(sample - step).tolist(), dt)
+        return (np.array(above) - below) / (2 * step.sum())
+
+    def _parameter_slopes(self, true, alpha, dt):
+        """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
+        temperature = np.full(1, self._model.temperature_ref_c + dt)
+        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature)
+        rows = [columns_at_point(self._model, sensor, None, None, ref=ref)[0] for sensor in SENSORS]
+        return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])

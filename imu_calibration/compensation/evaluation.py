@@ -1,0 +1,86 @@
+"""How good a calibration is on another session of the same IMU: errors against the table before and after compensation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.navigation import drift_over
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.samples import ImuSamples
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.segmentation.window_settings import WindowSettings
+
+
+@dataclass(frozen=True, eq=False)
+class SessionTruth:
+    """Measured samples beside what the table says they should be."""
+
+    imu: ImuSamples
+    """Samples with a reference."""
+    reference: Reference
+    """True motion at their stamps."""
+
+
+@dataclass(frozen=True)
+class ErrorFigures:
+    """Errors of one version of the samples."""
+
+    force_mg: float
+    """Root mean square error of specific force over one-second means, per axis, mg."""
+    rate_deg_s: float
+    """The same of the rate, deg/s."""
+    velocity: float
+    """Median velocity error after dead reckoning, m/s."""
+    position: float
+    """Median position error after dead reckoning, m."""
+
+
+def session_truth(blocks, table, settings=WindowSettings()):
+    """Return the samples of a session with their reference, as far as joints and IMU are both there."""
+    gatherer, windows = MotionGatherer(table, settings, keep_unused=True), []
+    for block in blocks:
+        windows += gatherer.push(block)
+    windows += gatherer.finish()
+    references = [_reference(window, table) for window in windows]
+    imu = ImuSamples(*(np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s')))
+    names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')
+    joined = {name: np.concatenate([getattr(r, name) for r in references]) for name in names}
+    return SessionTruth(imu, Reference(**joined, gravity=table.gravity_value))
+
+
+def _reference(window, table):
+    """Return the reference at every sample; a static window's motion is one row that stands for all."""
+    motion = window.motion
+    if len(motion) != len(window.time):
+        motion = motion.select(np.zeros(len(window.time), int))
+    reference = reference_motion(table, motion)
+    return Reference(window.time, reference.mat_sn, reference.force_s, reference.rate_s, reference.alpha_s, reference.gravity)
+
+
+def error_figures(truth, force_s, rate_s, seconds=50.0):
+    """
+    Return the ErrorFigures of a version of the samples.
+
+    Noise averages out over one second, so that the figures show what calibration can change.
+    """
+    reference = truth.reference
+    period = float(np.median(np.diff(reference.time)))
+    length = max(int(round(1.0 / period)), 1)
+    drift = drift_over(reference, force_s, rate_s, seconds)
+    return ErrorFigures(_rms_of_means(force_s - reference.force_s, length) / STANDARD_GRAVITY * 1e3, _rms_of_means(rate_s - reference.rate_s, length) / DEG,
+                        float(np.median(drift.velocity)), float(np.median(drift.position)))
+
+
+def _rms_of_means(error, length):
+    count = len(error) // length
+    means = error[:count * length].reshape(count, length, 3).mean(axis=1)
+    return float(np.sqrt((means**2).mean()))
+
+
+def before_and_after(truth, calibration, seconds=50.0):
+    """Return ErrorFigures of the raw and of the compensated samples."""
+    corrected = CompensationStream(calibration).correct(truth.imu)
+    return (error_figures(truth, truth.imu.force_s, truth.imu.rate_s, seconds), error_figures(truth, corrected.force, corrected.rate, seconds))

@@ -1,0 +1,158 @@
+"""Compensation of a stream of blocks: the state that has to go from one block to the next, and what is noticed on the way."""
+
+import numpy as np
+
+from imu_calibration.compensation.angular_acceleration import StampedDerivative, choose_derivative, typical_period
+from imu_calibration.compensation.compensate import Transfer, arms_of, compensate, invertible, needs_temperature, outside_conditions
+from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.errors import InputError
+
+CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
+"""A topic that ends like this is refused: nobody should correct twice."""
+
+
+class CompensationStream:
+    """
+    Corrects blocks of samples in order; the outcome does not depend on how the stream is cut.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    period : float, optional
+        Sampling period, s; default the median step of the first block.
+    temperature : TemperatureSamples, optional
+        For calibrations with thermal effects.
+    transfer : Transfer, optional
+        Another point and frame.
+
+    """
+
+    def __init__(self, calibration, period=None, temperature=None, transfer=None):
+        self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
+        if needs_temperature(invertible(calibration.model)) and temperature is None:
+            raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
+        self.period, self.derivative = period, None
+        self.count, self.flagged, self.frame_id = 0, 0, ''
+        self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
+        self._fastest, self._temperatures, self._last = 0.0, [], ()
+
+    def correct(self, imu):
+        """
+        Return `Corrected` for the next block of ImuSamples.
+
+        What is NaN, absent in the message or broken, stays NaN and leaves its neighbours and the other sensor alone.
+        """
+        self._settle(imu)
+        temperature = self._temperature_at(imu.stamp_ns)
+        finite = np.isfinite(imu.rate_s).all(axis=1)
+        slope = np.zeros_like(imu.rate_s)
+        slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
+        force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.value(sensor, 'bias'))
+                           for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
+        corrected = compensate(self.calibration, force_s, rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
+        corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
+        corrected.rate[~finite] = np.nan
+        self.count, self.frame_id = self.count + len(imu), imu.frame_id
+        self.flagged += int(corrected.flagged.sum())
+        if finite.any():
+            self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
+        self._remember(imu, slope, temperature)
+        return corrected
+
+    def _settle(self, imu):
+        if self.derivative is not None:
+            return
+        if self.period is None:
+            self.period = typical_period(imu.stamp_ns[:10_000]) or 0.01
+        self.derivative = derivative_for(self.calibration, self.period, self.transfer)
+        self._tracker = StampedDerivative(self.derivative)
+        self._uncertainty = Uncertainty(self.calibration, self.transfer, self.derivative)
+
+    def _remember(self, imu, slope, temperature):
+        usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
+        if len(usable):
+            k = usable[-1]
+            dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
+            self._last = (imu.force_s[k], imu.rate_s[k], slope[k], dt)
+
+    def _temperature_at(self, stamp_ns):
+        if self.temperature is None or not len(self.temperature):
+            return None
+        origin = self.temperature.stamp_ns[0]
+        values = np.interp((stamp_ns - origin) * 1e-9, (self.temperature.stamp_ns - origin) * 1e-9, self.temperature.temperature_c)
+        if len(values):
+            self._temperatures += [float(values.min()), float(values.max())]
+            self._temperatures = [min(self._temperatures), max(self._temperatures)]
+        return values
+
+    def propagate(self, force_cov, rate_cov):
+        """
+        Return the covariances of corrected (force, rate), each (3, 3), at the last sample.
+
+        Parameters
+        ----------
+        force_cov, rate_cov : ndarray or None
+            Those of the measured ones, shape (3, 3); None: unknown, the calibration's noise is taken.
+
+        """
+        noise = self._uncertainty.noise
+        known = [n if c is None else c for c, n in zip((force_cov, rate_cov), noise)]
+        return self._uncertainty.at(*self._last).covariances(*known)
+
+    def warnings(self):
+        """Return lines about what was outside the calibration's conditions or could not be corrected."""
+        fastest = np.array([[self._fastest, 0.0, 0.0]])
+        lines = outside_conditions(self.calibration, fastest, self._temperatures or None)
+        if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
+            lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
+                         'make sure that it is the same sensor')
+        if self.flagged:
+            lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
+        return lines
+
+
+def derivative_for(calibration, period, transfer=None):
+    """Return the causal derivative that suits the arms and the noise of a calibration."""
+    arm = float(np.max(np.linalg.norm(arms_of(calibration), axis=1)))
+    if transfer is not None:
+        arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
+    (force_sd, _), (rate_sd, _) = (calibration.noise(sensor) for sensor in ('accelerometer', 'gyroscope'))
+    return choose_derivative(period, float(rate_sd.max()), arm, float(force_sd.min()))
+
+
+def refuse_corrected(topic):
+    """
+    Refuse a stream that is corrected already.
+
+    Raises
+    ------
+    InputError
+        When the topic's name says so.
+
+    """
+    if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
+        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic with --imu-topic")
+
+
+def requested_transfer(frame_id, xyz, rpy):
+    """
+    Return the Transfer that options or parameters ask for, None without a target frame.
+
+    Raises
+    ------
+    InputError
+        When a pose comes without the name of its frame.
+
+    """
+    if frame_id:
+        return Transfer.from_pose(frame_id, xyz, rpy)
+    if any(xyz) or any(rpy):
+        raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well')
+    return None
+
+
+def late_ns(calibration, wanted=True):
+    """Return by how much stamps are to be moved back, ns: the calibration's time_offset when that is `wanted`, else 0."""
+    if not wanted or not calibration.has('reference', 'time_offset'):
+        return 0
+    return round(float(calibration.value('reference', 'time_offset')) * 1e9)

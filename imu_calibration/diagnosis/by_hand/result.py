@@ -1,0 +1,79 @@
+"""What a diagnosis by hand hands back besides its findings: solutions, residuals of the poses, and what stays unexplained."""
+
+import numpy as np
+
+from imu_calibration.diagnosis.traces import Traces
+from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Rest, correlate, slow_explanations, where_most
+from imu_calibration.estimation.noise_model import WindowNoise
+from imu_calibration.estimation.solution import Solution
+
+
+def as_solution(hand):
+    """Return a HandCalibration as the `Solution` that documents and reports know."""
+    model = hand.model.model
+    order = [hand.param_names.index(name) for name in model.param_names]
+    held = np.array([hand.statuses[k] == 'held' for k in order])
+    information = np.zeros((len(order), len(order)))
+    own = [model.param_names.index(name) for name in hand.model.param_names]
+    information[np.ix_(own, own)] = hand.information
+    found, noise, rms, chi2 = hand.statistics, {}, {}, {}
+    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
+    for sensor, key, scatter in (('accelerometer', 'force', 'pose'), ('gyroscope', 'rate', 'drift')):
+        white = np.square(found[f'{key}_noise_sd'])
+        noise[sensor] = WindowNoise(white, np.square(found[f'{key}_noise_colour']), found[f'{scatter}_scatter_sd'])
+        rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
+        chi2[sensor] = {'mean': None}
+    return Solution(model, hand.values[order], hand.covariance[np.ix_(order, order)], held, noise, chi2, information, rms)
+
+
+def _rates_left(hand):
+    """Return the rates at rest that the model leaves, shape (k, 3)."""
+    poses, true = hand.poses, hand.gravity * hand.state.up
+    more = hand.model.further('gyroscope', hand.state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)[0]
+    return poses.rate - hand.gyroscope[0] - more
+
+
+def traces_of(baseline, hand):
+    """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
+    poses = hand.poses
+    true = hand.gravity * hand.state.up
+    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': _rates_left(h)} for h in (baseline, hand)]
+    count = len(poses.start)
+    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, *errors,
+                  (poses.stop - poses.start).astype(float), None)
+
+
+def rest_of(hand, inquiry, named, sensor):
+    """Return what stays unexplained of one sensor: its rows at rest and its turns against what noise leaves."""
+    used = inquiry.search.used(named)
+    residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
+    for block, residual in zip(inquiry.blocks, residuals):
+        if block.sensor != sensor:
+            continue
+        spare = len(residual) - np.linalg.matrix_rank(block.rows[:, list(used)])
+        if spare < 3:
+            continue
+        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
+        if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
+            excess = np.sum(residual**2) / spare - np.mean(block.floor)
+            if own > sigma:
+                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
+    count = len(hand.poses.start)
+    first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
+    layers = residuals[first].reshape(count, -1)
+    noise_sd = np.sqrt(inquiry.blocks[first].floor).reshape(count, -1)
+    significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
+    if not significant:
+        return Rest(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)
+    name, share = correlate(_explanations(hand), layers / noise_sd)
+    if chosen is not None and chosen.name == 'turns' and name is None:
+        name = 'motion (turns between poses)'
+    return Rest(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd)
+
+
+def _explanations(hand):
+    poses, up = hand.poses, hand.state.up
+    every = np.ones(len(up), bool)
+    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
+    yield 'direction of gravity', up, every
+    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2], up[:, 0] * up[:, 2]], axis=1), every

@@ -1,0 +1,176 @@
+"""A recording without a table as rows of linear equations: norms of gravity in poses, rates at rest, directions after turns."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.by_hand.equations import tangent
+from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.preintegration import integrate_turn
+from imu_calibration.diagnosis.wander_search import NATURAL_WANDER
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import SensorModel, prior_sds
+from imu_calibration.reference.reference_motion import skew
+
+BASE = ('bias', 'matrix')
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
+
+    name: str
+    """'poses' or 'turns'."""
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    rows: np.ndarray
+    """``[columns | residual]`` at the baseline, shape (m, q + 1)."""
+    known: np.ndarray
+    """Variance by the noise of the samples, shape (m,)."""
+    floor: np.ndarray
+    """The same with the wander that every bias has, shape (m,)."""
+    pose: np.ndarray
+    """Pose of each row, that before it for a turn, shape (m,)."""
+    time: np.ndarray
+    """Seconds since the first sample, shape (m,)."""
+    axis: np.ndarray
+    """Rows of different axes have independent errors, shape (m,)."""
+
+    def select(self, keep):
+        """Return the rows at a mask."""
+        names = ('rows', 'known', 'floor', 'pose', 'time', 'axis')
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class HandSpace:
+    """Parameters of a diagnosis by hand: those of the baseline, then one run per column set."""
+
+    names: tuple
+    """Label of each run of columns: effect name, for a warm-up with the number of its time constant."""
+    parts: dict
+    """Label -> slice."""
+    prior_sd: np.ndarray
+    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
+    size: int
+    """Number of parameters."""
+
+
+def build_rows(hand, turns, noise, effects, constants):
+    """
+    Return (blocks, HandSpace).
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    turns : list of TurnData
+        Between consecutive poses.
+    noise : dict
+        From `average_poses`.
+    effects : sequence of Effect
+        That are asked about.
+    constants : array
+        Time constants at which warm-ups are asked about, s.
+
+    """
+    sets = [(effect, effect.name, None) for effect in effects if not effect.name.endswith('_bias_drift')]
+    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.name.endswith('_bias_drift') for k, tau in enumerate(constants)]
+    base = hand.model.size
+    sizes = [3 if tau is not None else effect.size for effect, _, tau in sets]
+    ends = np.cumsum([base] + sizes)
+    space = HandSpace(tuple(label for _, label, _ in sets), {s[1]: slice(a, b) for s, a, b in zip(sets, ends, ends[1:])},
+                      np.concatenate([1e3 * hand.model.priors, *(prior_sds(s[0])[:n] for s, n in zip(sets, sizes))]), int(ends[-1]))
+    at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
+                               hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label, tau in sets}
+    sensor_of = {label: effect.sensor for effect, label, _ in sets}
+    moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
+    blocks = [_norm_block(hand, noise, space, at_rest, sensor_of), _rest_block(hand, noise, space, at_rest, sensor_of)]
+    gravity_turns = [turn for turn in turns if turn.rotation is None]
+    if gravity_turns:
+        blocks.append(_turn_block(hand, gravity_turns, space, at_rest, moving))
+    return blocks, space
+
+
+def _columns(hand, effect, tau, force, rate, time, temperature_c):
+    """Return what the effect's parameters add to its sensor's output, shape (m, 3, p), at the baseline's solution."""
+    point = {} if tau is None else {effect.name: np.array([0.0, 0.0, 0.0, tau])}
+    names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
+    reference = hand.model.model.temperature_ref_c
+    model = HandModel(SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=reference, point=point), hand.gravity)
+    known = dict(zip(hand.model.param_names, hand.state.values))
+    values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
+    return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]
+
+
+def _natural(noise, key):
+    """Return the variance of the wander that every bias has, shape (3,)."""
+    return NATURAL_WANDER**2 * np.square(noise[key]) * noise['period']
+
+
+def _norm_block(hand, noise, space, at_rest, sensor_of):
+    """One row per pose: ``|true force| - gravity``."""
+    poses, count = hand.poses, len(hand.poses.start)
+    residual, base = hand.model.norm_rows(hand.state.values, poses.force, poses.time, poses.temperature_c)
+    back = base[:, 0:3]
+    rows = np.zeros((count, space.size + 1))
+    rows[:, :base.shape[1]], rows[:, -1] = base, residual
+    for label, columns in at_rest.items():
+        if sensor_of[label] == 'accelerometer':
+            rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
+    known = np.sum((back * poses.force_sem)**2, axis=1)
+    floor = known + back**2 @ _natural(noise, 'force_noise_sd')
+    return Block('poses', 'accelerometer', rows, known, floor, np.arange(count), poses.time, np.zeros(count, int))
+
+
+def _rest_block(hand, noise, space, at_rest, sensor_of):
+    """Three rows per pose: the rate at rest."""
+    poses, count = hand.poses, len(hand.poses.start)
+    true = hand.gravity * hand.state.up
+    more, slopes = hand.model.further('gyroscope', hand.state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    rows = np.zeros((count, 3, space.size + 1))
+    rows[:, :, 9:12] = np.eye(3)
+    rows[:, :, hand.model.extra_index('gyroscope')] = slopes
+    rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
+    for label, columns in at_rest.items():
+        if sensor_of[label] == 'gyroscope':
+            rows[:, :, space.parts[label]] = columns
+    known = poses.rate_sem**2
+    floor = known + _natural(noise, 'rate_noise_sd')
+    return Block('poses', 'gyroscope', rows.reshape(3 * count, -1), known.ravel(), floor.ravel(), np.repeat(np.arange(count), 3),
+                 np.repeat(poses.time, 3), np.tile(np.arange(3), count))
+
+
+def _turn_block(hand, turns, space, at_rest, moving):
+    """
+    Two rows per turn: the direction after it against that carried there by the rates, over the turn's duration.
+
+    The bias in a turn is the mean of the rates at rest before and after it, so that its wander does not enter; with it goes what
+    further effects add at rest.
+    """
+    bias_f, matrix_f = hand.accelerometer
+    matrix = hand.gyroscope[1]
+    across, rows, known = tangent(hand.state.up), [], []
+    for turn in turns:
+        i, j = turn.first, turn.last
+        bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
+        force, rate = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T, np.linalg.solve(matrix, (turn.rate - bias).T).T
+        further = [_columns(hand, e, None, force, rate, turn.time, turn.temperature_c) - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
+                   for e in moving]
+        stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
+        found = integrate_turn(turn.time, turn.rate, bias, matrix, (np.zeros_like(force), stacked))
+        carried = found.mat_ji @ hand.state.up[i]
+        by_psi = across[j].T @ skew(carried) / found.duration
+        row = np.zeros((2, space.size + 1))
+        row[:, 12:21] = by_psi @ found.by_matrix.reshape(3, 9)
+        place = 0
+        for effect in moving:
+            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]
+            place += effect.size
+        row[:, -1] = -across[j].T @ carried / found.duration
+        rows.append(row)
+        known.append(turn.noise_variance / found.duration**2)
+    known = np.repeat(known, 2)
+    pose = np.repeat([turn.first for turn in turns], 2)
+    return Block('turns', 'gyroscope', np.concatenate(rows), known, known, pose, np.repeat([t.time.mean() for t in turns], 2),
+                 np.arange(len(known)))

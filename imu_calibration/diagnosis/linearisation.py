@@ -1,0 +1,159 @@
+"""The recording reduced around a point of linearisation, the search on it, and the decision whether to linearise anew."""
+
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.diagnosis.evidence import Evidence, folds_of, locked_windows, quadratic
+from imu_calibration.diagnosis.noise import first_noise, normal_matrix, saturated_noise, solve_normal
+from imu_calibration.diagnosis.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
+from imu_calibration.diagnosis.questions import extended_model, time_constants
+from imu_calibration.diagnosis.reduced_recording import lift, rebased
+from imu_calibration.diagnosis.search import Search
+from imu_calibration.diagnosis.trusted_band import in_trusted_band
+
+FASTEST = 2 * np.pi * 3.0
+"""Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
+BILINEAR = 2e-3
+"""Relative change of the matrix that an effect left out may have caused."""
+
+
+class Attempt:
+    """One linearisation: the reduced recording, its noise, the evidence and the search."""
+
+    def __init__(self, windows, table, baseline, effects, point=None, progress=None):
+        self.baseline, self.effects = baseline, effects
+        self.constants = time_constants(max(float(w.time[-1]) for w in windows))
+        model, values = point or _start(baseline, effects)
+        lifted = lift(windows, table, model, values, self.constants, progress)
+        used = baseline_parameters(baseline, model)
+        if point is None:
+            lifted = _at_baseline(lifted, baseline, used)
+        self.all_samples = parameter_space(lifted, baseline)
+        self.space = in_trusted_band(self.all_samples)
+        self.questions = questions(self.space, effects)
+        self.noise = saturated_noise(self.space, smooth_parameters(self.questions))
+        self.locked = locked_windows(lifted.kind)
+        self.evidence = Evidence(self.space, self.noise, folds_of(lifted.kind, self.locked))
+        self.search = Search(self.evidence, used, self.questions, encoder_step(windows))
+
+    @property
+    def lifted(self):
+        """The reduced recording."""
+        return self.space.lifted
+
+    def values(self, chosen):
+        """Return the parameters of the whole space for a choice, fitted to the chosen windows, baseline in full, shape (q,)."""
+        used = self.search.used(chosen)
+        values = np.zeros(self.space.size)
+        values[list(used)] = self.evidence.fit(used)[0]
+        change = counted_from_values(self.lifted.model, self.baseline)
+        values[:len(change)] += np.where(change, self.lifted.values, 0.0)
+        return values
+
+    def needs_another(self, chosen):
+        """Return whether the linearisation is too coarse for what was chosen: curvature times evidence."""
+        values, model = self.values(chosen), self.lifted.model
+        full = self.evidence.loss(self.search.used(chosen))
+        if any('@' in question.label for question in chosen):
+            return True
+        for question in chosen:
+            weight = self.evidence.loss(self.search.used([q for q in chosen if q is not question])) - full
+            if weight * _curvature(question, values, model)**2 > 4.0:
+                return True
+        return False
+
+    @cached_property
+    def _locked_normal(self):
+        return normal_matrix(self.space, self.noise, self.locked)
+
+    def locked_gain(self, chosen, question):
+        """Return by how much an effect of a choice raises the log likelihood of the locked windows, fitted to the others, nats."""
+        rest = [q for q in chosen if q is not question]
+        losses = [quadratic(self._locked_normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
+        return 0.5 * (losses[0] - losses[1])
+
+    def acts_beside(self, chosen):
+        """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
+        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        model = self.lifted.model
+        return any(e.warp is not None and (e.sensor, e.name) not in kept and np.any(model.warp_point(e)) for e in model.effects)
+
+    def point(self, chosen):
+        """Return (model, values) at which the columns should be taken for this choice."""
+        values = self.values(chosen)
+        model = extended_model(self.baseline, self.effects)
+        for question in chosen:
+            if question.name.endswith('_bias_drift'):
+                model = model.with_effect(question.sensor, question.name)
+        start = model.start()
+        for effect in model.effects:
+            known = self.lifted.model.slices.get((effect.sensor, effect.name))
+            if known is not None:
+                start[model.slices[effect.sensor, effect.name]] = values[known]
+        for question in chosen:
+            if '@' in question.label:
+                start[model.slices[question.sensor, question.name]] = self._warm_up(chosen, question, values)
+        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        for effect in model.effects:
+            if (effect.sensor, effect.name) not in kept:
+                start[model.slices[effect.sensor, effect.name]] = 0.0
+        return model.at(start), start
+
+    def _warm_up(self, chosen, question, values):
+        """Return amplitudes and time constant of a warm-up, the latter between those of the bank."""
+        number = int(question.label.split('@')[1])
+        place = chosen.index(question)
+        near = [k for k in (number - 1, number, number + 1) if 0 <= k < len(self.constants)]
+        losses = []
+        for k in near:
+            other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
+            losses.append(self.evidence.loss(self.search.used(chosen[:place] + [other] + chosen[place + 1:])))
+        logs = np.log(self.constants[near])
+        if len(near) < 3:
+            return np.append(values[list(question.parameters)], self.constants[number])
+        curve = np.polyfit(logs - logs[1], losses, 2)
+        shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
+        return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
+
+
+def encoder_step(windows):
+    """Return the largest step of the encoders that shows in the readings, rad; 0 where none does."""
+    return max((float(np.max(w.joint_step)) for w in windows if w.joint_step is not None), default=0.0)
+
+
+def baseline_parameters(baseline, model):
+    """Return the indices of the baseline's parameters in an extended model."""
+    return tuple(k for e in baseline.effects for k in range(model.slices[e.sensor, e.name].start, model.slices[e.sensor, e.name].stop))
+
+
+def _start(baseline, effects):
+    model = extended_model(baseline, effects)
+    values = model.start()
+    return model, np.where(np.isfinite(values), values, 0.0)
+
+
+def _at_baseline(lifted, baseline, used):
+    """Move the residual to the baseline's own solution."""
+    for _ in range(2 if baseline.has_arms else 1):
+        space = in_trusted_band(parameter_space(lifted, baseline))
+        change = solve_normal(normal_matrix(space, first_noise(space)), space.prior_sd, space.prior_mean, np.array(used))
+        lifted = rebased(lifted, lifted.values + change[:len(lifted.values)])
+    return lifted
+
+
+def _curvature(question, values, model):
+    """Return the relative error of the first derivative at the size of the effect."""
+    effect = question.effect
+    value = values[list(question.parameters)]
+    if effect.warp is not None:
+        moved = np.max(np.abs(value - model.warp_point(effect)))
+        return moved * (FASTEST if effect.unit == 's' else 1.0)
+    if effect.name.endswith('_bias_drift'):
+        return abs(np.log(max(value[3], 1e-3) / model.full_point()[effect.name][3]))
+    return BILINEAR
+
+
+def without_saturation(effects):
+    """Return the effects that are asked about by columns."""
+    return [effect for effect in effects if not effect.name.endswith('_saturation')]

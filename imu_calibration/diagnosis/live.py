@@ -1,0 +1,146 @@
+"""A diagnosis while the motion goes on: the windows that are kept for it, and its outcome in the words of a status."""
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+from imu_calibration.calibration.options import choose_model
+from imu_calibration.diagnosis.diagnose import LEAST_WINDOWS, diagnose
+from imu_calibration.diagnosis.workflow import baseline_options, diagnosis_lines, in_words
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.estimation.window_store import owned_window
+
+WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = 'waiting', 'off', 'found', 'nothing found', 'unexplained', 'failed'
+
+
+@dataclass(frozen=True)
+class DiagnosisState:
+    """What a diagnosis said, or why none was made yet."""
+
+    word: str = WAITING
+    """'waiting', 'off', 'found', 'nothing found', 'unexplained' or 'failed'."""
+    message: str = f'it is asked after a solution, once there are {LEAST_WINDOWS} windows'
+    """One line."""
+    values: dict = field(default_factory=dict)
+    """Figures by name."""
+
+
+class RecentWindows:
+    """
+    The last windows of a session, with their samples.
+
+    Parameters
+    ----------
+    most : int
+        Samples kept at most; the oldest windows go first.
+
+    """
+
+    def __init__(self, most):
+        self._most, self._windows, self.n_samples, self.forgotten = most, deque(), 0, 0
+
+    def __len__(self):
+        return len(self._windows)
+
+    def add(self, windows):
+        """Take windows in order."""
+        for window in windows:
+            if window.kind != 'unused' and len(window) <= self._most:
+                self._windows.append(owned_window(window))
+                self.n_samples += len(window)
+        while self.n_samples > self._most:
+            self.n_samples -= len(self._windows.popleft())
+            self.forgotten += 1
+
+    def list(self):
+        """Return the windows in order; they are not changed by anybody."""
+        return list(self._windows)
+
+
+class LiveDiagnosis:
+    """
+    Keeps the last windows of a live calibration, and asks about them.
+
+    Parameters
+    ----------
+    most : int
+        Samples kept at most; 0: nothing is kept and nothing is asked.
+
+    """
+
+    def __init__(self, most):
+        self._most, self.recent = most, RecentWindows(most)
+
+    def add(self, windows):
+        """Take the windows that a `LiveCalibration` has completed."""
+        if self._most:
+            self.recent.add(windows)
+
+    def question(self, live):
+        """Return the Question about the last solution of a `LiveCalibration`, or None while there are too few windows."""
+        windows = self.recent.list() + live.open_windows
+        if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
+            return None
+        return Question(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What a diagnosis needs, for another thread."""
+
+    windows: list
+    """Windows in order."""
+    table: object
+    """The Table."""
+    model: object
+    """The model to diagnose."""
+    forgotten: int = 0
+    """Windows that were no longer there."""
+
+    def answer(self, progress=None):
+        """Diagnose and return the DiagnosisState; `progress` is called with the share done and may raise to end it."""
+        try:
+            return describe(diagnose(self.windows, self.table, self.model, progress=progress), self.forgotten)
+        except ImuCalibrationError as error:
+            return DiagnosisState(WAITING, str(error), {'windows': len(self.windows)})
+
+
+def baseline_model(options, table, solved):
+    """
+    Return the model that ``imu_calibration diagnose`` starts from with the same options.
+
+    Parameters
+    ----------
+    options : CalibrationOptions
+    table : Table
+    solved : SensorModel
+        The model of the last solution: where its columns were linearised holds for the same effects here.
+
+    """
+    model = choose_model(baseline_options(options), table, solved.temperature_ref_c)
+    names = {effect.name for effect in model.effects}
+    return replace(model, point={name: value for name, value in solved.point.items() if name in names})
+
+
+def describe(diagnosis, forgotten=0):
+    """Return the DiagnosisState of a Diagnosis: the first finding, or nothing, or what stays unexplained."""
+    values = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked, 'older windows not looked at': forgotten}
+    rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
+    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor)
+               for sensor, found in diagnosis.unexplained.items() if found.significant}
+    if not diagnosis.findings:
+        nothing = 'nothing found: no effect of the catalogue explains more than noise does'
+        return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing, values)
+    first = diagnosis.findings[0]
+    message = f'{first.effect}: {first.explanation}'
+    if first.indistinguishable_from:
+        others = ', '.join(first.indistinguishable_from)
+        message += f' This motion cannot tell it from {others}; to separate them: {first.separating_motion}'
+    low, high = first.gain.ci95
+    values = {'effect': first.effect, 'sensor': first.sensor, 'explanation': first.explanation,
+              **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},
+              'p-value': f'{first.p_value:.2g}', 'held-out reduction': f'{first.gain.reduction:.3f}',
+              'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
+              'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
+              'indistinguishable from': ' '.join(first.indistinguishable_from),
+              'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]), **values}
+    return DiagnosisState(FOUND, message, values)

@@ -1,0 +1,118 @@
+"""Which effects can be asked about in this recording, and which cannot, and why."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import catalogue
+
+TEMPERATURE_SPAN = 1.0
+"""Least span of temperature that can show a thermal effect, K."""
+N_TIME_CONSTANTS = 12
+"""Warm-ups are asked for at this many time constants."""
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """One effect that is asked about; a warm-up is asked for at each time constant of a bank."""
+
+    effect: object
+    """The Effect."""
+    parameters: tuple
+    """Indices in the parameter space of the diagnosis."""
+    price: int
+    """Number of parameters that it costs."""
+    label: str
+    """Effect name, for a warm-up with the number of the time constant."""
+
+    @property
+    def name(self):
+        """Published name of the effect."""
+        return self.effect.name
+
+    @property
+    def sensor(self):
+        """'accelerometer', 'gyroscope' or 'reference'."""
+        return self.effect.sensor
+
+
+def testable_effects(model, table, windows):
+    """
+    Return (effects that can be asked about, list of {'effect', 'why', 'needs'} for the others).
+
+    Parameters
+    ----------
+    model : SensorModel
+        The baseline; its effects are not asked about again.
+    table : Table
+        The searcher's description of the table.
+    windows : sequence of Window
+        The recording.
+
+    """
+    kinds = {window.kind for window in windows}
+    span = _temperature_span(windows)
+    have = {(e.sensor, e.name) for e in model.effects}
+    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span))
+
+
+def sort_effects(model, why_not):
+    """
+    Return (effects that can be asked about, list of {'effect', 'why', 'needs'}) of the catalogue's that the model lacks.
+
+    ``why_not(effect)`` gives (why, needs), or None for what can be asked about.
+    """
+    known, lacking = [], []
+    have = {(e.sensor, e.name) for e in model.effects}
+    for key, effect in catalogue(tuple(model.joint_names)).items():
+        if key in have:
+            continue
+        why = why_not(effect)
+        if why is None:
+            known.append(effect)
+        else:
+            lacking.append({'effect': effect.name, 'why': why[0], 'needs': why[1]})
+    return known, lacking
+
+
+def _temperature_span(windows):
+    if any(window.temperature_c is None for window in windows):
+        return None
+    means = [float(np.mean(window.temperature_c)) for window in windows]
+    return max(means) - min(means) if means else None
+
+
+def _why_not(effect, have, table, kinds, span):
+    moving = kinds & {'spin', 'dynamic'}
+    if 'temperature' in effect.needs and span is None:
+        return 'no temperature was recorded with all windows', 'record imu/temperature'
+    if 'temperature' in effect.needs and span < TEMPERATURE_SPAN:
+        return f'the temperature changed by {span:.2f} K only', 'record while the sensor warms up by at least some kelvins'
+    if 'rotation' in effect.needs and not moving:
+        return 'the recording has no rotation', 'spin and swing the table'
+    if 'dynamic' in effect.needs and not moving:
+        return 'the recording has no motion', 'swing the table at several frequencies'
+    if effect.name == 'lever_arm' and ('accelerometer', 'accel_size_effect') in have:
+        return 'the size effect of the model contains it', 'leave the size effect out of the model'
+    if effect.name == 'earth_rate' and table.latitude is not None and table.azimuth_deg is not None:
+        return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
+                'leave the azimuth out of the table description')
+    return None
+
+
+def time_constants(duration):
+    """Return the time constants at which warm-ups are asked for, s."""
+    return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, N_TIME_CONSTANTS)
+
+
+def extended_model(model, effects):
+    """Return the model with all these effects, but for those that are asked otherwise (warm-ups, saturation)."""
+    kept = [e for e in effects if e.warp is not None or not special(e)]
+    added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SENSORS + ('reference',)}
+    return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
+
+
+def special(effect):
+    """Return whether an effect has no columns of its own here: saturation is censoring, a warm-up has a bank of time constants."""
+    return effect.name.endswith('_saturation') or effect.name.endswith('_bias_drift')

@@ -1,0 +1,172 @@
+"""Saturation: a limit that outputs pile up at, and the samples that it spoils."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from imu_calibration.diagnosis.reduced_recording import joined_motion
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+
+MARGIN = 4.0
+"""Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
+AGREEMENT = 0.25
+"""Least sum of the chances of being beyond the limit over clipped samples, as a share of what it is when they are clipped by that chance.
+
+Near one g at rest only the tails of the noise are cut: a right limit then gives each of the samples a chance of a tenth."""
+LEAST_CLIPPED = 4
+SHORTEST = 20
+"""A window with fewer samples left is dropped."""
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """A limit that the outputs of one sensor pile up at."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    level: float
+    """Largest output, m/s^2 or rad/s."""
+    level_sd: float
+    """Standard deviation of the level: the resolution with which outputs approach it."""
+    n_clipped: int
+    """Samples at the limit."""
+    n_expected: float
+    """Samples that the model expects beyond it, where there are none."""
+    rms_before: float
+    """Rms of measured minus predicted where the model expects outputs beyond the limit, without the limit in the model."""
+    rms_after: float
+    """The same with it."""
+
+    @property
+    def p_value(self):
+        """Chance that no sample passes a level that so many are expected beyond (Poisson)."""
+        return float(np.exp(-self.n_expected))
+
+
+def predictions(windows, table, model, values):
+    """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
+    found = []
+    for window in windows:
+        temperature = window.temperature_c
+        if window.kind == 'static' and temperature is not None:
+            temperature = np.array([temperature.mean()])
+        found.append(tuple(columns(model, s, table, window.motion, temperature) @ coefficients(model, s, values) for s in SENSORS))
+    return found
+
+
+def measured(window, sensor):
+    """Return the measured output of a sensor in a window, shape (n, 3)."""
+    return window.force_s if sensor == 'accelerometer' else window.rate_s
+
+
+def noise_at_rest(windows, sensor):
+    """Return the standard deviation of single samples in static windows (of second differences without any), shape (3,)."""
+    rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
+    if rest:
+        return np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0)
+    return np.median([np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6) for w in windows if len(w.time) > 8], axis=0)
+
+
+def simple_fit(windows, table, model):
+    """Return the parameters of a model by least squares on thinned samples, all weighted alike."""
+    values = np.where(np.isfinite(model.start()), model.start(), 0.0)
+    prior, sd = model.prior()
+    picked = [_thinned(window) for window in windows]
+    index, total, right = np.arange(len(values)), np.diag(1 / sd**2), (prior - values) / sd**2
+    for sensor in SENSORS:
+        motion, temperature = joined_motion(picked)
+        design = columns(model, sensor, table, motion, temperature)
+        outputs = [measured(w, sensor) for w in picked]
+        output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
+        base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
+        weight = 1 / noise_at_rest(windows, sensor)**2
+        for axis in range(3):
+            rows, residual = design @ slope[:, axis], output[:, axis] - design @ base[:, axis]
+            total = total + weight[axis] * rows.T @ rows
+            right = right + weight[axis] * rows.T @ residual
+    scale = 1 / np.sqrt(np.diag(total))
+    step = scale * np.linalg.solve(total * np.outer(scale, scale) + 1e-13 * np.eye(len(index)), scale * right)
+    return values + step
+
+
+def _thinned(window, most=50):
+    if window.kind == 'static' or len(window.time) <= most:
+        return window
+    return _selected(window, np.arange(0, len(window.time), len(window.time) // most))
+
+
+def may_be_clipped(windows, sensor):
+    """Return whether several samples share the largest output exactly, more than share any of the next smaller outputs."""
+    size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
+    level = size.max(initial=0.0)
+    at = int((size >= level * (1 - 1e-12)).sum())
+    if at < LEAST_CLIPPED or level == 0:
+        return False
+    # A coarse output repeats all its values; those just below the largest show how often.
+    below = np.sort(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)])[-500:]
+    _, repeats = np.unique(below, return_counts=True)
+    return bool(at > 3 * (repeats[-5:].mean() if len(repeats) else 1.0))
+
+
+def find_saturation(windows, predicted, noise_sd, sensor):
+    """
+    Return the `Saturation` of a sensor, or None.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+    predicted : list of (force, rate)
+        What a model without limit predicts (`predictions`).
+    noise_sd : array, shape (3,)
+        Standard deviation of single samples.
+
+    """
+    if not may_be_clipped(windows, sensor):
+        return None
+    output = np.concatenate([measured(w, sensor) for w in windows])
+    expected = np.concatenate([np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape) for w, p in zip(windows, predicted)])
+    level = np.abs(output).max()
+    clipped = np.abs(output) >= level * (1 - 1e-12)
+    beyond = norm.sf((level - np.abs(expected)) / noise_sd)
+    n_expected = float(beyond.sum())
+    if n_expected < LEAST_CLIPPED or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
+        return None
+    far = np.abs(expected) > level
+    before, after = output - expected, output - np.clip(expected, -level, level)
+    rms = [float(np.sqrt(np.mean(e[far]**2))) if far.any() else 0.0 for e in (before, after)]
+    return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms)
+
+
+def without_clipped(windows, predicted, levels, noise_sd):
+    """
+    Return the windows without samples that a limit spoils: those at it, and those predicted within a few standard deviations of it.
+
+    Parameters
+    ----------
+    levels : dict
+        Sensor -> level.
+    noise_sd : dict
+        Sensor -> (3,).
+
+    """
+    kept = []
+    for window, pair in zip(windows, predicted):
+        good = np.ones(len(window.time), bool)
+        for sensor, level in levels.items():
+            near = np.abs(pair[SENSORS.index(sensor)]) > level - MARGIN * noise_sd[sensor]
+            at = np.abs(measured(window, sensor)) >= level * (1 - 1e-12)
+            good &= ~(near | at).any(axis=1)
+        if good.all():
+            kept.append(window)
+        elif window.kind != 'static' and good.sum() >= SHORTEST:
+            kept.append(_selected(window, good))
+    return kept
+
+
+def _selected(window, index):
+    temperature = None if window.temperature_c is None else window.temperature_c[index]
+    return replace(window, stamp_ns=window.stamp_ns[index], time=window.time[index], force_s=window.force_s[index],
+                   rate_s=window.rate_s[index], motion=window.motion.select(index), temperature_c=temperature)

@@ -1,0 +1,68 @@
+"""Which motion would tell two effects apart: the standard motions are tried, for the effects as large as they were found."""
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.observability import added_information
+from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+
+ENOUGH = 9.0
+"""Least growth of the evidence that a motion must promise, in squared standard deviations."""
+
+
+def separating_motion(solution, question, mate, gravity):
+    """
+    Return the standard motion after which the mate could no longer pass for the effect that was found.
+
+    For each motion: what it adds to the information about the extended model and the mate, and from that the part of the effect
+    that the mate, and everything else in the model, cannot imitate, in squared standard deviations.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of the extended model.
+    question, mate : Question
+        The finding and an effect that would do as well.
+
+    """
+    if question.sensor in SENSORS and mate.sensor in SENSORS and question.effect.groups and mate.effect.groups:
+        text = _best_motion(solution, question, mate, gravity)
+        if text is not None:
+            return text
+    return motions_of(question, mate)
+
+
+def motions_of(question, mate):
+    """Return the motions that two effects declare as theirs."""
+    own = [name for name in question.effect.motion + mate.effect.motion]
+    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
+    return '; '.join(dict.fromkeys(texts[name] for name in own if name in texts))
+
+
+def _best_motion(solution, question, mate, gravity):
+    model = solution.model.with_effect(mate.sensor, mate.name)
+    values = np.where(np.isfinite(model.start()), model.start(), 0.0)
+    for effect in solution.model.effects:
+        values[model.slices[effect.sensor, effect.name]] = solution.values[solution.model.slices[effect.sensor, effect.name]]
+    prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
+    own, other = model.slices[question.sensor, question.name], model.slices[mate.sensor, mate.name]
+    best = (ENOUGH, None)
+    for motion in MOTIONS:
+        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion, gravity)
+        left = _unimitated(total, values, own, other)
+        if left > best[0]:
+            best = (left, motion.text)
+    return best[1]
+
+
+def _unimitated(information, values, own, other):
+    """Return the squared standard deviations of the effect that nothing else in the model imitates, its mate included."""
+    index = np.zeros(len(values), bool)
+    index[own] = True
+    rest = ~index
+    scale = 1 / np.sqrt(np.diag(information))
+    scaled = information * np.outer(scale, scale)
+    cross = scaled[np.ix_(rest, index)]
+    left = scaled[np.ix_(index, index)] - cross.T @ np.linalg.solve(scaled[np.ix_(rest, rest)] + 1e-12 * np.eye(rest.sum()), cross)
+    effect = values[index] / scale[index]
+    return float(effect @ left @ effect)

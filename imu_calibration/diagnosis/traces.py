@@ -1,0 +1,139 @@
+"""Residuals before and after as a person looks at them: averaged over short blocks, and dead reckoning with both models."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.diagnosis.reduced_recording import MOTION
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import INPUT_OF, warped_reference
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.navigation import drift_over
+from imu_calibration.reference.joint_motion import JointMotion
+
+BLOCK = 0.25
+"""Residuals are averaged over this time for plots, s."""
+
+
+DEAD_RECKONING = 50.0
+"""Length of dead reckoning, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Residuals averaged over short blocks, before and after, with what they may be drawn against."""
+
+    time: np.ndarray
+    """Middle of each block, s, shape (n,)."""
+    kind: np.ndarray
+    """Kind of the window it comes from, shape (n,)."""
+    position: np.ndarray
+    """Joint angles, rad, shape (n, n_joints)."""
+    force_s: np.ndarray
+    """Reference specific force, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Reference rate, rad/s, shape (n, 3)."""
+    temperature_c: np.ndarray | None
+    """Temperature, shape (n,), or None."""
+    before: dict
+    """Sensor -> measured minus predicted by the baseline, shape (n, 3)."""
+    after: dict
+    """Sensor -> measured minus predicted by the extended model, shape (n, 3)."""
+    samples: np.ndarray
+    """Samples in each block, shape (n,)."""
+    dead_reckoning: dict | None
+    """{'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after', 'stretches'}: medians, m and m/s, or None when
+    no stretch of the recording is long enough."""
+
+
+def residual_traces(windows, table, before, after):
+    """
+    Return the Traces of two solutions.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        May include those of kind 'unused', which make dead reckoning possible.
+    before, after : Solution
+
+    """
+    motion, temperature, rows = _all_samples(windows)
+    outputs = {'accelerometer': np.concatenate([w.force_s for w in windows]), 'gyroscope': np.concatenate([w.rate_s for w in windows])}
+    errors, references = [], []
+    for solution in (before, after):
+        model = solution.model.at(solution.values)
+        predicted = predict(model, solution.values, table, motion, temperature)
+        errors.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
+        references.append({s: warped_reference(model, s, table, motion, temperature) for s in SENSORS})
+    time = np.concatenate([w.time for w in windows])
+    navigation = _dead_reckoning(windows, time, (before, after), errors, references, rows)
+    known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
+    block, number = _blocks(windows, known)
+
+    def mean(values):
+        return _block_mean(np.asarray(values, float)[known], block, number)
+    first = references[0]
+    kind = np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known]
+    return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))],
+                  mean(motion.position[rows]), mean(first['accelerometer'].force_s[rows]), mean(first['gyroscope'].rate_s[rows]),
+                  None if temperature is None else mean(temperature[rows]), {s: mean(errors[0][s]) for s in SENSORS},
+                  {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
+
+
+def _all_samples(windows):
+    """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, name) for w in windows]) for name in MOTION))
+    lengths = [len(w.motion) for w in windows]
+    starts = np.cumsum([0] + lengths)
+    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
+                           for w, s, n in zip(windows, starts, lengths)])
+    if any(w.temperature_c is None for w in windows):
+        return motion, None, rows
+    parts = [w.temperature_c if n == len(w.time) else np.full(n, w.temperature_c.mean()) for w, n in zip(windows, lengths)]
+    return motion, np.concatenate(parts), rows
+
+
+def _blocks(windows, known):
+    """Return the block number of each known sample and the size of each block; blocks end with their window."""
+    numbers, last = [], 0
+    for window in windows:
+        if window.kind == 'unused':
+            continue
+        number = ((window.time - window.time[0]) / BLOCK).astype(int)
+        numbers.append(last + number)
+        last += int(number[-1]) + 1
+    unique, block = np.unique(np.concatenate(numbers), return_inverse=True)
+    return block, np.bincount(block, minlength=len(unique))
+
+
+def _block_mean(values, block, number):
+    columns = values.reshape(len(values), -1)
+    means = np.stack([np.bincount(block, column, len(number)) / number for column in columns.T], axis=1)
+    return means[:, 0] if values.ndim == 1 else means
+
+
+def _dead_reckoning(windows, time, solutions, errors, references, rows):
+    """Return medians over stretches of 50 s without gaps, or None."""
+    edges = np.flatnonzero(np.diff(time) > 0.1)
+    starts, stops = np.r_[0, edges + 1], np.r_[edges + 1, len(time)]
+    pieces = [slice(a, b) for a, b in zip(starts, stops) if time[b - 1] - time[a] >= DEAD_RECKONING and np.all(np.diff(time[a:b]) > 0)]
+    found = []
+    for solution, error, reference in zip(solutions, errors, references):
+        ends = [_drifts(piece, time, solution, error, reference, rows) for piece in pieces]
+        if not ends:
+            return None
+        found.append((np.median(np.concatenate([e.position for e in ends])), np.median(np.concatenate([e.velocity for e in ends])),
+                      sum(len(e.position) for e in ends)))
+    return {'seconds': DEAD_RECKONING, 'position_before': float(found[0][0]), 'position_after': float(found[1][0]),
+            'velocity_before': float(found[0][1]), 'velocity_after': float(found[1][1]), 'stretches': int(found[0][2])}
+
+
+def _drifts(piece, time, solution, error, reference, rows):
+    at = rows[piece]
+    felt = {}
+    for sensor in SENSORS:
+        matrix = solution.value(sensor, 'matrix').reshape(3, 3)
+        felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[at] + np.linalg.solve(matrix, error[sensor][piece].T).T
+    base = reference['accelerometer'].select(at)
+    true = replace(base, time=time[piece], rate_s=reference['gyroscope'].rate_s[at])
+    return drift_over(true, felt['accelerometer'], felt['gyroscope'], DEAD_RECKONING)

@@ -1,0 +1,158 @@
+"""Use cases of diagnosis as plain functions: on a table and by hand; what they find in lines for people."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import gather_by_hand
+from imu_calibration.by_hand.workflow import document_of_hand, read_by_hand, reference_gravity, result_by_hand
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.document import Calibration, tolerances_of
+from imu_calibration.calibration.from_solution import document, preflight_statistics
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
+from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.document import to_mapping
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import parse_effects
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.units import for_people, significant
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisResult:
+    """A diagnosis with everything that is written and shown."""
+
+    diagnosis: object
+    """The Diagnosis."""
+    calibration: Calibration
+    """The extended calibration; the baseline's when nothing was found."""
+    solution: object
+    """Solution of the extended model."""
+    table: object
+    """The Table."""
+    tolerances: np.ndarray
+    """Tolerance of each parameter of the extended model."""
+    options: CalibrationOptions
+    """What was asked for."""
+
+    @property
+    def document(self):
+        """Return the content of diagnosis.json."""
+        return to_mapping(self.diagnosis)
+
+    @property
+    def lines(self):
+        """What was found, in lines for people."""
+        return diagnosis_lines(self.diagnosis)
+
+
+def diagnose_recording(source, table, options=CalibrationOptions(), provenance=None, progress=None):
+    """
+    Calibrate a recording, say what the model gets wrong and why, and extend it.
+
+    Parameters
+    ----------
+    source : callable
+        Returns an iterator of SampleBlock, twice.
+    table : Table
+    options : CalibrationOptions
+        The model to start from; where nothing is asked for, bias and matrix alone, so that everything else has to prove itself.
+    provenance : dict, optional
+    progress : callable, optional
+        Called with the percent done since the last call.
+
+    Returns
+    -------
+    DiagnosisResult
+
+    """
+    options = baseline_options(options)
+    baseline = calibrate([source], table, options, provenance)
+    windows = collect_windows(source(), table, options)
+    diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
+    tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
+    calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, provenance)
+    return DiagnosisResult(diagnosis, calibration, diagnosis.solution, table, tolerances, options)
+
+
+def baseline_options(options):
+    """Return the options of the model that a diagnosis starts from: what was not asked for has to prove itself."""
+    return replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
+
+
+def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, provenance=None, progress=None):
+    """
+    Calibrate a recording by hand, say what the model gets wrong and why, and extend it (see `diagnosis.by_hand`).
+
+    Parameters
+    ----------
+    source : callable
+        Returns an iterator of SampleBlock.
+    options : CalibrationOptions
+        The model to start from; where nothing is asked for, bias and matrix alone.
+    gravity : float, optional
+        Local gravity, m/s^2.
+    provenance, progress : optional
+        As in `diagnose_recording`.
+
+    Returns
+    -------
+    DiagnosisResult
+
+    """
+    preflight = Preflight(gravity, options.nominal)
+    recording = read_by_hand(preflight.watch(source()), options.nominal)
+    value, spread = reference_gravity(gravity)
+    data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
+    names = {sensor: parse_effects(sensor, text or 'bias+matrix') for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
+    found = diagnose_by_hand(data, value, spread, tolerances=options.tolerances, **names, progress=_percent(progress) if progress else None)
+    document_of, limits = document_of_hand(found.hand, recording.gathered, len(recording.imu), options.tolerances, provenance)
+    calibration = result_by_hand(document_of, found.hand, recording.gathered, limits, options).calibration
+    calibration = replace(calibration, statistics=calibration.statistics | preflight_statistics(preflight.findings))
+    return DiagnosisResult(found.diagnosis, calibration, found.hand, None, limits, options)
+
+
+def collect_windows(blocks, table, options=CalibrationOptions()):
+    """Return all windows of a recording with their samples, unused ones too."""
+    gatherer, windows = MotionGatherer(table, options.windows, keep_unused=True), []
+    for block in blocks:
+        if options.nominal is not None and block.imu is not None:
+            block = replace(block, imu=options.nominal.apply(block.imu))
+        windows += gatherer.push(block)
+    return windows + gatherer.finish()
+
+
+def _percent(advance):
+    """Return a function of the share done that calls `advance` with what was added, in percent."""
+    done = [0.0]
+
+    def report(share):
+        advance(100 * share - done[0])
+        done[0] = 100 * share
+    return report
+
+
+def diagnosis_lines(diagnosis):
+    """Return findings, what stays unexplained and what could not be tested, as lines."""
+    lines = []
+    for number, finding in enumerate(diagnosis.findings, 1):
+        lines.append(f'{number}. {finding.effect}: {finding.explanation}')
+        if finding.indistinguishable_from:
+            lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
+    if not diagnosis.findings:
+        lines.append('nothing found: no effect of the catalogue explains more than noise does')
+    for sensor, rest in diagnosis.unexplained.items():
+        if rest.significant:
+            with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
+            lines.append(f'unexplained: {in_words(rest.rms, sensor)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
+    if diagnosis.not_testable:
+        lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
+    return lines
+
+
+def in_words(value, sensor):
+    """Return a specific force or rate in people's units."""
+    factor, unit = for_people({'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
+    return f'{significant(value * factor)} {unit}'

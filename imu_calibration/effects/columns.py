@@ -1,0 +1,105 @@
+"""The columns of a sensor: what its coefficients multiply, at the point where the model is linearised."""
+
+import numpy as np
+
+from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.errors import InputError
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.reference_motion import Reference, lever_matrix
+
+
+def warps_act(model):
+    """Tell whether any warp has a point other than zero, so that the sensors feel another motion than the table's."""
+    return any(effect.warp is not None and np.any(model.warp_point(effect)) for effect in model.effects)
+
+
+def warped_reference(model, sensor, table, motion, temperature_c=None, values=None, skip=None):
+    """
+    Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
+
+    Parameters
+    ----------
+    values : dict, optional
+        Effect name -> values that replace the point of those effects.
+
+    """
+    branches = [(1.0, table, motion)]
+    for effect in model.concerning(sensor):
+        if effect.warp is None:
+            continue
+        at = (values or {}).get(effect.name)
+        at = model.warp_point(effect) if at is None else np.atleast_1d(at)
+        if not np.any(at):
+            continue
+        branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in effect.warp(a, b, at)]
+    references = [(weight, reference_motion(t, m, temperature_c)) for weight, t, m in branches]
+    return mean_reference(references, motion)
+
+
+def mean_reference(weighted, motion):
+    """Return the weighted mean of references (a lag is a mean over delays); attitude from the last, which moves little."""
+    if len(weighted) == 1:
+        return weighted[0][1]
+    total = sum(weight for weight, _ in weighted)
+    first = weighted[0][1]
+    mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')}
+    return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c, motion)
+
+
+INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
+
+
+def columns(model, sensor, table, motion, temperature_c=None, ref=None):
+    """
+    Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
+
+    A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
+    its coefficients are matrix times parameter. The derivative is a central difference of the exact kinematics.
+    """
+    ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
+    if ref.temperature_c is None and any(name.endswith('temperature') for name, _ in model.groups(sensor)):
+        raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
+    point, parts = model.full_point(), []
+    warps = {e.name: e for e in model.concerning(sensor) if e.warp is not None}
+    for name, _ in model.groups(sensor):
+        kind, _, owner = name.partition(':')
+        if kind == 'warp':
+            parts += warp_columns(model, warps[owner], sensor, table, motion, ref)
+        elif kind != 'warp_lever':
+            parts.append(GROUPS[name](ref, point))
+    return np.concatenate(parts, axis=1)
+
+
+def warp_columns(model, effect, sensor, table, motion, ref):
+    """
+    Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
+    """
+    if effect.derivative is not None:
+        return [effect.derivative(ref)]
+    inputs, levers = [], []
+    for above, below, width in _central_steps(effect, model.warp_point(effect)):
+        high, low = (warped_reference(model, sensor, table, motion, values={effect.name: at}) for at in (above, below))
+        inputs.append((getattr(high, INPUT_OF[sensor]) - getattr(low, INPUT_OF[sensor])) / width)
+        if sensor == 'accelerometer' and model.has_arms:
+            turns = [lever_matrix(end.rate_s, end.alpha_s).reshape(-1, 9) for end in (high, low)]
+            levers.append((turns[0] - turns[1]) / width)
+    return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
+
+
+def _central_steps(effect, at):
+    """Yield (values above, values below, distance) for the derivative by each parameter; time constants stay positive."""
+    for index in range(effect.size):
+        step = np.zeros(effect.size)
+        step[index] = effect.step
+        below = at - step
+        if effect.components[index] == 'time_constant':
+            step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
+            below = at - step if at[index] > 0 else at
+        yield at + step, below, (at + step - below)[index]
+
+
+def columns_at_point(model, sensor, table, motion, temperature_c=None, ref=None):
+    """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
+    ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
+    point = model.full_point()
+    return np.concatenate([GROUPS[name](ref, point) for name, _ in model.groups(sensor) if name in GROUPS], axis=1)

@@ -1,0 +1,6 @@
+"""
+Windows become a solution.
+
+In: windows and a sensor model. Out: parameters with their covariance, the noise, what is observable.
+Read `solver` first; the noise is in `noise_model`.
+"""

@@ -1,0 +1,140 @@
+"""The streaming least-squares system: windows go in one at a time, memory stays bounded, systems of several recordings merge."""
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.linear_least_squares import triangular
+from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
+
+CAPACITY = 4096
+"""Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
+
+
+@dataclass(eq=False)
+class Accumulator:
+    """
+    Everything that least squares needs of any number of windows.
+
+    Mean rows stay single, because the bias that wanders from window to window makes their weights depend on one another;
+    the centred rows of each kind of window are one triangular factor per sensor.
+    """
+
+    rows: list = field(default_factory=list)
+    """Windows in order of time with their mean rows (WindowStatistics whose `within` is empty)."""
+    within: dict = field(default_factory=dict)
+    """(sensor, kind) -> triangular factor of the centred rows."""
+    slow: dict = field(default_factory=dict)
+    """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
+    slow_rows: dict = field(default_factory=dict)
+    """Kind -> number of rows behind `slow`."""
+    samples: dict = field(default_factory=dict)
+    """Kind -> number of samples."""
+    windows: dict = field(default_factory=dict)
+    """Kind -> number of windows."""
+
+    def add(self, window):
+        """Take one window (WindowStatistics)."""
+        for sensor in SENSORS:
+            statistics = window.sensors[sensor]
+            _stack(self.within, (sensor, window.kind), statistics.within)
+            if statistics.slow_rows:
+                _stack(self.slow, (sensor, window.kind), statistics.slow)
+        self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + statistics.slow_rows
+        self.rows.append(_without_within(window))
+        self._count(window.kind, window.count, 1)
+        if len(self.rows) > CAPACITY:
+            self._thin()
+
+    def copy(self):
+        """Return an accumulator that goes its own way; rows and factors are never changed in place."""
+        return Accumulator(list(self.rows), *(dict(getattr(self, f.name)) for f in fields(self)[1:]))
+
+    def merge(self, other):
+        """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
+        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
+            for key, factor in its.items():
+                _stack(mine, key, factor)
+        for kind, count in other.slow_rows.items():
+            self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
+        self.rows.extend(other.rows)
+        for kind, count in other.samples.items():
+            self._count(kind, count, other.windows[kind])
+        while len(self.rows) > CAPACITY:
+            self._thin()
+
+    def _count(self, kind, samples, windows):
+        self.samples[kind] = self.samples.get(kind, 0) + samples
+        self.windows[kind] = self.windows.get(kind, 0) + windows
+
+    def _thin(self):
+        """Join neighbours of one kind and recording into one row; their difference joins the centred rows of their kind."""
+        thinned, index = [], 0
+        while index < len(self.rows):
+            first = self.rows[index]
+            second = self.rows[index + 1] if index + 1 < len(self.rows) else None
+            if second is None or (first.kind, first.session) != (second.kind, second.session) or index > len(self.rows) // 2:
+                thinned.append(first)
+                index += 1
+                continue
+            for sensor in SENSORS:
+                _stack(self.within, (sensor, first.kind), _difference(first, second, sensor))
+            thinned.append(_joined(first, second))
+            index += 2
+        if len(thinned) == len(self.rows):
+            del thinned[0]
+        self.rows = thinned
+
+
+def _stack(factors, key, factor):
+    """Add rows to the triangular factor under `key`."""
+    known = factors.get(key)
+    factors[key] = factor if known is None or not len(known) else triangular(np.concatenate([known, factor])) if len(factor) else known
+
+
+def _difference(first, second, sensor):
+    """Return the row that carries what differs between two windows, scaled to the noise of one sample."""
+    scale = 1 / np.sqrt(1 / first.count + 1 / second.count)
+    return scale * (first.sensors[sensor].mean - second.sensors[sensor].mean)[None, :]
+
+
+def _joined(first, second):
+    total = first.count + second.count
+    share = np.array([first.count, second.count]) / total
+    sensors = {}
+    for sensor in SENSORS:
+        a, b = first.sensors[sensor], second.sensors[sensor]
+        means = [share[0] * x + share[1] * y for x, y in ((a.mean, b.mean), (a.noise_variance, b.noise_variance), (a.inflation, b.inflation))]
+        sensors[sensor] = SensorStatistics(means[0], a.within[:0], means[1], means[2])
+    time = share[0] * first.time + share[1] * second.time
+    return WindowStatistics(first.kind, float(time), first.duration + second.duration, total, sensors, first.session)
+
+
+def _without_within(window):
+    if all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
+        return window
+    sensors = {name: SensorStatistics(s.mean, s.within[:0].copy(), s.noise_variance, s.inflation) for name, s in window.sensors.items()}
+    return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session)
+
+
+def restrict(accumulator, wide, narrow):
+    """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
+    chosen = {}
+    for sensor in ('accelerometer', 'gyroscope'):
+        index, start = {}, 0
+        for name, width in wide.groups(sensor):
+            index[name] = np.arange(start, start + width)
+            start += width
+        chosen[sensor] = np.concatenate([index[name] for name, _ in narrow.groups(sensor)] + [np.arange(start, start + 3)])
+    small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
+    small.within, small.slow = ({(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
+                                for factors in (accumulator.within, accumulator.slow))
+    small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
+    return small
+
+
+def restricted_window(window, chosen):
+    """Return a reduced window with the columns `chosen` (sensor -> indices) only."""
+    sensors = {name: replace(s, mean=s.mean[chosen[name]], within=s.within[:, chosen[name]]) for name, s in window.sensors.items()}
+    return replace(window, sensors=sensors)

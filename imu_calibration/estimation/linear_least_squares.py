@@ -1,0 +1,326 @@
+"""Linear least squares that stays accurate: orthogonal factors of scaled columns, never the normal equations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.linalg import lapack
+
+from imu_calibration.errors import InputError, NotObservableError
+
+RANK_TOLERANCE = 1e-10
+"""A singular value of the unit-column design below this times the largest counts as zero; rounding leaves about 1e-15."""
+COLUMN_TOLERANCE = 1e-14
+"""A column shorter than this times the longest is rounding of zero (the sine of pi), not a column to be scaled up."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSolution:
+    """Least-squares solution of ``outputs = design @ values`` for one or several columns of outputs."""
+
+    values: np.ndarray
+    """Parameters in `param_names` order, shape (n_params,) or (n_params, n_outputs)."""
+    param_names: tuple
+    """Names of the parameters."""
+    unit_covariance: np.ndarray
+    """Covariance for output noise of sd 1 (of sd 1/sqrt(weight) with weights), shape (n_params, n_params)."""
+    sigma: np.ndarray
+    """Sd of unit weight estimated from the residuals, scalar array or shape (n_outputs,); NaN without redundancy."""
+    residuals: np.ndarray
+    """Outputs minus prediction, not weighted, shape of the outputs."""
+    dof: int
+    """Rows of non-zero weight minus parameters."""
+    rank: int
+    """Numerical rank of the unit-column design; equal to the number of parameters here."""
+    cond: float
+    """Condition number of the (weighted) design in the units it came in."""
+    eqcond: float
+    """Condition number after every column is scaled to unit norm; independent of units."""
+    singular_values: np.ndarray
+    """Singular values of the unit-column design, descending, shape (n_params,)."""
+
+    @property
+    def unit_sd(self):
+        """Sd of each parameter for output noise of sd 1, shape (n_params,)."""
+        return np.sqrt(np.diag(self.unit_covariance))
+
+    @property
+    def sd(self):
+        """Sd of each parameter with the estimated sigma, shape of `values`."""
+        return np.multiply.outer(self.unit_sd, self.sigma)
+
+    @property
+    def covariance(self):
+        """Covariance with the estimated sigma, shape (n_params, n_params) or (n_outputs, n_params, n_params)."""
+        return np.multiply.outer(self.sigma**2, self.unit_covariance)
+
+    @property
+    def chi2_per_dof(self):
+        """Weighted residual sum of squares per degree of freedom, shape of `sigma`."""
+        return self.sigma**2
+
+    def value(self, name):
+        """Return the parameter called `name`."""
+        return self.values[self.param_names.index(name)]
+
+
+def solve_linear(design, outputs, param_names, weights=None, rank_tolerance=RANK_TOLERANCE):
+    """
+    Solve ``outputs = design @ values`` by least squares through the SVD of the unit-column design.
+
+    Parameters
+    ----------
+    design : array, shape (n, n_params)
+        One row per observation.
+    outputs : array, shape (n,) or (n, n_outputs)
+        Observations; several columns share the design.
+    param_names : sequence of str
+        One name per column of the design.
+    weights : array, shape (n,), optional
+        Inverse variances of the observations.
+    rank_tolerance : float
+        Relative singular value (unit columns) below which the system counts as singular.
+
+    Returns
+    -------
+    LinearSolution
+
+    Raises
+    ------
+    InputError
+        When shapes disagree or a value is not finite.
+    NotObservableError
+        When the design is singular; the message names the directions that it does not determine.
+
+    """
+    design, outputs, names, root = _checked(design, outputs, param_names, weights)
+    norms, left, singular, right = _scaled_svd(design * root[:, None])
+    _require_full_rank(design, norms, singular, right, names, rank_tolerance)
+
+    def fit(target):
+        weighted = (target.T * root).T
+        return ((right.T / singular) @ (left.T @ weighted)).T / norms
+
+    values = fit(outputs).T
+    values = values + fit(outputs - design @ values).T  # one refinement step: the residual is formed at full precision
+    residuals = outputs - design @ values
+    dof = int(np.count_nonzero(root)) - len(names)
+    rss = np.sum(((residuals.T * root) ** 2), axis=-1)
+    sigma = np.sqrt(rss / dof) if dof > 0 else np.full(np.shape(rss), np.nan)
+    inverse = right.T / singular / norms[:, None]
+    raw = np.linalg.svd(design * root[:, None], compute_uv=False)
+    return LinearSolution(values, names, inverse @ inverse.T, np.asarray(sigma), residuals, dof, len(names),
+                          _ratio(raw), _ratio(singular), singular)
+
+
+def numerical_rank(design, rank_tolerance=RANK_TOLERANCE):
+    """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
+    singular = _scaled_svd(np.asarray(design, float))[2]
+    return int(np.sum(singular > rank_tolerance * max(singular[0], np.finfo(float).tiny)))
+
+
+def condition_numbers(design):
+    """Return (condition number as it is, condition number with unit-norm columns); infinite when a column is zero."""
+    design = np.asarray(design, float)
+    return _ratio(np.linalg.svd(design, compute_uv=False)), _ratio(_scaled_svd(design)[2])
+
+
+def null_directions(design, param_names, rank_tolerance=RANK_TOLERANCE):
+    """
+    Return the combinations of parameters that leave every output unchanged, as a list of {name: weight}.
+
+    Weights are changes of the parameters in their own units, the leading one being 1; combinations are made as short as an echelon
+    form can. A column of zeros gives a direction of its own.
+
+    """
+    norms, _, singular, right = _scaled_svd(np.asarray(design, float))
+    weak = right[singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)]
+    return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
+
+
+def predicted_sd(design, weights=None, sigma=1.0):
+    """
+    Return the sd that each parameter will have, before any data exist; infinite where the design does not reach it.
+
+    Parameters
+    ----------
+    design : array, shape (n, n_params)
+    weights : array, shape (n,), optional
+        Inverse variances of the observations; with them `sigma` stays 1.
+    sigma : float
+        Output noise sd.
+
+    """
+    design = np.asarray(design, float)
+    if weights is not None:
+        design = design * np.sqrt(np.asarray(weights, float))[:, None]
+    norms, _, singular, right = _scaled_svd(design)
+    weak = singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
+    reach = np.sqrt(np.sum((right[~weak].T / singular[~weak]) ** 2, axis=1)) / norms
+    touched = np.any(np.abs(right[weak]) > 1e-7, axis=0)
+    return np.where(touched, np.inf, sigma * reach)
+
+
+@dataclass(frozen=True, eq=False)
+class ToleranceScaled:
+    """What the data say about directions of the parameter space when each parameter is measured in its tolerance."""
+
+    singular_values: np.ndarray
+    """One over the sd of each direction in tolerances, descending, shape (n_params,); below 1 the direction is too weak."""
+    directions: np.ndarray
+    """Unit vectors in tolerance units, one per row, shape (n_params, n_params)."""
+    sd_over_tolerance: np.ndarray
+    """Predicted sd over tolerance of each parameter, shape (n_params,); infinite when not reached."""
+
+    @property
+    def cond(self):
+        """Largest over smallest singular value."""
+        return _ratio(self.singular_values)
+
+    def weak_directions(self, param_names, threshold=1.0, share=0.1):
+        """Return [{name: weight}] for directions whose sd exceeds tolerance/threshold, the weakest first."""
+        rows = self.directions[self.singular_values < threshold][::-1]
+        return [{name: float(w) for name, w in zip(param_names, row) if abs(w) >= share * np.max(np.abs(row))} for row in rows]
+
+
+def tolerance_scaled(design, tolerances, sigma=1.0):
+    """
+    Scale a design to parameters in units of their tolerances and outputs in units of their noise.
+
+    Parameters
+    ----------
+    design : array, shape (n, n_params)
+    tolerances : array, shape (n_params,)
+        The sd that would be good enough, in the unit of each parameter.
+    sigma : float or array, shape (n,)
+        Output noise sd.
+
+    """
+    design = np.asarray(design, float) / np.broadcast_to(np.asarray(sigma, float), len(design))[:, None]
+    tolerances = np.asarray(tolerances, float)
+    singular, right = np.linalg.svd(_square_factor(design * tolerances))[1:]
+    return ToleranceScaled(singular, right, predicted_sd(design) / tolerances)
+
+
+def tolerance_scaled_covariance(covariance, tolerances):
+    """Do the same as `tolerance_scaled` from a covariance, shape (n_params, n_params)."""
+    tolerances = np.asarray(tolerances, float)
+    variances, vectors = np.linalg.eigh(np.asarray(covariance, float) / np.outer(tolerances, tolerances))
+    with np.errstate(divide='ignore'):
+        singular = 1 / np.sqrt(np.maximum(variances, 0))
+    return ToleranceScaled(singular, vectors.T, np.sqrt(np.diag(covariance)) / tolerances)
+
+
+def _checked(design, outputs, param_names, weights):
+    design, outputs, names = np.asarray(design, float), np.asarray(outputs, float), tuple(param_names)
+    if design.ndim != 2 or design.shape[1] != len(names):
+        raise InputError(f'the design must have one column per parameter ({len(names)}), got shape {design.shape}; correct one of them')
+    if outputs.shape[:1] != design.shape[:1] or outputs.ndim > 2:
+        raise InputError(f'outputs must have {len(design)} rows like the design, got shape {outputs.shape}; correct one of them')
+    weights = np.ones(len(design)) if weights is None else np.asarray(weights, float)
+    if weights.shape != (len(design),) or not np.all(weights >= 0):
+        raise InputError(f'weights must be {len(design)} numbers >= 0, got shape {weights.shape}; give inverse variances')
+    if not (np.all(np.isfinite(design)) and np.all(np.isfinite(outputs)) and np.all(np.isfinite(weights))):
+        raise InputError('design, outputs and weights must be finite, got NaN or infinity; remove those rows')
+    return design, outputs, names, np.sqrt(weights)
+
+
+def _scaled_svd(design):
+    """Return (column norms with 1 for empty columns, U, singular values, V') of the unit-column design, all n_params of them."""
+    norms = np.linalg.norm(design, axis=0)
+    empty = norms <= COLUMN_TOLERANCE * np.max(norms)
+    norms = np.where(empty, 1.0, norms)
+    orthogonal, factor = np.linalg.qr(_padded(np.where(empty, 0.0, design / norms)))
+    left, singular, right = np.linalg.svd(factor)
+    return norms, (orthogonal @ left)[:len(design)], singular, right
+
+
+def _padded(design):
+    missing = design.shape[1] - design.shape[0]
+    return np.vstack([design, np.zeros((missing, design.shape[1]))]) if missing > 0 else design
+
+
+def _square_factor(design):
+    return np.linalg.qr(_padded(design), mode='r')
+
+
+def _ratio(singular):
+    return float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
+
+
+def _require_full_rank(design, norms, singular, right, names, rank_tolerance):
+    weak = singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)
+    if np.any(weak):
+        directions = _echelon(right[weak], norms, names)
+        raise NotObservableError(
+            f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from {len(design)} rows; not determined: '
+            f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.')
+
+
+def _echelon(weak, norms, names):
+    pivots = np.sort(scipy.linalg.qr(weak, pivoting=True, mode='r')[1][:len(weak)])
+    rows = np.linalg.solve(weak[:, pivots], weak)
+    shown = np.abs(rows) > 1e-6
+    changes = rows / norms * norms[pivots, None]
+    return [{names[k]: float(change[k]) for k in np.flatnonzero(keep)} for change, keep in zip(changes, shown)]
+
+
+def _as_text(direction):
+    if len(direction) == 1:
+        return next(iter(direction))
+    return ' '.join(f'{weight:+.3g} {name}' for name, weight in direction.items())
+
+
+BLOCK = 2000
+"""Rows per orthogonal factorisation: taller blocks do not stay in the processor's cache."""
+
+
+PANEL = 4
+"""Columns that are reflected at a time."""
+
+
+def triangular(rows):
+    """Return the triangular factor of `rows` by Householder reflections, block after block, with as many rows as it has rank bound."""
+    count, width = rows.shape
+    if count < 2 * width:
+        return _r_factor(np.array(rows, order='F'))
+    factor = np.zeros((width, width), order='F')
+    for start in range(0, count, BLOCK):
+        # Each block is folded into the triangle, whose zeros cost nothing.
+        block = np.array(rows[start:start + BLOCK], order='F')
+        factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
+        _require_finite(info, factor)
+    return np.triu(factor)
+
+
+def _r_factor(stacked):
+    if not len(stacked):
+        return stacked
+    raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
+    _require_finite(info, raw[:, 0])
+    return np.triu(raw[:min(raw.shape)])
+
+
+def _require_finite(info, values):
+    if info != 0 or not np.isfinite(values).all():
+        raise FloatingPointError('orthogonal factorisation met values that are not finite')
+
+
+def _scaled_lstsq(matrix, right):
+    """Return the least-squares solution with columns scaled to unit norm first."""
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
+    diagonal = np.abs(np.diag(r))
+    rank = int((diagonal > 1e-15 * diagonal[0]).sum()) if len(diagonal) else 0
+    solved = np.zeros((matrix.shape[1],) + right.shape[1:])
+    solved[order[:rank]] = scipy.linalg.solve_triangular(r[:rank, :rank], (q.T @ right)[:rank])
+    return (solved.T / scale).T
+
+
+def _inverse_gram(matrix):
+    """Return (matrix' matrix)^-1 through the triangular factor of the scaled columns."""
+    scale = np.linalg.norm(matrix, axis=0)
+    r = scipy.linalg.qr(matrix / scale, mode='r')[0][:matrix.shape[1]]
+    inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
+    return (inverse @ inverse.T) / np.outer(scale, scale)

@@ -1,0 +1,113 @@
+"""What a recording can determine, in tolerances, and which motion would determine the rest."""
+
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+
+
+def added_information(model, values, noise, motion, gravity):
+    """
+    Return the information matrix that one minute of a standard motion would add, shape (n_params, n_params).
+
+    Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this session.
+    """
+    total = np.zeros((len(values), len(values)))
+    point = model.full_point()
+    for piece in motion.make(gravity):
+        for sensor in SENSORS:
+            total += _piece_information(model, sensor, values, noise[sensor], piece, point)
+    return total
+
+
+def _piece_information(model, sensor, values, noise, piece, point):
+    design = np.concatenate([_group(name, width, piece, point) for name, width in model.groups(sensor)], axis=1)
+    dc = coefficient_jacobian(model, sensor, values)
+    static = len(piece) == 1
+    count = 500.0 if static else 2.0 * len(piece)
+    mean = design.mean(axis=0)
+    within = (design - mean).T @ (design - mean) * (0.0 if static else 2.0)
+    information = np.zeros((dc.shape[2], dc.shape[2]))
+    for axis in range(3):
+        rows = mean @ dc[:, axis]
+        variance = noise.white_variance[axis] * noise.inflation[axis]
+        information += np.outer(rows, rows) / (variance / count + noise.offset_sd**2 + noise.wander_sd**2)
+        information += dc[:, axis].T @ within @ dc[:, axis] / variance
+    return information
+
+
+def _group(name, width, piece, point):
+    thermal = name.endswith('temperature') and piece.temperature_c is None
+    return np.zeros((len(piece), width)) if thermal or name not in GROUPS else GROUPS[name](piece, point)
+
+
+def tolerance_scaled_singular_values(information, tolerances):
+    """
+    Return the singular values of the design with parameters in units of their tolerance, descending.
+
+    A value of one means that the direction is determined to one tolerance; below one it is weak. Rank alone proves nothing.
+    """
+    scaled = information * np.outer(tolerances, tolerances)
+    return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
+
+
+def weak_directions(covariance, tolerances, names, limit=6):
+    """
+    Return the directions in which the standard deviation exceeds the tolerance, worst first.
+
+    Returns
+    -------
+    list of dict
+        {name: weight}, the weights in tolerances, members below 0.2 of the largest left out.
+
+    """
+    scaled = covariance / np.outer(tolerances, tolerances)
+    variances, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
+    found = []
+    for variance, vector in sorted(zip(variances, vectors.T), key=lambda pair: -pair[0]):
+        if variance <= 1.0 or len(found) >= limit:
+            break
+        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        strong = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
+        found.append({names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong)})
+    return found
+
+
+def needed_motions(solution, tolerances, gravity, prior_sd):
+    """
+    Return for each parameter that is not determined the standard motion that would serve it best.
+
+    Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
+    tolerances.
+
+    Returns
+    -------
+    dict
+        Parameter name -> (motion text, predicted standard deviation).
+
+    """
+    lacking = np.flatnonzero(solution.sd > tolerances)
+    if not len(lacking):
+        return {}
+    base = solution.information + np.diag(1 / prior_sd**2)
+    predicted = {}
+    for motion in MOTIONS:
+        total = base + added_information(solution.model, solution.values, solution.noise, motion, gravity)
+        scale = np.sqrt(np.diag(total))
+        inverse = np.linalg.inv(total / np.outer(scale, scale))
+        predicted[motion] = np.sqrt(np.clip(np.diag(inverse), 0, None)) / scale
+    return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}
+
+
+def _best(solution, index, predicted):
+    motion = min(predicted, key=lambda m: predicted[m][index])
+    sd = float(predicted[motion][index])
+    if sd > 0.7 * solution.sd[index]:
+        owner = next(e for e in solution.model.effects if solution.param_names[index] in e.param_names())
+        texts = {m.name: m.text for m in MOTIONS} | TABLE_MOTIONS
+        return texts[owner.motion[0]], float('nan')
+    return motion.text, sd

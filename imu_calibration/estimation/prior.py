@@ -1,0 +1,49 @@
+"""What is known of the parameters before any data: priors, gauge, and parameters that least squares leaves alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian prior as rows: ``root @ (values - mean)`` has unit variance."""
+
+    mean: np.ndarray
+    """Prior values, shape (n_params,)."""
+    root: np.ndarray
+    """Square root of the information, shape (k, n_params)."""
+    sd: np.ndarray
+    """Marginal standard deviations, shape (n_params,)."""
+
+
+GAUGE_SD = 1e-12
+
+
+def make_prior(model):
+    """
+    Return the prior of a model.
+
+    When both `accel_size_effect` and `lever_arm` are estimated, the arms of the size effect sum to zero: the origin is the
+    mean of the sensitive points.
+    """
+    mean, sd = model.prior()
+    mean = np.where(np.isfinite(mean), mean, 0.0)
+    for effect in model.relinearised:
+        if effect.components[-1] == 'time_constant' and effect.size > 1:
+            mean[model.slices[effect.sensor, effect.name]][-1] = 300.0
+    rows = [np.diag(1 / sd)]
+    if ('accelerometer', 'accel_size_effect') in model.slices and ('accelerometer', 'lever_arm') in model.slices:
+        arms = np.arange(len(mean))[model.slices['accelerometer', 'accel_size_effect']].reshape(3, 3)
+        gauge = np.zeros((3, len(mean)))
+        for component in range(3):
+            gauge[component, arms[:, component]] = 1 / GAUGE_SD
+        rows.append(gauge)
+        sd = sd.copy()
+        sd[arms.ravel()] *= np.sqrt(2 / 3)
+    return Prior(mean, np.concatenate(rows), sd)
+
+
+def fixed_parameters(model):
+    """Return a mask of parameters that least squares leaves alone (saturation is censoring, not a column)."""
+    return np.concatenate([np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects])

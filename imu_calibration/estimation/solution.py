@@ -1,0 +1,43 @@
+"""What a solve hands back: parameters, covariance, noise, quality of the fit."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Estimated parameters with everything that is needed to judge them."""
+
+    model: object
+    """The SensorModel, linearised where the columns were taken."""
+    values: np.ndarray
+    """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
+    covariance: np.ndarray
+    """Their covariance, the priors of held parameters included, shape (n_params, n_params)."""
+    held: np.ndarray
+    """True where the recording says next to nothing and the prior stands, shape (n_params,)."""
+    noise: dict
+    """Sensor -> WindowNoise."""
+    chi2_per_dof: dict
+    """Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom."""
+    information: np.ndarray
+    """Information matrix of the data alone, shape (n_params, n_params)."""
+    residual_rms: dict
+    """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
+    session_biases: dict = field(default_factory=dict)
+    """Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean."""
+
+    @property
+    def param_names(self):
+        """Names in the order of `values`."""
+        return self.model.param_names
+
+    @property
+    def sd(self):
+        """Standard deviations, shape (n_params,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, sensor, effect):
+        """Return the values of one effect."""
+        return self.values[self.model.slices[sensor, effect]]

@@ -1,0 +1,119 @@
+"""Standard motions of a table, each one minute long: what a recording may lack and a person can do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.constants import DEG
+from imu_calibration.reference.reference_motion import Reference
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A standard motion of the sensor, to be carried out on the table or by hand."""
+
+    name: str
+    """Short name."""
+    text: str
+    """What to do."""
+    make: object
+    """Function of gravity that returns pieces of the motion, each a Reference."""
+
+
+def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None):
+    """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
+    axis, up = np.asarray(axis, float) / np.linalg.norm(axis), np.asarray(up, float) / np.linalg.norm(up)
+    cos, sin = np.cos(angle)[:, None], -np.sin(angle)[:, None]
+    up_s = up * cos + np.cross(axis, up) * sin + axis * (axis @ up) * (1 - cos)
+    rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
+    force = gravity * up_s
+    if arm is not None:
+        force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
+    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c)
+
+
+def _attitudes(up_s):
+    """Return attitudes whose third column is the vertical; the heading is arbitrary."""
+    other = np.eye(3)[np.argmin(np.abs(up_s), axis=1)]
+    first = np.cross(other, up_s)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return np.stack([first, np.cross(up_s, first), up_s], axis=2)
+
+
+TIME = np.arange(0.0, 30.0, 0.02)
+
+
+EDGES = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+
+
+def _spin(axis, speeds, up=None, arm=None):
+    def make(gravity):
+        across = np.roll(axis, 1) if up is None else up
+        return [_turn(axis, TIME, s * DEG * TIME, np.full(len(TIME), s * DEG), np.zeros(len(TIME)), gravity, across, arm=arm) for s in speeds]
+    return make
+
+
+def _oscillation(axis, degrees, hertz):
+    def make(gravity):
+        w, a = 2 * np.pi * hertz, degrees * DEG
+        return [_turn(axis, TIME, a * np.sin(w * TIME), a * w * np.cos(w * TIME), -a * w**2 * np.sin(w * TIME), gravity, (0.3, 0.4, 1.0))]
+    return make
+
+
+def _poses(directions, temperatures=(None,)):
+    def make(gravity):
+        one = np.zeros(1)
+        return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, None if t is None else np.full(1, t))
+                for t in temperatures for k, up in enumerate(directions)]
+    return make
+
+
+def _two_axis(gravity):
+    """Turn about an axis that itself turns: rates about two axes at once, with the cross term in the angular acceleration."""
+    pieces = []
+    for inner, outer in ((0, 1), (1, 2), (2, 0)):
+        w = 200 * DEG
+        rate, alpha = np.zeros((len(TIME), 3)), np.zeros((len(TIME), 3))
+        third = 3 - inner - outer
+        rate[:, inner] = w
+        rate[:, outer], rate[:, third] = w * np.cos(w * TIME), -w * np.sin(w * TIME)
+        alpha[:, outer], alpha[:, third] = -w * w * np.sin(w * TIME), -w * w * np.cos(w * TIME)
+        up = np.zeros((len(TIME), 3))
+        up[:, outer], up[:, third] = np.cos(w * TIME), -np.sin(w * TIME)
+        pieces.append(Reference(TIME, _attitudes(up), gravity * up, rate, alpha, gravity))
+    return pieces
+
+
+def _fine_poses():
+    angle = np.arange(0, 2 * np.pi, np.pi / 12)
+    rings = [np.roll(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), k, axis=1) for k in range(3)]
+    return [tuple(v) for v in np.concatenate(rings)]
+
+
+MOTIONS = (
+    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(EDGES)),
+    Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
+    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), (-200, -100, 100, 200))),
+    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), (-200, -100, 100, 200))),
+    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), (-200, -100, 100, 200))),
+    Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
+        piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+        for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
+    Motion('oscillate_x', "oscillate about the sensor's x axis, 30 deg at 1 Hz", _oscillation((1, 0, 0), 30, 1.0)),
+    Motion('oscillate_y', "oscillate about the sensor's y axis, 30 deg at 1 Hz", _oscillation((0, 1, 0), 30, 1.0)),
+    Motion('oscillate_z', "oscillate about the sensor's z axis, 30 deg at 1 Hz", _oscillation((0, 0, 1), 30, 1.0)),
+    Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
+    Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
+        piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
+    Motion('warm_up', 'rest in six faces, cold and warm', _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
+)
+"""Standard motions of the sensor; motions of table joints are named by the effects that need them."""
+
+
+TABLE_MOTIONS = {
+    'turn_about_vertical': 'turn slowly through a full circle about the vertical, resting at several headings',
+    'slow_turn': 'turn each joint slowly through full circles, with the sensor mounted at two attitudes',
+    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz about two axes, in both phases',
+    'fast_spin': 'spin slowly up to the fastest rate in both senses',
+}
+"""Motions that concern the table or the clock; their gain depends on the table and is not predicted."""

@@ -1,0 +1,79 @@
+"""A bounded store of windows, for effects that must be linearised anew without reading the recording again."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.effects.columns import columns
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.segmentation.window import Window
+
+STATIC_MOST = 4096
+"""Static windows kept at most."""
+
+
+class WindowStore:
+    """
+    All windows of a session as long as they fit, none of them afterwards.
+
+    A static window is its reduced form with one row of motion; of others every sample is kept.
+
+    Parameters
+    ----------
+    most : int
+        Samples in moving windows that are kept at most.
+    complete : bool
+        False when windows were missed already, as after a restart.
+
+    """
+
+    def __init__(self, most, complete=True):
+        self._most, self._entries, self._n_samples, self._n_static = most, [], 0, 0
+        self.complete = complete and most > 0
+
+    def copy(self):
+        """Return a copy that shares the windows."""
+        twin = WindowStore(self._most, self.complete)
+        twin._entries, twin._n_samples, twin._n_static = list(self._entries), self._n_samples, self._n_static
+        return twin
+
+    def add(self, window, reduced):
+        """Take one window (Window, WindowStatistics); when it does not fit, forget them all."""
+        if not self.complete:
+            return
+        if window.kind == 'static':
+            self._n_static += 1
+            temperature = None if window.temperature_c is None else np.array([window.temperature_c.mean()])
+            self._entries.append((reduced, window.motion, temperature))
+        else:
+            self._n_samples += len(window)
+            self._entries.append(owned_window(window))
+        if self._n_samples > self._most or self._n_static > STATIC_MOST:
+            self.complete, self._entries = False, []
+
+    def reduced(self, model, table, session):
+        """Return the accumulator of all windows with the columns of `model`."""
+        accumulator = Accumulator()
+        for entry in self._entries:
+            if isinstance(entry, Window):
+                accumulator.add(reduce_window(entry, model, table, session))
+            else:
+                accumulator.add(_again(*entry, model, table))
+        return accumulator
+
+
+def _again(reduced, motion, temperature, model, table):
+    """Return a static window's statistics with the columns taken anew."""
+    sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion, temperature).mean(axis=0), known.mean[-3:]]))
+               for name, known in reduced.sensors.items()}
+    return replace(reduced, sensors=sensors)
+
+
+def owned_window(window):
+    """Return the window in memory of its own: slices would keep the whole chunk that they were cut from."""
+    motion = JointMotion(*(np.array(getattr(window.motion, name)) for name in ('time', 'position', 'rate', 'acceleration', 'jerk')))
+    temperature = None if window.temperature_c is None else np.array(window.temperature_c)
+    return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
+                  joint_step=window.joint_step)

@@ -1,0 +1,228 @@
+"""
+Zhang's calibration of a tri-axis accelerometer (Sensors 2017, 17(3)): static model, installation angles, closed-form lever arms.
+
+Row i of `cosines` holds the direction cosines of sensor axis i in the body frame (angles theta_ix, theta_iy, theta_iz); the paper's
+C_a^b has them as columns. Lever arms point from the reference point to the sensitive point, the sign that eq. 11 and 21 need; the
+paper's Table 3 is printed with the opposite one. Any force unit serves as long as it is kept: the paper's own is g, with volts as outputs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.estimation.linear_least_squares import solve_linear
+
+"""m/s^2, the g of the paper's units."""
+TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])
+"""Installation angles as printed, row i: sensor axis i to body x, y, z."""
+TABLE_1_SCALE = np.array([0.39496, 0.39808, 0.40024])
+"""Scale factors as printed, V/g."""
+TABLE_1_BIAS = np.array([2.405098, 2.380978, 2.435503])
+"""Zero-bias voltages as printed, V."""
+TABLE_2_G = np.array([[1.00043, 1.00041, -0.99956, -0.99958], [0.01299, 0.00098, -0.01100, 0.00098], [-0.00911, 0.00023, 0.00953, 0.00020]])
+"""Readings at rest as printed, g, rows x, y, z; columns: x up before and after compensation, x down before and after."""
+TABLE_3_ARMS = -np.array([[-0.00834, -0.00042, -0.00132], [-0.00256, -0.00893, -0.00026], [-0.00060, -0.00050, -0.00824]])
+"""Lever arms, m, row i: reference point to sensor i (the printed numbers times -1)."""
+TABLE_4_G = np.array([[0.998078, 0.998060, -1.001924, -1.001939], [0.000289, 0.000253, -0.003359, 0.000253],
+                      [-0.014150, 0.002402, 0.0093985, 0.002402]])
+"""Readings in rotation as printed, g, laid out as `TABLE_2_G`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticModel:
+    """``outputs = scale * (cosines @ force) + bias`` (eq. 5)."""
+
+    scale: np.ndarray
+    """Output per unit force of each sensor, shape (3,)."""
+    cosines: np.ndarray
+    """Direction cosines, one sensor per row, shape (3, 3)."""
+    bias: np.ndarray
+    """Outputs at zero force, shape (3,)."""
+
+    @property
+    def matrix(self):
+        """K C' (eq. 7), shape (3, 3)."""
+        return self.scale[:, None] * self.cosines
+
+    @property
+    def angles_deg(self):
+        """Installation angles in degrees, shape (3, 3)."""
+        return np.rad2deg(np.arccos(np.clip(self.cosines, -1, 1)))
+
+    @property
+    def bias_force(self):
+        """Equivalent zero bias in the body frame (eq. 8), force units, shape (3,)."""
+        return np.linalg.solve(self.matrix, self.bias)
+
+    def predict(self, force_b):
+        """Return the outputs for specific forces in the body frame, shape (n, 3)."""
+        return np.asarray(force_b) @ self.matrix.T + self.bias
+
+    def invert(self, outputs):
+        """Return specific forces in the body frame (eq. 6) by the true inverse, shape (n, 3)."""
+        return np.linalg.solve(self.matrix, (np.asarray(outputs) - self.bias).T).T
+
+    def invert_as_printed(self, outputs):
+        """Return specific forces with the transpose taken for the inverse of the cosines, as eq. 3 and 4 claim."""
+        return (np.asarray(outputs) - self.bias) / self.scale @ self.cosines
+
+
+def printed_static_model():
+    """Return Table 1 as it stands; its second row is no unit vector."""
+    return StaticModel(TABLE_1_SCALE, np.cos(np.deg2rad(TABLE_1_ANGLES_DEG)), TABLE_1_BIAS)
+
+
+def static_model_from_matrix(matrix, bias):
+    """Split a sensor matrix into scale factors and unit rows of direction cosines."""
+    scale = np.linalg.norm(matrix, axis=1)
+    return StaticModel(scale, matrix / scale[:, None], np.asarray(bias, float))
+
+
+def six_positions(force=1.0):
+    """Return the specific forces of the six faces, shape (6, 3): x, y, z up, then x, y, z down."""
+    return force * np.vstack([np.eye(3), -np.eye(3)])
+
+
+def fit_static(force_b, outputs, weights=None):
+    """
+    Estimate scale factors, nine installation angles and zero biases from means at rest (section 3.1, step 4).
+
+    Parameters
+    ----------
+    force_b : array, shape (n, 3)
+        Reference specific force in the body frame.
+    outputs : array, shape (n, 3)
+        Mean outputs; volts, or m/s^2 for a sensor that comes with a nominal scale.
+    weights : array, shape (n,), optional
+        Inverse variances.
+
+    Returns
+    -------
+    StaticModel, LinearSolution
+        The solution's rows are 'bias', 'x', 'y', 'z', its columns the sensors.
+
+    """
+    design = np.column_stack([np.ones(len(force_b)), force_b])
+    solution = solve_linear(design, outputs, ('bias', 'x', 'y', 'z'), weights)
+    return static_model_from_matrix(solution.values[1:].T, solution.values[0]), solution
+
+
+def closed_form(means_static, means_spin, rate, directions, spin_axes=None, as_printed=False):
+    """
+    Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (..., 3, 3), one sensor per row.
+
+    ``r_ik = (d_ik - d_il - d_im) / (2 rate^2 cos(axis_i, spin axis k))`` with ``d = spin mean - static mean`` of sensor i; the
+    sensors' biases drop out.
+
+    Parameters
+    ----------
+    means_static, means_spin : arrays, shape (..., 3, 3)
+        Means of sensor i (column) at rest and spinning about axis k (row), m/s^2.
+    rate : float
+        Spin rate, rad/s.
+    directions : array, shape (3, 3)
+        Direction cosines, row i; a full sensor matrix does as well when the means are raw.
+    spin_axes : array, shape (3, 3), optional
+        Spin axes in the body frame, one per row; the body axes if not given. Arms come back in the body frame.
+    as_printed : bool
+        Use the printed fourth term of r_jx (spin instead of static reading), to see what it does.
+
+    Raises
+    ------
+    NotObservableError
+        When a sensor axis is square to a spin axis.
+
+    """
+    axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+        raise InputError('the three spin axes must be orthonormal for the closed form, got others; use the joint fit')
+    cosines = np.asarray(directions, float) @ axes.T
+    if np.any(np.abs(cosines) < 1e-12):
+        sensor, spin = np.argwhere(np.abs(cosines) < 1e-12)[0]
+        raise NotObservableError(f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
+                                 'skew the fixture, add oscillations, or use the joint fit')
+    means_static, means_spin = np.asarray(means_static, float), np.asarray(means_spin, float)
+    change = np.swapaxes(means_spin - means_static, -1, -2)
+    numerator = 2 * change - np.sum(change, axis=-1, keepdims=True)
+    if as_printed:
+        numerator[..., 0] -= change[..., 0]
+    return numerator / (2 * rate**2 * cosines) @ axes
+
+
+def closed_form_sd(noise_sd, rate, directions, spin_axes=None):
+    """Return the sd of each arm along the spin axes, ``sqrt(6) noise_sd / (2 rate^2 |cos|)``, shape (3, 3), one sensor per row."""
+    axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
+    return np.sqrt(6) * noise_sd / (2 * rate**2 * np.abs(np.asarray(directions, float) @ axes.T))
+
+
+def average_rates(arms, rates, weighted=True):
+    """Average closed-form arms of several spin rates, shape (n_rates, 3, 3), with weights rate^4 (their inverse variances) or plainly."""
+    rates = np.asarray(rates, float)
+    return np.average(arms, axis=0, weights=rates**4 if weighted else None)
+
+
+@dataclass(frozen=True)
+class AxisReading:
+    """One line of Zhang's Table 2 (at rest) or Table 4 (in rotation)."""
+
+    position: str
+    """Sensor axis that points up or down, '+x' to '-z'."""
+    rate_deg_s: float
+    """Turn rate, deg/s; 0 at rest."""
+    n_windows: int
+    """Windows averaged in this line."""
+    sensor: str
+    """Sensor whose reading this is, 'x', 'y' or 'z'."""
+    theoretical_g: float
+    """What a perfect sensor reads, g."""
+    before_g: float
+    """Reading before compensation, g."""
+    after_g: float
+    """Reading after compensation, g."""
+
+    @property
+    def improvement(self):
+        """Return the error before over the error after, in sizes."""
+        after = abs(self.after_g - self.theoretical_g)
+        return abs(self.before_g - self.theoretical_g) / after if after > 0 else np.inf
+
+
+def axis_readings(measured, compensated, reference, rate, gravity, within_deg=5.0, still_deg_s=0.2):
+    """
+    Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
+
+    Parameters
+    ----------
+    measured, compensated, reference : arrays, shape (n, 3)
+        Window means of specific force: raw, corrected, and what a perfect sensor at the reference point would read, m/s^2.
+    rate : array, shape (n,)
+        Turn rate of the table in each window, rad/s.
+    gravity : float
+        Local gravity, m/s^2: the g of the lines.
+    within_deg : float
+        Windows whose reference lies within this angle of a sensor axis are taken.
+    still_deg_s : float
+        Slower than this is at rest; faster windows are grouped by rate rounded to 1 deg/s.
+
+    Returns
+    -------
+    list of AxisReading
+        At rest first, then by rate; three lines per position; empty when no window fits.
+
+    """
+    measured, compensated, reference = (np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference))
+    rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
+    rate_deg_s = np.where(rate_deg_s < still_deg_s, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
+    size = np.linalg.norm(reference, axis=1)
+    axis = np.argmax(np.abs(reference), axis=1)
+    along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
+    near = np.abs(along) >= np.cos(np.deg2rad(within_deg)) * size
+    lines = []
+    for key in sorted({(r, -int(np.sign(s)), int(a)) for r, s, a in zip(rate_deg_s[near], along[near], axis[near])}):
+        chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])
+        position = ('+' if key[1] < 0 else '-') + 'xyz'[key[2]]
+        means = [np.mean(values[chosen], axis=0) for values in (reference, measured, compensated)]
+        lines += [AxisReading(position, float(key[0]), int(np.sum(chosen)), sensor, *(float(mean[i]) for mean in means))
+                  for i, sensor in enumerate('xyz')]
+    return lines

@@ -1,0 +1,170 @@
+"""
+Static and dynamic runs in one least-squares system: bias, matrix row and lever arm of each accelerometer together.
+
+``f_i = b_i + m_i . (f + W r_i)`` (Zhang 2017, eq. 11-17, with the dot on the tangential term), SI units, body frame. The products
+``m_ij r_ik`` enter as columns of their own, so that one triangular factor of 13 columns is an exact summary of any number of samples;
+the nonlinear fit runs on it, for many draws of noise at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.errors import NotObservableError
+from imu_calibration.estimation.linear_least_squares import RANK_TOLERANCE, solve_linear, tolerance_scaled
+from imu_calibration.papers.zhang2017_designs import stack_runs
+
+PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
+"""Parameters of one accelerometer: m/s^2, 1, m."""
+TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
+"""0.1 mg, 0.1 mg/g, 0.1 mm."""
+
+
+def predict(runs, values):
+    """Return the readings of one accelerometer, shape (n_rows,), for parameters in `PARAM_NAMES` order."""
+    force, arm_matrix, _ = stack_runs(runs)
+    return values[0] + (force + arm_matrix @ values[4:]) @ values[1:4]
+
+
+def jacobian(runs, values):
+    """Return the derivative of the readings by `PARAM_NAMES`, each row over its noise sd, shape (n_rows, 7)."""
+    force, arm_matrix, noise = stack_runs(runs)
+    columns = [np.ones(len(force)), force + arm_matrix @ values[4:], np.einsum('j,njk->nk', values[1:4], arm_matrix)]
+    return np.column_stack(columns) / noise[:, None]
+
+
+def judge_design(runs, matrix, arms, tolerances=TOLERANCES):
+    """
+    Predict what a design can determine, one `ToleranceScaled` per accelerometer: sd over tolerance and weak directions.
+
+    An sd over tolerance above 1 means that the parameter must not be reported as a plain value.
+
+    """
+    return [tolerance_scaled(jacobian(runs, np.concatenate([[0.0], m, r])), tolerances) for m, r in zip(matrix, arms)]
+
+
+def weak_arms(judged):
+    """Return names such as 'r_xy' (sensor x, component y) of arms whose predicted sd exceeds the tolerance."""
+    return [f'r_{sensor}{PARAM_NAMES[k][-1]}' for sensor, one in zip('xyz', judged) for k in (4, 5, 6) if one.sd_over_tolerance[k] > 1]
+
+
+def arm_errors(runs, matrix_row, arm, rng, n_draws):
+    """Draw errors of one estimated arm from the covariance that the runs predict, m, shape (n_draws, 3)."""
+    factor = np.linalg.qr(jacobian(runs, np.concatenate([[0.0], matrix_row, arm])), mode='r')
+    return np.linalg.solve(factor, rng.normal(size=(len(PARAM_NAMES), n_draws))).T[:, 4:]
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Fit of one accelerometer for one or many draws of the readings."""
+
+    values: np.ndarray
+    """Parameters in `PARAM_NAMES` order, shape (n_draws, 7)."""
+    covariance: np.ndarray
+    """From the stated noise, at the solution, shape (n_draws, 7, 7)."""
+    chi2: np.ndarray
+    """Weighted residual sum of squares, shape (n_draws,)."""
+    dof: int
+    """Rows minus parameters."""
+    iterations: int
+    """Gauss-Newton steps taken."""
+
+    @property
+    def sd(self):
+        """Sd of the parameters, shape (n_draws, 7)."""
+        return np.sqrt(np.einsum('nii->ni', self.covariance))
+
+
+def fit_joint(runs, readings, start=None, max_iterations=30):
+    """
+    Fit bias, matrix row and arm of one accelerometer to static and dynamic runs jointly.
+
+    Parameters
+    ----------
+    runs : list of Run
+    readings : array, shape (n_rows,) or (n_rows, n_draws)
+        Rows in the order of the runs, m/s^2.
+    start : array, shape (7,), optional
+        Start values; if not given, the static solution of the runs at rest with no arm.
+
+    Returns
+    -------
+    JointFit
+
+    Raises
+    ------
+    NotObservableError
+        When the runs do not determine all parameters at an iterate; names the directions.
+
+    """
+    readings = np.asarray(readings, float).reshape(len(readings), -1)
+    orthogonal, factor, target = _reduce(runs, readings)
+    outside = np.sum((readings / stack_runs(runs)[2][:, None] - orthogonal @ target) ** 2, axis=0)
+    values = _static_start(runs, readings) if start is None else np.tile(np.asarray(start, float), (readings.shape[1], 1))
+    previous = np.inf
+    for iteration in range(1, max_iterations + 1):
+        slope, rest = _linearise(factor, target, values)
+        step, inverse = _solve_stack(slope, rest)
+        values = values + step
+        size = np.max(np.abs(step) / np.sqrt(np.einsum('nij,nij->ni', inverse, inverse)))
+        if size < 1e-9 and size >= 0.1 * previous or size == 0:
+            break
+        previous = size
+    slope, rest = _linearise(factor, target, values)
+    _, inverse = _solve_stack(slope, rest)
+    covariance = inverse @ np.swapaxes(inverse, 1, 2)
+    return JointFit(values, covariance, outside + np.sum(rest**2, axis=1), len(readings) - len(PARAM_NAMES), iteration)
+
+
+def fit_triad(runs, readings):
+    """Fit the three accelerometers of a recording, readings of shape (n_rows, 3); return matrix (3, 3), arms (3, 3), bias (3,), fits."""
+    fits = [fit_joint(runs, column) for column in np.asarray(readings, float).T]
+    values = np.array([fit.values[0] for fit in fits])
+    return values[:, 1:4], values[:, 4:], values[:, 0], fits
+
+
+def _reduce(runs, readings):
+    """Return Q, R and Q'y of the system with columns 1, f_j and W_jk; products m_j r_k are its last nine unknowns."""
+    force, arm_matrix, noise = stack_runs(runs)
+    lifted = np.column_stack([np.ones(len(force)), force, arm_matrix.reshape(len(force), 9)]) / noise[:, None]
+    orthogonal, factor = np.linalg.qr(lifted)
+    return orthogonal, factor, orthogonal.T @ (readings / noise[:, None])
+
+
+def _linearise(factor, target, values):
+    n_draws, matrix, arm = len(values), values[:, 1:4], values[:, 4:]
+    lifted = np.concatenate([values[:, :4], np.einsum('nj,nk->njk', matrix, arm).reshape(n_draws, 9)], axis=1)
+    slope = np.zeros((n_draws, 13, 7))
+    slope[:, :4, :4] = np.eye(4)
+    for j in range(3):
+        rows = slice(4 + 3 * j, 7 + 3 * j)
+        slope[:, rows, 1 + j] = arm
+        slope[:, rows, 4:] = matrix[:, j, None, None] * np.eye(3)
+    return factor @ slope, target.T - lifted @ factor.T
+
+
+def _solve_stack(slope, rest):
+    """Solve a stack of small least-squares problems by QR with scaled columns; return steps and inverse factors."""
+    norms = np.linalg.norm(slope, axis=1)
+    if np.any(norms == 0):
+        _refuse(slope[np.argmax(np.any(norms == 0, axis=1))])
+    orthogonal, triangle = np.linalg.qr(slope / norms[:, None, :])
+    smallest = np.min(np.abs(np.einsum('nii->ni', triangle)), axis=1)
+    if np.any(smallest < RANK_TOLERANCE):
+        _refuse(slope[np.argmin(smallest)])
+    inverse = np.linalg.inv(triangle) / norms[:, :, None]
+    return np.einsum('nij,nkj,nk->ni', inverse, orthogonal, rest), inverse
+
+
+def _refuse(slope):
+    solve_linear(slope, np.zeros(len(slope)), PARAM_NAMES)
+    raise NotObservableError('the runs must determine bias, matrix row and arm, got a system singular to rounding; add runs')
+
+
+def _static_start(runs, readings):
+    force, _, noise = stack_runs(runs)
+    still = np.concatenate([np.full(len(run.force), not (np.any(run.rate) or np.any(run.alpha))) for run in runs])
+    design = np.column_stack([np.ones(np.sum(still)), force[still]])
+    static = solve_linear(design, readings[still], PARAM_NAMES[:4], 1 / noise[still] ** 2).values
+    return np.concatenate([static.T, np.zeros((readings.shape[1], 3))], axis=1)

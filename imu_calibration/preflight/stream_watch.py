@@ -1,0 +1,105 @@
+"""How the streams of a live session are doing, by header stamps: rates, silence, what is being dropped."""
+
+from dataclasses import dataclass
+
+from imu_calibration.segmentation.window_cutter import dropped
+
+SILENT_AFTER = 2.0
+"""Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
+RECENT = 10.0
+"""Seconds for which a loss is called recent."""
+_MESSAGES = {'imu': 'Imu', 'joints': 'JointState'}
+GOOD, TROUBLE, SILENT = 'good', 'trouble', 'silent'
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """The state of all streams together."""
+
+    word: str
+    """'good', 'trouble' or 'silent'."""
+    message: str
+    """One line: what is wrong and what to do."""
+    values: dict
+    """Figures by name."""
+
+
+class StreamWatch:
+    """
+    Takes note of every block and says how the streams are.
+
+    Parameters
+    ----------
+    joints : bool
+        Whether joint states are needed.
+
+    """
+
+    def __init__(self, joints=True):
+        self._needed = ('imu', 'joints') if joints else ('imu',)
+        self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
+        self._newest = {}
+        self._arrived = {}
+        self._period = {}
+        self._lost, self._lost_at, self._recent, self._apart_since = {}, None, {}, None
+
+    @property
+    def last_arrival(self):
+        """When the last message came, s of the clock given to `note`; None before the first."""
+        return max(self._arrived.values(), default=None)
+
+    @property
+    def n_imu(self):
+        """Imu samples so far."""
+        return self._count['imu']
+
+    def note(self, block, now):
+        """Take a SampleBlock that arrived at `now`, s of a steady clock."""
+        for name in self._count:
+            samples = getattr(block, name)
+            if samples is None or not len(samples):
+                continue
+            first, last = int(samples.stamp_ns[0]), int(samples.stamp_ns[-1])
+            if len(samples) > 1 and last > first:
+                self._period[name] = (last - first) * 1e-9 / (len(samples) - 1)
+            self._count[name] += len(samples)
+            self._newest[name], self._arrived[name] = last, now
+
+    def note_counts(self, counts, now):
+        """Take the counts of what became of the samples."""
+        lost = dropped(counts)
+        grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
+        if grown:
+            self._recent, self._lost_at = grown, now
+        self._lost = lost
+
+    def _apart_for(self, lead, now):
+        """Return for how long the stamps of the streams have been apart, s; a fast replay sets them apart for moments."""
+        if abs(lead) <= SILENT_AFTER:
+            self._apart_since = None
+            return 0.0
+        self._apart_since = now if self._apart_since is None else self._apart_since
+        return now - self._apart_since
+
+    def state(self, now):
+        """Return the StreamState at `now`."""
+        values = {f'{name} messages': count for name, count in self._count.items()}
+        values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
+        values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
+        silent = [name for name in self._needed if now - self._arrived.get(name, float('-inf')) > SILENT_AFTER]
+        if silent and len(self._needed) == 1:
+            return StreamState(SILENT, 'Imu messages do not come; check the topic imu/data_raw', values)
+        if len(silent) == 2:
+            return StreamState(SILENT, 'neither Imu nor JointState messages come; check the topics imu/data_raw and joint_states', values)
+        if silent:
+            missing = {'imu': 'Imu messages do not come (imu/data_raw)',
+                       'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
+            return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
+        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
+        if self._apart_for(lead, now) > SILENT_AFTER:
+            ahead = 'ahead of' if lead > 0 else 'behind'
+            return StreamState(TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {ahead} the joint stamps; bring the clocks together', values)
+        if self._lost_at is not None and now - self._lost_at < RECENT:
+            lost = ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
+            return StreamState(TROUBLE, f'dropped lately: {lost}', values)
+        return StreamState(GOOD, f'{" and ".join(_MESSAGES[name] for name in self._needed)} messages come', values)

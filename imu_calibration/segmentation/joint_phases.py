@@ -1,0 +1,131 @@
+"""When the joints stand, turn steadily or change their rate, seen in noisy or quantised readings."""
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.special import ndtri
+
+from imu_calibration.reference.encoder import encoder_step
+
+STILL, STEADY, MOVING, LOST = 0, 1, 2, 3
+"""Phases: all joints at rest; all rates constant and one joint turning; anything else that moves; joints unknown."""
+RATE_SPAN = 0.2
+"""Rates are slopes over this time, s: long enough for encoders, short against `settling`."""
+LONGEST_SPAN = 1.0
+"""A rest or a steady turn must show over this time (or the shortest window, if that is less), s."""
+REACH = RATE_SPAN / 2 + LONGEST_SPAN
+"""Readings further away than this do not change a phase, s."""
+
+
+def joint_phases(time, position, settings, noise_rad=None):
+    """
+    Tell the phase of each joint reading of a stretch without gaps.
+
+    At rest: every slope over 0.2 s, and some slope over a second that contains the reading, is below `static_rate` plus what
+    noise and encoder steps can feign (four standard deviations; 1.5 steps over the span). Steady: within some second that
+    contains the reading the rates over 0.2 s change by less than `spin_rate_variation` of their middle, or by less than `static_rate`,
+    and the readings show no ripple about them.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, increasing.
+    position : array, shape (n, n_joints)
+        Joint angles without jumps by whole turns, rad.
+    settings : WindowSettings
+    noise_rad : float, optional
+        Known noise or resolution of the encoders, rad.
+
+    Returns
+    -------
+    phase : array of int8, shape (n,)
+        STILL, STEADY or MOVING.
+    level : array, shape (n, n_joints)
+        Positions averaged over 0.2 s, rad.
+
+    """
+    period = np.median(np.diff(time)) if len(time) > 1 else 1.0
+    rows = np.ascontiguousarray(position.T)
+    step, noise = (values[:, None] for values in _resolution(rows, noise_rad))
+    half = _half_width(RATE_SPAN, period, 2)
+    rate, level, ripple = _slopes(time, rows, half)
+    still = _slow(rate, settings.static_rate, half, period, step, noise)
+    if still.any():
+        long_half = _half_width(min(LONGEST_SPAN, settings.static_minimum), period, half)
+        long_rate, _, _ = _slopes(time, rows, long_half)
+        still &= _widened(_slow(long_rate, settings.static_rate, long_half, period, step, noise), long_half)
+    if still.all():
+        return np.full(len(time), STILL, np.int8), level.T
+    noise = np.maximum(np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None])
+    steady_half = _half_width(min(LONGEST_SPAN, settings.spin_minimum), period, half)
+    steady = _steady(rate, settings, steady_half, 4 * noise * _slope_gain(half, period), ripple, half, 3 * noise)
+    return np.where(still, STILL, np.where(steady, STEADY, MOVING)).astype(np.int8), level.T
+
+
+def _resolution(rows, noise_rad):
+    """Return the step of the encoders and the noise of the readings, both (n_joints,), rad."""
+    step = np.array([encoder_step(row) for row in rows])
+    # the lower quartile: readings at rest, where they are a quarter of all, have neither jitter nor jerk in them
+    return step, np.maximum(noise_rad or 0.0, _white_noise(rows, 0.25))
+
+
+def _white_noise(rows, quantile, chosen=None):
+    """Return the noise of the readings from a quantile of their fourth differences, (n_joints,); smooth motion drops out."""
+    fourth = np.abs(np.diff(rows, 4, axis=1))
+    fourth = fourth if chosen is None else fourth[:, chosen[2:-2]]
+    if fourth.shape[1] < 12:
+        return np.zeros(len(rows))
+    return np.quantile(fourth, quantile, axis=1) / (ndtri((1 + quantile) / 2) * np.sqrt(70))
+
+
+def _half_width(span, period, least):
+    return max(least, int(round(span / period / 2)))
+
+
+def _slope_gain(half, period):
+    """Return the standard deviation of a slope over ``2 half + 1`` readings for noise of one."""
+    n = 2 * half + 1
+    return np.sqrt(12 / n) / (n * period)
+
+
+def _slow(rate, static_rate, half, period, step, noise):
+    allowed = static_rate + 4 * noise * _slope_gain(half, period) + 1.5 * step / ((2 * half + 1) * period)
+    return np.all(np.abs(rate) <= allowed, axis=0)
+
+
+def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
+    size = 2 * half + 1
+    high, low = (f(rate, size, axis=1, mode='nearest') for f in (maximum_filter1d, minimum_filter1d))
+    change = np.maximum(settings.spin_rate_variation * np.abs(high + low) / 2, settings.static_rate)
+    # a rate that swings by `change` within the span moves the readings by this
+    swing = change * RATE_SPAN / (2 * np.pi)
+    rough = np.sqrt(np.maximum(uniform_filter1d(ripple ** 2, 2 * ripple_half + 1, axis=1, mode='nearest'), 0.0))
+    even = maximum_filter1d(rough - swing, size, axis=1, mode='nearest') <= noise
+    return _widened(np.all((high - low <= change + 2 * allowance) & even, axis=0), half)
+
+
+def _widened(mask, half):
+    return maximum_filter1d(mask.view(np.int8), 2 * half + 1, mode='constant').astype(bool)
+
+
+def _slopes(time, rows, half):
+    """Return least-squares slopes and means over ``2 half + 1`` readings, fewer at the ends, and what the readings differ from them."""
+    n = len(time)
+    half = min(half, n - 1)
+    place = np.arange(n)
+    count = np.minimum(place + half + 1, n) - np.maximum(place - half, 0)
+    middle = rows.mean(axis=1, keepdims=True)
+    t, p = time - time.mean(), rows - middle
+    sum_t, sum_tt = _window_sums(np.stack([t, t * t]), half)
+    sum_p, sum_tp = _window_sums(p, half), _window_sums(p * t, half)
+    spread = np.maximum(sum_tt - sum_t ** 2 / count, 1e-18)
+    slope = (sum_tp - sum_t * sum_p / count) / spread
+    return slope, sum_p / count + middle, p - sum_p / count - slope * (t - sum_t / count)
+
+
+def _window_sums(rows, half):
+    n = rows.shape[1]
+    sums = np.empty((len(rows), n + 2 * half + 1))
+    sums[:, :half + 1] = 0.0
+    np.cumsum(rows, axis=1, out=sums[:, half + 1:half + 1 + n])
+    sums[:, half + 1 + n:] = sums[:, half + n, None]
+    return sums[:, 2 * half + 1:] - sums[:, :n]

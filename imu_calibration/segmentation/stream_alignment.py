@@ -1,0 +1,221 @@
+"""Streams brought together, chunk by chunk of a fixed grid in time: the joints at the IMU's stamps and what they do."""
+
+import numpy as np
+
+from imu_calibration.segmentation import joint_phases
+from imu_calibration.segmentation.joint_phases import LOST, STILL
+from imu_calibration.segmentation.joint_run import LEAST_READINGS, JointRun
+from imu_calibration.segmentation.quiet_detector import REACH, quiet_samples
+from imu_calibration.segmentation.sample_buffer import SampleBuffer
+from imu_calibration.segmentation.window import PhasedSamples
+
+JOINT_WAIT = 60.0
+"""The IMU or the joints may be ahead of each other by this much before the missing ones are given up, s."""
+TEMPERATURE_WAIT = 5.0
+"""Temperature may come later than the IMU by this much, s."""
+_LEAST_MARGIN = max(joint_phases.REACH, REACH) + 0.4
+NEVER = 1 << 62
+
+
+class MotionChunks:
+    """
+    One epoch of the clock: takes samples as they come and hands out `PhasedSamples`, in order.
+
+    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the first IMU sample. What
+    comes out depends on samples within the chunk and a margin only, and a chunk is worked on when all streams have passed
+    its margin (or are given up), so the cut of the streams into blocks plays no role. The waiting times bound the memory.
+    """
+
+    def __init__(self, settings, noise_rad, floor):
+        self.counts = {}
+        self.time_origin = 0.0
+        self._settings, self._noise_rad, self._floor = settings, noise_rad, floor
+        self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
+        self.margin = max(settings.overlap, _LEAST_MARGIN)
+        self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
+        self._start_ns = None
+        self._first_joint_ns = None
+        self._chunk = 0
+        self._previous_ns = None
+        self._after_loss = False
+
+    @property
+    def short_rest(self):
+        """Length of the rests that have a curve of the joints throughout, s."""
+        return min(self._settings.settling + self._settings.static_minimum, self.margin)
+
+    @property
+    def n_buffered(self):
+        """Samples held, of all streams."""
+        return sum(len(buffer) for buffer in (self._imu, self._joints, self._temperature))
+
+    @property
+    def end_time(self):
+        """Session time at the newest IMU sample, s."""
+        return self.time_origin if self._imu.newest_ns is None else self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
+
+    def add(self, imu=None, joints=None, temperature=None):
+        """Take cleaned samples, each stream in the order of its stamps."""
+        if imu is not None and len(imu):
+            if self._start_ns is None:
+                self._start_ns = int(imu.stamp_ns[0])
+            self._imu.add(self._not_late(imu, 'late IMU sample'))
+        if joints is not None and len(joints):
+            if self._first_joint_ns is None:
+                self._first_joint_ns = int(joints.stamp_ns[0])
+            self._joints.add(self._not_late(joints, None))
+        if temperature is not None and len(temperature):
+            self._temperature.add(temperature)
+
+    def take(self, final=False):
+        """Yield the chunks that can be worked on (all with `final`) as `PhasedSamples` without those that have no joints."""
+        if self._start_ns is not None:
+            passed = np.inf if final else self._passed_ns()
+            while self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed and self._advance(passed, final):
+                chunk = self._work(self._next_start_ns(), final)
+                self._chunk += 1
+                if chunk is not None:
+                    yield chunk
+        self._forget()
+
+    def joints_left(self):
+        """Return the joint samples that are still held, or None."""
+        return self._joints.between(-NEVER, NEVER)
+
+    def _next_start_ns(self):
+        return self._start_ns + self._chunk * self._chunk_ns
+
+    def _passed_ns(self):
+        """Return the stamp that all streams have passed or will never pass."""
+        imu, joints, temperature = (-NEVER if b.newest_ns is None else b.newest_ns for b in (self._imu, self._joints, self._temperature))
+        given_up = _ns(JOINT_WAIT)
+        imu, joints = max(imu, joints - given_up), max(joints, imu - given_up)
+        return min(imu, joints, max(temperature, imu - _ns(TEMPERATURE_WAIT)))
+
+    def _advance(self, passed, final):
+        """Go to the next chunk that has IMU samples; False when there is none yet."""
+        oldest = self._imu.first_from(self._next_start_ns())
+        if oldest is None:
+            if not final:
+                self._chunk = max(self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns))
+            return False
+        self._chunk = (oldest - self._start_ns) // self._chunk_ns
+        return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
+
+    def _not_late(self, samples, reason):
+        """Return `samples` without those that belong to chunks already worked on."""
+        if self._start_ns is None or self._chunk == 0:
+            return samples
+        late = int(np.searchsorted(samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)))
+        if reason:
+            self._count(reason, late)
+        return samples.select(slice(late, None)) if late else samples
+
+    def _forget(self):
+        if self._start_ns is not None:
+            oldest = self._next_start_ns() - self._margin_ns
+        elif self._joints.newest_ns is not None:
+            oldest = self._joints.newest_ns - _ns(JOINT_WAIT)
+        else:
+            oldest = (self._temperature.newest_ns or 0) - _ns(JOINT_WAIT)
+        for buffer, keep_one in ((self._imu, False), (self._joints, False), (self._temperature, True)):
+            buffer.forget_before(oldest, keep_one)
+
+    def _count(self, reason, number):
+        if number:
+            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+
+    def _work(self, start_ns, final):
+        """Return the chunk from `start_ns` on, or None when nothing in it can be used."""
+        stop_ns = start_ns + self._chunk_ns
+        imu = self._imu.between(start_ns - self._margin_ns, stop_ns + self._margin_ns)
+        core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
+        time = (imu.stamp_ns - self._start_ns) / 1e9
+        period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
+        runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
+        phase, level, joint_step = self._phases(time, runs, final)
+        quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor,
+                              phase == STILL)
+        after_gap = self._after_gaps(imu.stamp_ns[core], limit)
+        motion = np.zeros((4,) + level[core].shape)
+        motion[0] = level[core]
+        self._draw_curves(motion, time[core], phase[core], runs)
+        temperature = self._temperatures(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        return self._without_lost(PhasedSamples(
+            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, temperature, phase[core],
+            quiet[core], after_gap, np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
+
+    def _joint_runs(self, first_ns, last_ns, period):
+        """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
+        joints = self._joints.between(first_ns, last_ns)
+        limit = max(self._settings.gap, 5 * period)
+        if joints is None or not len(joints):
+            return [], limit
+        time = (joints.stamp_ns - self._start_ns) / 1e9
+        step = np.diff(time)
+        joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
+        bounds = np.concatenate([[0], np.flatnonzero(step > joint_limit) + 1, [len(time)]])
+        runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], self._settings, self._noise_rad)
+                for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= LEAST_READINGS]
+        return runs, limit
+
+    def _phases(self, time, runs, final):
+        """Return the phase of each IMU sample, the level of the joints there and the steps of their encoders."""
+        phase = np.full(len(time), LOST, np.int8)
+        level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
+        steps = np.zeros(level.shape)
+        for k, run in enumerate(runs):
+            first = self._first_joint_ns is not None and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
+            inside = run.covered(time, before=first, after=final and k == len(runs) - 1)
+            phase[inside], level[inside] = run.at(time[inside])
+            steps[inside] = run.step
+        return phase, level, steps
+
+    def _draw_curves(self, motion, time, phase, runs):
+        """Put the joints' motion on the samples near which joints move."""
+        for run in runs:
+            need = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
+            if not len(need):
+                continue
+            parts = np.split(need, np.flatnonzero(np.diff(time[need]) > 2 * self._settings.overlap) + 1)
+            for part in parts:
+                stretch = slice(part[0], part[-1] + 1)
+                curve = run.curve(time[stretch], self._settings.overlap, self._noise_rad)
+                for target, values in zip(motion, (curve.position, curve.rate, curve.acceleration, curve.jerk), strict=True):
+                    target[stretch] = values
+
+    def _after_gaps(self, stamp_ns, limit):
+        before = stamp_ns[0] - (1 << 40) if self._previous_ns is None else self._previous_ns
+        self._previous_ns = int(stamp_ns[-1])
+        return np.diff(np.concatenate([[before], stamp_ns])) > _ns(limit)
+
+    def _temperatures(self, stamp_ns, last_ns):
+        readings = self._temperature.between(-NEVER, last_ns)
+        if readings is None or not len(readings):
+            return np.full(len(stamp_ns), np.nan)
+        return np.interp((stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9, readings.temperature_c)
+
+    def _at_edge(self, stamp_ns, limit, final):
+        """Tell which samples are so close before the first joint state or after the last that nothing is missing."""
+        if self._first_joint_ns is None:
+            return np.zeros(len(stamp_ns), bool)
+        edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))
+        if final and self._joints.newest_ns is not None:
+            edge |= (stamp_ns > self._joints.newest_ns) & (stamp_ns <= self._joints.newest_ns + _ns(limit))
+        return edge
+
+    def _without_lost(self, samples, edge):
+        lost = samples.phase == LOST
+        before = np.concatenate([[self._after_loss], lost[:-1]])
+        self._after_loss = bool(lost[-1])
+        samples.after_gap[before] = True
+        samples.after_loss[before] = True
+        if not lost.any():
+            return samples
+        self._count('no joint state', np.count_nonzero(lost & ~edge))
+        self._count('edge of joints', np.count_nonzero(lost & edge))
+        return None if lost.all() else samples.select(~lost)
+
+
+def _ns(seconds):
+    return int(round(seconds * 1e9))

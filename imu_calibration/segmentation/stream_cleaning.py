@@ -1,0 +1,218 @@
+"""One stream of stamped samples, cleaned: what cannot be used is dropped with a count, and the stamps are described."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+
+_SECOND = 1_000_000_000
+BACKWARD_RESET_NS = _SECOND
+"""A larger step back is a new setting of the clock, a smaller one a sample that came late."""
+FORWARD_RESET_NS = 3600 * _SECOND
+"""A larger step ahead is a new setting of the clock as well (a computer that learns the date after start-up)."""
+_NEEDED = {ImuSamples: ('force_s', 'rate_s'), JointSamples: ('position',), TemperatureSamples: ('temperature_c',)}
+
+
+class StreamCheck:
+    """
+    Cleans one stream; the outcome does not depend on how it is cut into pieces.
+
+    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays: where stamps are
+    whole milliseconds a second reading belongs to a later, unknown instant), 'backward stamp' (a sample that came late)
+    and 'stray stamp' (one sample far from both neighbours). 'clock reset' counts the jumps, each of which starts a new epoch.
+    """
+
+    def __init__(self):
+        self.counts = {}
+        self.epoch = 0
+        self._steps = StepHistogram()
+        self._n_accepted = 0
+        self._span_ns = 0
+        self._newest = None
+        self._before_held = None
+        self._held = None
+
+    def push(self, samples):
+        """Return a list of (epoch, samples) that are accepted; the last sample is held while it may be a stray."""
+        if samples is None or not len(samples):
+            return []
+        return self._accept(self._without_strays(self._finite(samples)))
+
+    def finish(self):
+        """Return what was held, as `push` does."""
+        held, self._held = self._held, None
+        return [] if held is None else self._accept(held)
+
+    def statistics(self, gap=0.1):
+        """
+        Return the `StreamStatistics` of what was accepted until now.
+
+        Parameters
+        ----------
+        gap : float
+            Steps longer than this, and than five median periods, are counted as gaps, s.
+
+        """
+        period = self._steps.median()
+        return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, period, self._steps.common_step_ns,
+                                *self._steps.longer_than(max(gap, 5 * period)))
+
+    def _count(self, reason, number):
+        if number:
+            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+
+    def _finite(self, samples):
+        columns = [getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]]
+        if all(np.isfinite(column).all() for column in columns):
+            return samples
+        finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
+        self._count('not finite', len(finite) - np.count_nonzero(finite))
+        return samples.select(finite)
+
+    def _without_strays(self, samples):
+        if self._held is not None:
+            samples, self._held = type(samples).concatenate([self._held, samples]), None
+        if not len(samples):
+            return samples
+        started = self._before_held is not None
+        stamps = np.concatenate([[self._before_held], samples.stamp_ns]) if started else samples.stamp_ns
+        step = np.diff(stamps)
+        far = np.abs(step) > BACKWARD_RESET_NS
+        stray = np.zeros(len(stamps), bool)
+        stray[1:-1] = far[:-1] & far[1:] & (np.abs(step[:-1] + step[1:]) < np.minimum(np.abs(step[:-1]), np.abs(step[1:])))
+        if not started and len(step):
+            stray[0] = _is_reset(step[0])
+        stray = stray[started:]
+        undecided = far[-1] if len(step) else True
+        if undecided:
+            self._held = samples.select(slice(len(samples) - 1, None))
+            samples, stray = samples.select(slice(0, len(samples) - 1)), stray[:-1]
+        if len(samples):
+            self._before_held = samples.stamp_ns[-1]
+        self._count('stray stamp', np.count_nonzero(stray))
+        return samples.select(~stray) if stray.any() else samples
+
+    def _accept(self, samples):
+        accepted = []
+        while len(samples):
+            stamps = samples.stamp_ns
+            newest = stamps[0] - 1 if self._newest is None else self._newest
+            before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
+            reset = _is_reset(stamps - before)
+            end = int(np.argmax(reset)) if reset.any() else len(stamps)
+            if end:
+                accepted.append((self.epoch, self._in_order(samples.select(slice(0, end)), before[:end])))
+            if end < len(stamps):
+                self._count('clock reset', 1)
+                self.epoch, self._newest = self.epoch + 1, None
+            samples = samples.select(slice(end, None))
+        return accepted
+
+    def _in_order(self, samples, before):
+        stamps = samples.stamp_ns
+        self._count('repeated stamp', np.count_nonzero(stamps == before))
+        self._count('backward stamp', np.count_nonzero(stamps < before))
+        keep = stamps > before
+        samples = samples if keep.all() else samples.select(keep)
+        if len(samples):
+            joined = samples.stamp_ns if self._newest is None else np.concatenate([[self._newest], samples.stamp_ns])
+            self._steps.add(np.diff(joined))
+            self._span_ns += int(joined[-1] - joined[0])
+            self._newest = joined[-1]
+            self._n_accepted += len(samples)
+        return samples
+
+
+def _is_reset(step):
+    return (step < -BACKWARD_RESET_NS) | (step > FORWARD_RESET_NS)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamStatistics:
+    """What can be said about the stamps of one stream."""
+
+    count: int
+    """Samples accepted."""
+    dropped: dict
+    """Reason -> number of samples dropped ('clock reset': number of jumps, which drop nothing)."""
+    duration: float
+    """From the first to the last accepted sample, epochs added, s."""
+    period: float
+    """Median step between stamps, s; 0 with fewer than two samples."""
+    stamp_step_ns: int
+    """Greatest common divisor of the steps between stamps, ns (1000000: whole milliseconds); 0 when unknown."""
+    n_gaps: int
+    """Number of gaps."""
+    gap_total: float
+    """Their total length, s."""
+    longest_step: float
+    """Longest step between stamps, a gap or not, s."""
+
+    @property
+    def rate(self):
+        """Samples per second between gaps, 0 when unknown."""
+        return 1.0 / self.period if self.period > 0 else 0.0
+
+
+def clean_samples(samples, gap=0.1):
+    """
+    Clean a whole recording of one stream.
+
+    Returns
+    -------
+    list of samples
+        One item per epoch of the clock, in order, without empty ones.
+    StreamStatistics
+        What was dropped and how the stamps look.
+
+    """
+    check = StreamCheck()
+    pieces = check.push(samples) + check.finish()
+    epochs = [type(samples).concatenate([part for number, part in pieces if number == epoch]) for epoch in sorted({n for n, _ in pieces})]
+    return [part for part in epochs if len(part)], check.statistics(gap)
+
+
+_BINS_PER_E = 100
+
+
+_N_BINS = 4500
+"""One per cent wide, up to the longest step that 64 bits of nanoseconds hold."""
+
+
+_FINE_STEP_NS = 100
+
+
+class StepHistogram:
+    """Numbers and sums of steps in bins of equal ratio; adding pieces in any order gives the same numbers."""
+
+    def __init__(self):
+        self.common_step_ns = 0
+        self._number = np.zeros(_N_BINS, np.int64)
+        self._sum_ns = np.zeros(_N_BINS, np.int64)
+        self._longest_ns = 0
+
+    def add(self, step_ns):
+        """Add steps, int64, ns, all positive."""
+        if not len(step_ns):
+            return
+        index = (np.log(step_ns) * _BINS_PER_E).astype(np.int64)
+        np.add.at(self._number, index, 1)
+        np.add.at(self._sum_ns, index, step_ns)
+        self._longest_ns = max(self._longest_ns, int(step_ns.max()))
+        if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
+            self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
+
+    def median(self):
+        """Return the median step to one per cent (exact when the steps are equal), s; 0 without steps."""
+        total = self._number.sum()
+        if total == 0:
+            return 0.0
+        middle = np.searchsorted(np.cumsum(self._number), (total + 1) // 2)
+        return float(self._sum_ns[middle] / self._number[middle] / 1e9)
+
+    def longer_than(self, gap):
+        """Return number and total (s) of the steps longer than `gap` s, bin by bin, and the longest step (s)."""
+        filled = np.maximum(self._number, 1)
+        longer = self._sum_ns / filled > gap * 1e9
+        return int(self._number[longer].sum()), float(self._sum_ns[longer].sum() / 1e9), self._longest_ns / 1e9

@@ -1,0 +1,102 @@
+"""What a window is, and how samples become one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.samples import _Columns
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A stretch of samples of one kind, without gaps."""
+
+    kind: str
+    """'static', 'spin', 'dynamic' or 'unused'."""
+    stamp_ns: np.ndarray
+    """Header stamps, int64, shape (n,)."""
+    time: np.ndarray
+    """Seconds since the session's first IMU sample, shape (n,); goes on where a clock was set back."""
+    force_s: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Measured angular rate, rad/s, shape (n, 3)."""
+    motion: JointMotion
+    """The joints at the IMU's stamps; one row for 'static': mean position, and rates of zero unless the joints clearly creep."""
+    temperature_c: np.ndarray | None = None
+    """Temperature at the samples, degrees Celsius, shape (n,), or None."""
+    reason: str = ''
+    """Why the window is 'unused'."""
+    joint_step: np.ndarray | None = None
+    """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
+
+    def __len__(self):
+        return len(self.time)
+
+    @property
+    def period(self):
+        """Median sampling period, s; 0 for one sample."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
+
+    @property
+    def noise_sd(self):
+        """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion drops out."""
+        second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
+        return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class PhasedSamples(_Columns):
+    """IMU samples with what the joints do at that time."""
+
+    stamp_ns: np.ndarray
+    """Header stamps, shape (n,)."""
+    time: np.ndarray
+    """Session time, s, shape (n,)."""
+    force_s: np.ndarray
+    """Shape (n, 3)."""
+    rate_s: np.ndarray
+    """Shape (n, 3)."""
+    position: np.ndarray
+    """Joint angles, shape (n, n_joints); the three below are their derivatives, zero where the joints rest."""
+    joint_rate: np.ndarray
+    """Shape (n, n_joints)."""
+    acceleration: np.ndarray
+    """Shape (n, n_joints)."""
+    jerk: np.ndarray
+    """Shape (n, n_joints)."""
+    temperature_c: np.ndarray
+    """NaN where unknown, shape (n,)."""
+    phase: np.ndarray
+    """STILL, STEADY or MOVING, shape (n,)."""
+    quiet: np.ndarray
+    """Whether the IMU is as quiet as at rest, shape (n,)."""
+    after_gap: np.ndarray
+    """Whether a window cannot go on from the sample before, shape (n,)."""
+    after_loss: np.ndarray
+    """Whether the joints were unknown just before, shape (n,)."""
+    joint_step: np.ndarray
+    """Steps of the encoders, rad, zero where none show, shape (n, n_joints)."""
+
+
+def make_window(samples, kind, reason=''):
+    """Return the `Window` of a kind that holds all of `samples`."""
+    temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
+    moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk)
+    motion = _mean_motion(samples) if kind == 'static' else moving
+    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason, samples.joint_step.max(axis=0))
+
+
+def _mean_motion(samples):
+    """Return one row: the mean position and, when a straight line explains the readings and noise does not, its slope."""
+    mean = samples.position.mean(axis=0)
+    some = slice(None, None, max(1, len(samples) // 500))  # the levels are averages over 0.2 s, so these say as much as all
+    time, position = samples.time[some] - samples.time[some].mean(), samples.position[some] - mean
+    slope = time @ position / max(time @ time, 1e-12)
+    rest = (position - time[:, None] * slope).std(axis=0)
+    distance = np.abs(slope) * (time[-1] - time[0])
+    # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
+    slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
+    zero = np.zeros((1, len(mean)))
+    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero)

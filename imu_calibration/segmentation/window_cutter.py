@@ -1,0 +1,176 @@
+"""From samples with phases to windows: short runs are joined, settling and knocks kept out, long windows cut."""
+
+import numpy as np
+
+from imu_calibration.segmentation.joint_phases import MOVING, STEADY, STILL
+from imu_calibration.segmentation.window import PhasedSamples, make_window
+
+UNUSED, STATIC, SPIN, DYNAMIC = 0, 1, 2, 3
+_KINDS = ('unused', 'static', 'spin', 'dynamic')
+
+
+class WindowCutter:
+    """
+    Turns samples, in order and in any pieces, into windows; holds back a few window lengths at most.
+
+    Decides in three steps, each of which waits only for what it needs:
+    runs of one phase that are too short for it become motion, samples get a kind, runs of one kind become windows.
+    """
+
+    def __init__(self, settings, short_rest, keep_unused=False):
+        self.counts = {}
+        self._settings, self._short_rest, self._keep_unused = settings, short_rest, keep_unused
+        self._waiting = None
+        self._phase_before = None
+        self._disturbed = self._ramped = -np.inf
+        self._open = None
+
+    @property
+    def n_waiting(self):
+        """Samples held."""
+        return (0 if self._waiting is None else len(self._waiting)) + (0 if self._open is None else len(self._open[0]))
+
+    def push(self, samples, final=False):
+        """Take the next samples (or None) and return the windows that are complete; with `final` all that is left."""
+        windows = []
+        if self._waiting is not None:
+            samples = self._waiting if samples is None else PhasedSamples.concatenate([self._waiting, samples])
+            self._waiting = None
+        if samples is not None and len(samples):
+            windows += self._cut(*self._decided(samples, final))
+        if final and self._open is not None:
+            windows += self._close(*self._open)
+            self._open = None
+        return windows
+
+    def _decided(self, samples, final):
+        """Return the samples whose phase is final, and that phase; keep the rest waiting."""
+        starts, stops = _runs(samples.phase, samples.after_gap)
+        time, settings = samples.time, self._settings
+        phase = samples.phase.copy()
+        original = samples.phase[starts]
+        before = np.concatenate([[-1 if self._phase_before is None else self._phase_before], original[:-1]])
+        before[samples.after_gap[starts]] = -1
+        decided = len(samples)
+        for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
+            is_open = k == len(starts) - 1 and not final
+            length = time[stop - 1] - time[start]
+            needed = self._short_rest if original[k] == STILL else settings.spin_minimum + (settings.settling if before[k] >= 0 else 0.0)
+            goes_on = before[k] == original[k]  # the part before was long enough already
+            if original[k] == MOVING or goes_on or length > needed:
+                continue
+            if is_open:
+                decided = start
+            elif original[k] == STEADY or _between_motion(k, before, original, samples.after_gap, stop):
+                phase[start:stop] = MOVING
+        if decided < len(samples):
+            self._waiting = samples.select(slice(decided, None))
+        if decided:
+            self._phase_before = samples.phase[decided - 1]
+        return samples.select(slice(0, decided)), phase[:decided]
+
+    def _cut(self, samples, phase):
+        if not len(samples):
+            return []
+        kind, reason = self._kinds(samples, phase)
+        after_gap = samples.after_gap.copy()
+        if self._open is not None:
+            before, kind_before, reason_before = self._open
+            samples = PhasedSamples.concatenate([before, samples])
+            kind, reason = np.concatenate([kind_before, kind]), np.concatenate([reason_before, reason])
+            after_gap = samples.after_gap
+        starts, stops = _runs(kind * 8 + reason, after_gap)
+        windows = []
+        for start, stop in zip(starts, stops, strict=True):
+            cut_off, start = self._shed(samples, start, stop, kind[start], reason[start])
+            windows += cut_off
+            rest = samples.select(slice(start, stop)), kind[start:stop], reason[start:stop]
+            if stop < len(samples):
+                windows += self._close(*rest)
+        self._open = rest
+        return windows
+
+    def _shed(self, samples, start, stop, kind, reason):
+        """Cut whole windows off a run while it is twice as long as a window, open or not: so arrival plays no role."""
+        windows, longest = [], self._longest(kind)
+        while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
+            cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
+            windows += self._finished(samples.select(slice(start, cut)), kind, reason)
+            start = cut
+        return windows, start
+
+    def _kinds(self, samples, phase):
+        time, settings = samples.time, self._settings
+        unknown = samples.after_loss
+        calm_rest = (phase == STILL) & samples.quiet & ~unknown
+        steady = (phase == STEADY) & ~unknown
+        rested = time - self._last_time(time, ~calm_rest, '_disturbed') >= settings.settling
+        settled = time - self._last_time(time, ~steady, '_ramped') >= settings.settling
+        kind = np.full(len(time), DYNAMIC, np.int8)
+        reason = np.zeros(len(time), np.int8)
+        for at_phase, good, wanted in ((STILL, rested, STATIC), (STEADY, settled, SPIN)):
+            kind[phase == at_phase] = np.where(good[phase == at_phase], wanted, UNUSED)
+        reason[kind == UNUSED] = _SETTLING
+        reason[(kind == UNUSED) & (phase == STILL) & ~samples.quiet] = _NOT_QUIET
+        early = time < settings.turn_on
+        kind[early], reason[early] = UNUSED, _TURN_ON
+        return kind, reason
+
+    def _last_time(self, time, event, name):
+        """Return the time of the last event at or before each sample, and remember the last one under `name`."""
+        last = np.maximum.accumulate(np.where(event, time, getattr(self, name)))
+        setattr(self, name, last[-1])
+        return last
+
+    def _close(self, samples, kind, reason):
+        """Return the windows of a whole run of one kind, cut into equal pieces of at most the longest length."""
+        length = samples.time[-1] - samples.time[0]
+        pieces = max(1, int(np.ceil(length / self._longest(kind[0]))))
+        bounds = np.linspace(0, len(samples), pieces + 1).astype(int)
+        windows = []
+        for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+            windows += self._finished(samples.select(slice(start, stop)), kind[0], reason[0])
+        return windows
+
+    def _least(self, kind):
+        settings = self._settings
+        return {UNUSED: 0.0, STATIC: settings.static_minimum, SPIN: settings.spin_minimum, DYNAMIC: settings.dynamic_minimum}[kind]
+
+    def _longest(self, kind):
+        # halves of a window that is a little too long must still be long enough
+        return max(self._settings.window_maximum, 2 * self._least(kind))
+
+    def _finished(self, samples, kind, reason):
+        n = len(samples)
+        length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
+        if length < self._least(kind) or (kind != UNUSED and n < _LEAST_SAMPLES):
+            kind, reason = UNUSED, _TOO_SHORT
+        key = _REASONS[reason] if kind == UNUSED else _KINDS[kind]
+        self.counts[key] = self.counts.get(key, 0) + n
+        return [make_window(samples, _KINDS[kind], _REASONS[reason])] if kind != UNUSED or self._keep_unused else []
+
+
+_REASONS = ('', 'settling', 'not quiet', 'turn-on', 'too short')
+_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT = 1, 2, 3, 4
+_LEAST_SAMPLES = 5
+
+
+def _runs(value, broken):
+    """Return starts and stops of runs of equal values that are not broken."""
+    begins = np.concatenate([[True], (value[1:] != value[:-1]) | broken[1:]])
+    starts = np.flatnonzero(begins)
+    return starts, np.append(starts[1:], len(value))
+
+
+def _between_motion(k, before, original, after_gap, stop):
+    follows = k + 1 < len(original) and not after_gap[stop]
+    return before[k] in (STEADY, MOVING) and follows
+
+
+ACCEPTED = ('static', 'spin', 'dynamic', 'settling', 'not quiet', 'turn-on', 'too short', 'edge of joints')
+"""Counts of samples that arrived whole; the last five are kept out of windows on purpose."""
+
+
+def dropped(counts):
+    """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
+    return {reason: int(count) for reason, count in sorted(counts.items()) if count and reason not in ACCEPTED}

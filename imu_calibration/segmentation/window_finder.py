@@ -1,0 +1,218 @@
+"""Windows from streams: what comes in blocks goes out as static, spinning and dynamic windows with the joints' motion."""
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.segmentation.quiet_detector import QuietFloor
+from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.segmentation.stream_alignment import JOINT_WAIT, MotionChunks
+from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window_cutter import WindowCutter
+from imu_calibration.segmentation.window_settings import WindowSettings
+
+__all__ = ['MotionGatherer', 'Window', 'find_still']
+
+_STREAMS = ('imu', 'joints', 'temperature')
+_BATCH = 200  # samples that are taken in together: cleaning has a fixed cost per call
+
+
+class MotionGatherer:
+    """
+    Turns streams into windows, in bounded memory; the outcome does not depend on how the streams are cut into blocks.
+
+    Cleaning is done by `stream_check.StreamCheck`, one per stream; `motion_chunks.MotionChunks` brings the joints to the
+    IMU's stamps; `window_cutting.WindowCutter` makes the windows. A clock that is set back starts again with the first two.
+    Streams may be late against each other by a minute (temperature: five seconds); what comes later is not used.
+
+    Parameters
+    ----------
+    table : Table or None
+        Gives the names of the joints and their noise; None takes the joints as they come.
+    settings : WindowSettings
+    keep_unused : bool
+        Also return windows of kind 'unused', so that every accepted sample is in exactly one window, in order.
+
+    """
+
+    def __init__(self, table, settings=WindowSettings(), keep_unused=False):
+        self._names = () if table is None else tuple(table.joint_names)
+        self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
+        self._checks = {name: StreamCheck() for name in _STREAMS}
+        self._raw = {name: [] for name in _STREAMS}
+        self._n_new = 0
+        self._queue = {name: [] for name in _STREAMS}
+        self._epoch_shift = dict.fromkeys(_STREAMS, 0)
+        self._turns = _Unwrapper()
+        self._floor = QuietFloor()
+        self._lost_counts = {}
+        self._epoch = 0
+        self._chunks = MotionChunks(settings, self._noise_rad, self._floor)
+        self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
+
+    @property
+    def n_buffered(self):
+        """Samples held at the moment; stays bounded however long the session."""
+        waiting = sum(len(part) for name in _STREAMS for _, part in self._queue[name])
+        raw = sum(len(part) for name in _STREAMS for part in self._raw[name])
+        return raw + waiting + self._chunks.n_buffered + self._cutter.n_waiting
+
+    @property
+    def counts(self):
+        """
+        Return reason -> number of samples.
+
+        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short': accepted, but in no window.
+        'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
+        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What blocks report as dropped is not in here.
+        """
+        self._take_in()
+        counts = {}
+        for name in _STREAMS:
+            _add_counts(counts, {f'{name} {reason}': number for reason, number in self._checks[name].counts.items()})
+        for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
+            _add_counts(counts, source)
+        return counts
+
+    def streams(self):
+        """Return stream name -> `StreamStatistics` ('imu', 'joints', 'temperature')."""
+        self._take_in()
+        return {name: check.statistics(self._settings.gap) for name, check in self._checks.items()}
+
+    def push(self, block):
+        """
+        Take a block and return the windows that are complete now.
+
+        Raises
+        ------
+        InputError
+            When the joints of the block are not those of the table.
+
+        """
+        for name in _STREAMS:
+            samples = getattr(block, name)
+            if samples is not None and len(samples):
+                self._raw[name].append(self._with_table_joints(samples) if name == 'joints' else samples)
+                self._n_new += len(samples)
+        if self._n_new < _BATCH:
+            return []
+        self._n_new = 0
+        self._take_in()
+        return self._work()
+
+    def finish(self):
+        """Return the remaining windows; after this nothing more may be pushed."""
+        self._take_in()
+        for name in _STREAMS:
+            self._enqueue(name, self._checks[name].finish())
+        windows = self._work()
+        while any(epoch > self._epoch for name in _STREAMS for epoch, _ in self._queue[name]):
+            windows += self._next_epoch() + self._work()
+        return windows + self._end_epoch() + self._cutter.push(None, final=True)
+
+    def _with_table_joints(self, joints):
+        if not self._names or not joints.names or tuple(joints.names) == self._names:
+            return joints
+        missing = [name for name in self._names if name not in joints.names]
+        if missing:
+            raise InputError(f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
+                             'correct the names in the table or choose another joint topic')
+        order = [joints.names.index(name) for name in self._names]
+        return JointSamples(joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names)
+
+    def _take_in(self):
+        """Clean what was pushed and queue it by epoch."""
+        kinds = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+        for name in _STREAMS:
+            if self._raw[name]:
+                blocks, self._raw[name] = self._raw[name], []
+                self._enqueue(name, self._checks[name].push(blocks[0] if len(blocks) == 1 else kinds[name].concatenate(blocks)))
+
+    def _enqueue(self, name, accepted):
+        for epoch, samples in accepted:
+            if name == 'joints':
+                samples = self._turns.unwrap(samples)
+            if len(samples):
+                self._queue[name].append((epoch + self._epoch_shift[name], samples))
+
+    def _work(self):
+        """Hand on what belongs to this epoch; go to the next one when the streams have."""
+        windows = []
+        while True:
+            for name in _STREAMS:
+                for epoch, part in self._queue[name]:
+                    if epoch == self._epoch:  # what is left of an earlier one came after its end: a temperature, too late
+                        self._chunks.add(**{name: part})
+                self._queue[name] = [(epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch]
+            windows += self._cut(self._chunks.take())
+            if not self._epoch_is_over():
+                self._forget_temperature()
+                return windows
+            windows += self._next_epoch()
+
+    def _epoch_is_over(self):
+        """Tell whether IMU and joints both had their clock set back, or one had and the other did not follow in time."""
+        queues = [self._queue['imu'], self._queue['joints']]
+        return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
+
+    def _next_epoch(self):
+        windows = self._end_epoch()
+        old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floor)
+        self._chunks.time_origin = old.end_time + self._settings.gap
+        _add_counts(self._lost_counts, old.counts)
+        self._epoch += 1
+        if not (self._queue['imu'] and self._queue['joints']):
+            self._follow(old)
+        return windows
+
+    def _follow(self, old):
+        """Let streams whose clock was not set back go on in the new epoch: one clock moved, the others did not."""
+        if not self._queue['joints']:
+            self._chunks.add(joints=old.joints_left())
+        for name in _STREAMS:
+            if not self._queue[name]:
+                self._epoch_shift[name] = self._epoch - self._checks[name].epoch
+
+    def _forget_temperature(self):
+        """Bound the temperatures that wait for an epoch which the other streams do not begin."""
+        queue = self._queue['temperature']
+        while len(queue) > 1 and _span(queue) > JOINT_WAIT:
+            del queue[0]
+
+    def _end_epoch(self):
+        return self._cut(self._chunks.take(final=True))
+
+    def _cut(self, chunks):
+        return [window for chunk in chunks for window in self._cutter.push(chunk)]
+
+
+class _Unwrapper:
+    """Undoes jumps of joint angles by whole turns, sample after sample."""
+
+    def __init__(self):
+        self._last = None
+        self._turns = 0
+
+    def unwrap(self, joints):
+        """Return the joints without jumps of more than half a turn."""
+        if not len(joints):
+            return joints
+        last = joints.position[:1] if self._last is None else self._last
+        step = np.diff(np.concatenate([last, joints.position]), axis=0)
+        self._last = joints.position[-1:].copy()
+        turns = self._turns + np.cumsum(np.rint(step / (2 * np.pi)).astype(np.int64), axis=0)
+        self._turns = turns[-1]
+        if not turns.any():
+            return joints
+        return JointSamples(joints.stamp_ns, joints.position - 2 * np.pi * turns, joints.velocity, joints.names)
+
+
+def _add_counts(total, counts):
+    for reason, number in counts.items():
+        total[reason] = total.get(reason, 0) + number
+
+
+def _span(queue):
+    first, last = queue[0][1].stamp_ns[0], queue[-1][1].stamp_ns[-1]
+    return abs(int(last) - int(first)) / 1e9

@@ -1,0 +1,131 @@
+"""A simulated table with an IMU on it, block after block: what a live simulator publishes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import warped_reference
+from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.reference.reference_motion import lever_matrix
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.simulation.sensor_noise import quantise, read_encoders
+from imu_calibration.simulation.session import SimulationOptions, temperature_at
+
+TEMPERATURE_RATE = 1.0
+"""Temperatures per second."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedBlock:
+    """What happens in a stretch of time."""
+
+    imu: ImuSamples
+    """Readings."""
+    joints: JointSamples
+    """Joint states."""
+    temperature: TemperatureSamples | None
+    """Temperatures, when the simulation has them."""
+    truth: ImuSamples
+    """True specific force and rate at the origin of the arms, at the stamps of `imu`."""
+
+
+class LiveSimulation:
+    """
+    The forward model with noise that goes on from block to block.
+
+    Parameters
+    ----------
+    model, values : SensorModel, ndarray
+        The true IMU, table and clock.
+    table : Table
+        The table as its description says.
+    motion : object
+        ``at(time) -> JointMotion``.
+    options : SimulationOptions
+        Rates, noise, temperature.
+    seed : int
+    start_ns : int
+        Stamp of time zero.
+
+    """
+
+    def __init__(self, model, values, table, motion, options=SimulationOptions(), seed=0, start_ns=0):
+        self.model, self.values, self.table, self.motion, self.options = model.at(values), values, table, motion, options
+        self.start_ns = start_ns
+        self._rng = np.random.default_rng([seed, 3])
+        self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
+        noise = options.noise
+        self._wander = [_Wander(sd, noise.correlation_time, 1 / options.imu_rate, self._rng)
+                        for sd in (noise.accel_instability, noise.gyro_instability)]
+
+    def take(self, until):
+        """Return everything from where the last block ended to `until` (s, exclusive)."""
+        time = self._times('imu', self.options.imu_rate, 0.0, until)
+        imu, truth = self._imu(time)
+        return SimulatedBlock(imu, self._joints(until), self._temperature(until), truth)
+
+    def _times(self, stream, rate, offset, until):
+        """Return the times of a stream's next samples before `until`, s."""
+        first = self._n[stream]
+        stop = max(int(np.ceil(until * rate - offset)), first)
+        self._n[stream] = stop
+        return (np.arange(first, stop) + offset) / rate
+
+    def _stamps(self, time):
+        return self.start_ns + np.round(time * 1e9).astype(np.int64)
+
+    def _imu(self, time):
+        if not len(time):
+            empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
+            return empty, empty
+        motion, noise = self.motion.at(time), self.options.noise
+        temperature = temperature_at(time, self.options)
+        outputs = []
+        figures = ((noise.accel_density, noise.accel_resolution), (noise.gyro_density, noise.gyro_resolution))
+        for sensor, output, wander, (density, resolution) in zip(SENSORS, predict(self.model, self.values, self.table, motion, temperature),
+                                                                 self._wander, figures):
+            white = self._rng.normal(0.0, density * np.sqrt(self.options.imu_rate), output.shape)
+            outputs.append(clip(self.model, sensor, self.values, quantise(output + white + wander.take(len(output)), resolution)))
+        jitter = np.round(self._rng.normal(0.0, noise.stamp_jitter * 1e9, len(time))).astype(np.int64) if noise.stamp_jitter else 0
+        stamps = self._stamps(time) + jitter
+        return ImuSamples(stamps, *outputs, self.options.frame_id), self._truth(stamps, motion)
+
+    def _truth(self, stamps, motion):
+        felt = [warped_reference(self.model, sensor, self.table, motion) for sensor in SENSORS]
+        force = felt[0].force_s
+        if ('accelerometer', 'lever_arm') in self.model.slices:
+            force = force + lever_matrix(felt[0].rate_s, felt[0].alpha_s) @ self.values[self.model.slices['accelerometer', 'lever_arm']]
+        return ImuSamples(stamps, force, felt[1].rate_s, self.options.frame_id)
+
+    def _joints(self, until):
+        time = self._times('joints', self.options.joint_rate, 0.5, until)
+        names = tuple(self.table.joint_names)
+        if not len(time):
+            return JointSamples(np.zeros(0, np.int64), np.zeros((0, len(names))), np.zeros((0, len(names))), names)
+        motion = self.motion.at(time)
+        velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
+        return JointSamples(self._stamps(time), read_encoders(motion.position, self.options.noise, self._rng), velocity, names)
+
+    def _temperature(self, until):
+        if self.options.temperature_start_c is None:
+            return None
+        time = self._times('temperature', TEMPERATURE_RATE, 0.0, until)
+        return TemperatureSamples(self._stamps(time), temperature_at(time, self.options) if len(time) else np.zeros(0))
+
+
+class _Wander:
+    """The first-order Gauss-Markov bias of `noise.gauss_markov`, continued from block to block."""
+
+    def __init__(self, sd, correlation_time, step, rng):
+        self._decay, self._rng = np.exp(-step / correlation_time), rng
+        self._drive_sd = sd * np.sqrt(-np.expm1(-2.0 * step / correlation_time))
+        self._state = rng.normal(0.0, sd, 3)
+
+    def take(self, count):
+        """Return the next values, shape (count, 3)."""
+        from scipy.signal import lfilter
+        drive = self._rng.normal(0.0, self._drive_sd, (count, 3))
+        values, _ = lfilter([1.0], [1.0, -self._decay], drive, axis=0, zi=(self._decay * self._state)[None])
+        self._state = values[-1]
+        return values

@@ -1,0 +1,237 @@
+"""Smooth joint motion put together from segments: rests, moves, ramps, spins and oscillations, with exact derivatives."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from imu_calibration.reference.joint_motion import JointMotion
+
+# Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
+# by the quintic both leave position, rate, acceleration and jerk continuous where segments meet.
+_SEPTIC = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+_QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+_POSITION_STEP = [_SEPTIC.deriv(order) for order in range(4)]
+_RATE_STEP = [_QUINTIC.integ(), *(_QUINTIC.deriv(order) for order in range(3))]
+PEAK_RATE_OF_MOVE = 2.1875
+"""Largest rate of a move, in units of distance over duration."""
+PEAK_ACCELERATION_OF_MOVE = 7.5132
+"""Largest acceleration of a move, in units of distance over duration squared."""
+SHORTEST_DWELL = 0.8
+"""Rests and spins cut to less than this share would be too short for windows."""
+PEAK_ACCELERATION_OF_RAMP = 1.875
+"""Largest acceleration of a ramp, in units of change of rate over duration."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """
+    A stretch of motion of all joints.
+
+    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate goes from `rate_from` to `rate_to`
+    and the position gains `shift`, both by smooth steps, and the sines fade in and out.
+    """
+
+    kind: str
+    """'rest', 'move', 'ramp', 'spin' or 'oscillation'."""
+    duration: float
+    """Length, s."""
+    start: np.ndarray
+    """Joint positions at the start, rad, shape (n_joints,)."""
+    rate_from: np.ndarray
+    """Joint rates at the start, rad/s, shape (n_joints,)."""
+    rate_to: np.ndarray
+    """Joint rates at the end, rad/s, shape (n_joints,)."""
+    shift: np.ndarray
+    """Distance of a move, rad, shape (n_joints,)."""
+    amplitude: np.ndarray | None = None
+    """Amplitudes of the sines, rad, shape (n_sines, n_joints)."""
+    frequency: np.ndarray | None = None
+    """Their frequencies, Hz, same shape."""
+    phase: np.ndarray | None = None
+    """Their phases at the start, rad, same shape."""
+    fade: float = 0.0
+    """Time over which the sines come and go, s; at most half the duration."""
+
+    @property
+    def end(self):
+        """Joint positions at the end, rad, shape (n_joints,)."""
+        return self.start + self.shift + 0.5 * (self.rate_from + self.rate_to) * self.duration
+
+    def at(self, time):
+        """Return position, rate, acceleration and jerk at `time` since the start of the segment, shape (4, n, n_joints)."""
+        motion = np.zeros((4, len(time), len(self.start)))
+        motion[0] = self.start + time[:, None] * self.rate_from
+        motion[1] = self.rate_from
+        self._add_steps(motion, time)
+        if self.amplitude is not None:
+            self._add_sines(motion, time)
+        return motion
+
+    def _add_steps(self, motion, time):
+        part = time / self.duration
+        for steps, gain, power in ((_RATE_STEP, self.rate_to - self.rate_from, 1), (_POSITION_STEP, self.shift, 0)):
+            if gain.any():
+                for order in range(4):
+                    motion[order] += np.outer(steps[order](part), gain * self.duration ** (power - order))
+
+    def _add_sines(self, motion, time):
+        rise = np.clip(time / self.fade, 0.0, 1.0)
+        fall = np.clip((time - self.duration) / self.fade + 1.0, 0.0, 1.0)
+        envelope = [(step(rise) - step(fall)) * self.fade ** -order for order, step in enumerate(_POSITION_STEP)]
+        for amplitude, frequency, phase in zip(self.amplitude, self.frequency, self.phase, strict=True):
+            omega = 2.0 * np.pi * frequency
+            angle = np.outer(time, omega) + phase
+            sine, cosine = amplitude * np.sin(angle), amplitude * np.cos(angle) * omega
+            waves = [sine, cosine, -sine * omega**2, -cosine * omega**2]
+            for order in range(4):
+                for inner in range(order + 1):
+                    motion[order] += _BINOMIAL[order][inner] * envelope[order - inner][:, None] * waves[inner]
+
+
+_BINOMIAL = ((1,), (1, 1), (1, 2, 1), (1, 3, 3, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A named motion of all joints, at rest before its start and after its end."""
+
+    name: str
+    """Name in the registry."""
+    segments: tuple
+    """Segments in the order of time."""
+    joint_names: tuple | None = None
+    """Joints in column order, when the profile is tied to a table."""
+    table: dict | None = None
+    """Description of the table that the profile is made for (as in the table's YAML), when it brings its own."""
+
+    @property
+    def edges(self):
+        """Start of every segment and the end of the last, s, shape (n_segments + 1,)."""
+        return np.concatenate([[0.0], np.cumsum([segment.duration for segment in self.segments])])
+
+    @property
+    def duration(self):
+        """Length, s."""
+        return float(self.edges[-1])
+
+    def at(self, time):
+        """
+        Return the joints' motion at any times.
+
+        Parameters
+        ----------
+        time : array, shape (n,)
+            Seconds since the start, in any order; the joints rest outside ``[0, duration]``.
+
+        Returns
+        -------
+        JointMotion
+
+        """
+        time = np.atleast_1d(np.asarray(time, float))
+        motion = self._evaluate(np.clip(time, 0.0, self.duration))
+        return JointMotion(time, *motion)
+
+    def _evaluate(self, time):
+        edges = self.edges
+        order = None if np.all(time[1:] >= time[:-1]) else np.argsort(time, kind='stable')
+        ordered = time if order is None else time[order]
+        motion = np.empty((4, len(time), len(self.segments[0].start)))
+        cuts = np.searchsorted(ordered, edges[1:-1])
+        for segment, start, low, high in zip(self.segments, edges, [0, *cuts], [*cuts, len(time)], strict=False):
+            if high > low:
+                motion[:, low:high] = segment.at(ordered[low:high] - start)
+        if order is None:
+            return motion
+        unsorted = np.empty_like(motion)
+        unsorted[:, order] = motion
+        return unsorted
+
+    def find(self, kind):
+        """Return (start, end) of every segment of a kind, s, shape (n, 2)."""
+        edges = self.edges
+        return np.array([(edges[i], edges[i + 1]) for i, s in enumerate(self.segments) if s.kind == kind]).reshape(-1, 2)
+
+
+class MotionBuilder:
+    """
+    Writes segments one after the other, each starting where the last one ended.
+
+    Angles in degrees here, as people state motions; the segments hold radians.
+    """
+
+    def __init__(self, n_joints, dwell=1.0, rate_limit_deg=150.0, acceleration_limit_deg=300.0):
+        """Start at rest at zero; `dwell` stretches rests, spins and oscillations, the limits time moves and ramps."""
+        self.segments = []
+        self.dwell = dwell
+        self._limits = np.radians([rate_limit_deg, acceleration_limit_deg])
+        self._position = np.zeros(n_joints)
+
+    @property
+    def n_joints(self):
+        """Number of joints."""
+        return len(self._position)
+
+    def rest(self, duration):
+        """Stay for `duration` times dwell, s."""
+        self._append('rest', duration * self.dwell)
+
+    def move(self, angles_deg, shortest=True):
+        """Move to the joint angles (NaN: leave that joint), each by less than half a turn when `shortest`."""
+        target = np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints))
+        shift = np.where(np.isnan(target), 0.0, target - self._position)
+        if shortest:
+            shift = (shift + np.pi) % (2.0 * np.pi) - np.pi
+        distance = np.max(np.abs(shift))
+        if distance < 1e-9:
+            return
+        rate, acceleration = self._limits
+        duration = max(0.5, PEAK_RATE_OF_MOVE * distance / rate, np.sqrt(PEAK_ACCELERATION_OF_MOVE * distance / acceleration))
+        self._append('move', duration, shift=shift)
+
+    def spin(self, rates_deg, duration):
+        """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
+        last = np.zeros(self.n_joints)
+        for rate in np.radians(np.atleast_2d(np.asarray(rates_deg, float))):
+            self._ramp(last, rate)
+            self._append('spin', duration * self.dwell, rate, rate)
+            last = rate
+        self._ramp(last, np.zeros(self.n_joints))
+
+    def oscillate(self, amplitude_deg, frequency, duration, phase=0.0, fade=None):
+        """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
+        amplitude = np.radians(np.atleast_2d(np.asarray(amplitude_deg, float)))
+        frequency, phase = (np.broadcast_to(np.asarray(value, float), amplitude.shape) for value in (frequency, phase))
+        duration = duration * self.dwell
+        fade = min(0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade)
+        self._append('oscillation', duration, amplitude=amplitude, frequency=frequency, phase=phase, fade=fade)
+
+    def _ramp(self, rate_from, rate_to):
+        change = np.max(np.abs(rate_to - rate_from))
+        if change > 0.0:
+            self._append('ramp', max(0.5, PEAK_ACCELERATION_OF_RAMP * change / self._limits[1]), rate_from, rate_to)
+
+    def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
+        zero = np.zeros(self.n_joints)
+        parts = [zero if part is None else part for part in (rate_from, rate_to, shift)]
+        segment = Segment(kind, float(duration), self._position, *parts, **sines)
+        self.segments.append(segment)
+        self._position = segment.end
+
+
+def stretch(build, duration):
+    """
+    Return the segments of `build(dwell)` with the dwell that makes them last `duration` seconds.
+
+    Raises
+    ------
+    InputError
+        When moves and ramps alone leave too little time for rests and spins.
+
+    """
+    length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]
+    change = length[1] - length[0]
+    if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
+        raise InputError(f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile')
+    return build(1.0 + (duration - length[0]) / change)

@@ -1,0 +1,247 @@
+"""Named motions of a turntable: what `simulate --profile NAME` can run."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Callable
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from imu_calibration.simulation import paper_profiles
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, stretch
+from imu_calibration.simulation.motion_primitives import (
+    CORNERS,
+    EDGES,
+    FACES,
+    at_angles,
+    poses,
+    rest_at_zero,
+    run,
+    simultaneous,
+    spin_joint,
+    spin_vertical,
+    swing,
+    swing_joints,
+    swings,
+    tumble,
+    two_axes,
+)
+
+THREE_AXIS = ('outer', 'middle', 'inner')
+SPEEDS_DEG = (60.0, 120.0, 200.0)
+"""Three speeds: with one or two, a delay is a mounting angle and a square is an asymmetry."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    description: str
+    build: Callable
+    """``build(builder, rng)`` appends the segments; `rng` comes from the seed."""
+    table: dict | None = None
+    n_joints: int | None = None
+    """Joints that it needs; None: any number."""
+    adapts: bool = False
+    """Whether a table with another number of joints gets `any_table` instead."""
+
+
+def profile_names():
+    """Return the names of all profiles with one line of description each, a dict."""
+    return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
+
+
+def make_profile(name, seed=0, table=None, duration=None):
+    """
+    Return the motion called `name`.
+
+    Parameters
+    ----------
+    name : str
+        One of `profile_names`.
+    seed : int
+        Seed of what is drawn: the order of the session, and in 'random' the motions themselves.
+    table : Table, optional
+        The table to be moved; default three axes. Sessions for three axes become poses, spins and swings of every joint
+        on a table with another number of joints. Profiles that bring their own table (`Profile.table`) ignore it.
+    duration : float, optional
+        Wanted length, s; rests and spins are stretched to reach it.
+
+    Raises
+    ------
+    InputError
+        When the name is unknown, the table does not suit the profile, or the duration is too short.
+
+    """
+    if name not in _REGISTRY:
+        raise InputError(f"profile '{name}' is unknown; the profiles are {', '.join(profile_names())}")
+    entry = _REGISTRY[name]
+    joint_names = _joint_names(entry, table)
+    fits = entry.n_joints in (None, len(joint_names))
+    if not (fits or entry.adapts):
+        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'")
+    build = entry.build if fits else _any_table
+
+    def segments(dwell):
+        builder = MotionBuilder(len(joint_names), dwell)
+        build(builder, np.random.default_rng(seed))
+        return builder.segments
+
+    chosen = segments(1.0) if duration is None else stretch(segments, duration)
+    return Profile(name, tuple(chosen), joint_names, entry.table)
+
+
+def _joint_names(entry, table):
+    if entry.table is not None:
+        return tuple(joint['name'] for joint in entry.table['joints'])
+    if table is None:
+        return THREE_AXIS if entry.n_joints in (None, 3) else THREE_AXIS[:1] + THREE_AXIS[2:]
+    joints = table['joints'] if isinstance(table, dict) else table.joints
+    return tuple(joint['name'] if isinstance(joint, dict) else joint.name for joint in joints)
+
+
+def _calibration(builder, rng):
+    tasks = poses(np.concatenate([FACES, EDGES, CORNERS]), 5.0)
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG, dwell=4.0) for axis in np.eye(3)]
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG[2], dwell=4.0) for axis in CORNERS[:4]]
+    tasks += [partial(spin_joint, joint=2, at_deg=[90 * k, 0, 0], speeds_deg=speed, dwell=5.0) for k, speed in enumerate(SPEEDS_DEG)]
+    tasks += [partial(spin_joint, joint=1, at_deg=[30, 0, inner], speeds_deg=SPEEDS_DEG[1], dwell=5.0) for inner in (0, 90)]
+    tasks += swings(((30.0, 0.5), (10.0, 1.0), (5.0, 2.0)), 6.0)
+    tasks += simultaneous((150.0, 100.0), 6.0)
+    run(builder, rng, tasks)
+
+
+def _short(builder, rng):
+    tasks = poses(np.concatenate([FACES, EDGES]), 4.0)
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG, dwell=2.0) for axis in np.eye(3)]
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG[2], dwell=2.0) for axis in CORNERS[:2]]
+    tasks += [partial(spin_joint, joint=2, at_deg=[0, 0, 0], speeds_deg=SPEEDS_DEG[1], dwell=3.0)]
+    tasks += swings(((20.0, 0.5), (10.0, 1.0)), 4.0)
+    tasks += simultaneous((150.0, 100.0), 2.0)[:4]
+    run(builder, rng, tasks)
+
+
+def _quick(builder, rng):
+    tasks = poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0)
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=speed, dwell=2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)]
+    tasks += swings(((10.0, 1.0),), 3.0)
+    tasks += simultaneous((150.0, 100.0), 2.0)[:3]
+    run(builder, rng, tasks, reference_every=100)
+
+
+def _static_only(builder, rng):
+    run(builder, rng, poses(np.concatenate([FACES, EDGES, CORNERS]), 8.0))
+
+
+def _separating(builder, rng, n_angles=16, n_oblique=4, cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), swing_time=4.0):
+    """Many angles, three speeds both ways, swings at several frequencies: what tells neighbours among the effects apart."""
+    rings = [direction for k in range(n_angles) for direction in _rings(2 * np.pi * (k + 0.25) / n_angles)]
+    tasks = poses(rings, 2.2)
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(60.0, 150.0, 300.0), dwell=2.0) for axis in np.eye(3)]
+    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(150.0, 300.0), dwell=2.0) for axis in CORNERS[:n_oblique]]
+    tasks += [partial(spin_joint, joint=2, at_deg=[0, 0, 0], speeds_deg=(30.0, 120.0), dwell=4.0)]
+    tasks += [partial(spin_joint, joint=1, at_deg=[90, 0, inner], speeds_deg=(40.0, 100.0), dwell=4.0) for inner in (0, 90)]
+    tasks += swings(cycles, swing_time)
+    tasks += simultaneous((250.0, 100.0), 2.5)
+    run(builder, rng, tasks, reference_every=20)
+
+
+_separating_short = partial(_separating, n_angles=8, n_oblique=1, cycles=((20.0, 0.5), (5.0, 1.5), (2.0, 4.0)), swing_time=3.0)
+
+
+def _rings(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return [[c, s, 0.0], [0.0, c, s], [s, 0.0, c]]
+
+
+def _thermal(builder, rng):
+    """The same short round again and again, so that only time and temperature differ between rounds."""
+    rest_at_zero(builder, 20.0)
+    for turn in range(6):
+        for task in poses(FACES, 5.0):
+            task(builder)
+        for axis in np.eye(3):
+            spin_vertical(builder, axis, SPEEDS_DEG[1], 3.0)
+        for axis in range(3):
+            swing(builder, axis, 10.0, 1.0, 3.0)
+        builder.move([90.0 * turn, 0.0, 0.0])
+        builder.rest(15.0)
+
+
+def _navigation(builder, rng):
+    """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
+    builder.rest(10.0)
+    tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], [0.3, 1.1, 2.0], 50.0)
+    builder.rest(10.0)
+    tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], [0.3, 1.1, 2.0], 50.0)
+    builder.rest(5.0)
+
+
+def _tumbling(builder, rng):
+    builder.rest(5.0)
+    tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], [0.3, 1.1, 2.0], 60.0)
+    builder.rest(5.0)
+
+
+def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2,
+            n_swings=2, n_simultaneous=4):
+    """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
+    tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
+    speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
+    tasks += [partial(spin_vertical, up_b=_near(rng, axis, 0.2), speeds_deg=speeds[:, k], dwell=2.0) for k, axis in enumerate(np.eye(3))]
+    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=2.0)
+              for _ in range(n_oblique)]
+    tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, 3), speeds_deg=rng.uniform(50, 120), dwell=3.0)
+              for joint in (1, 2)]
+    for axis in range(3):
+        tasks += [partial(swing, axis=axis, amplitude_deg=rng.uniform(7, 14) / frequency, frequency=frequency, duration=3.5)
+                  for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]]
+    rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
+    tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5), rates)]
+    run(builder, rng, tasks, reference_every=15)
+
+
+_random_short = partial(_random, directions=np.concatenate([FACES, CORNERS[::2]]), speed_ranges=((60, 90), (150, 210)), n_oblique=1,
+                        n_swings=1, n_simultaneous=3)
+
+
+def _near(rng, direction, spread):
+    vector = direction + rng.normal(0.0, spread, 3)
+    return vector / np.linalg.norm(vector)
+
+
+def _any_table(builder, rng):
+    """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
+    count = builder.n_joints
+    angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
+    tasks = [partial(at_angles, angles_deg=row) for row in angles]
+    only = np.eye(count)
+    for joint in range(count):
+        tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, count), speeds_deg=speed, dwell=4.0)
+                  for speed in SPEEDS_DEG]
+        tasks += [partial(swing_joints, at_deg=rng.uniform(-180, 180, count), amplitude_deg=10.0 / cycles * only[joint], frequency=cycles)
+                  for cycles in (0.5, 1.0, 2.0)]
+        tasks += [partial(two_axes, at_deg=at_deg, rates_deg=120.0 * only[joint] + 80.0 * only[other], dwell=5.0)
+                  for other in range(joint) for at_deg in rng.uniform(-180, 180, (3, count))]
+    run(builder, rng, tasks)
+
+
+_ON_ARM = {**paper_profiles.GIMBALS, 'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]}}
+
+_REGISTRY = {
+    'calibration': _Entry('full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once', _calibration,
+                          n_joints=3, adapts=True),
+    'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
+    'quick': _Entry('the least that determines everything, about 2 min', _quick, n_joints=3, adapts=True),
+    'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
+    'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
+    'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
+    'separating': _Entry('many angles, three speeds both ways, four frequencies: tells similar effects apart', _separating,
+                         n_joints=3, adapts=True),
+    'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
+    'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins leave 1 g', _separating, _ON_ARM, 3),
+    'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),
+    'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling', _navigation, n_joints=3),
+    'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)', _tumbling, n_joints=3),
+    'two_axis': _Entry('poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2),
+    'any_table': _Entry('poses, spins, swings and simultaneous turns of whatever joints the table has', _any_table),
+    **{name: _Entry(*entry) for name, entry in paper_profiles.REGISTRY.items()},
+}

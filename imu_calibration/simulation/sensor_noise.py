@@ -1,0 +1,143 @@
+"""Noise of inertial sensors, encoders and clocks, and the grades of sensors it comes in."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """
+    Random errors of one IMU and of what it is compared with.
+
+    The bias wander is a stationary first-order Gauss-Markov process whose standard deviation is the data sheet's
+    in-run instability.
+    """
+
+    accel_density: float = 0.0
+    """White noise of the accelerometer, m/s^2/sqrt(Hz)."""
+    gyro_density: float = 0.0
+    """White noise of the gyroscope, rad/s/sqrt(Hz)."""
+    accel_instability: float = 0.0
+    """Standard deviation of the accelerometer's bias wander, m/s^2."""
+    gyro_instability: float = 0.0
+    """Standard deviation of the gyroscope's bias wander, rad/s."""
+    correlation_time: float = 100.0
+    """Correlation time of the bias wander, s."""
+    accel_resolution: float = 0.0
+    """Step of the accelerometer's output, m/s^2; 0: continuous."""
+    gyro_resolution: float = 0.0
+    """Step of the gyroscope's output, rad/s; 0: continuous."""
+    stamp_jitter: float = 0.0
+    """Standard deviation of the IMU's stamps, s."""
+    encoder_noise: float = 0.0
+    """White noise of the joint positions, rad."""
+    encoder_resolution: float = 0.0
+    """Step of the joint positions, rad; 0: continuous."""
+
+    def white_only(self):
+        """Return the model with nothing but the white noise of the IMU."""
+        return NoiseModel(accel_density=self.accel_density, gyro_density=self.gyro_density)
+
+
+@dataclass(frozen=True)
+class ImuGrade:
+    """A grade of IMU: its noise, and the standard deviations of the errors that a calibration finds."""
+
+    noise: NoiseModel
+    """Random errors."""
+    accel_bias: float
+    """Run-to-run accelerometer bias, m/s^2."""
+    gyro_bias: float
+    """Run-to-run gyroscope bias, rad/s."""
+    scale: float
+    """Scale-factor error."""
+    misalignment: float
+    """Direction error of an input axis, rad."""
+    arm: float
+    """Distance of a sensitive point from the middle of the package, m."""
+    source: str
+    """Where the figures come from."""
+
+
+GRADES = {
+    'consumer': ImuGrade(
+        NoiseModel(400 * MICRO_G, 0.005 * DEG, 100 * MICRO_G, 20 * DEG_H, 100.0, 61e-6 * STANDARD_GRAVITY, DEG / 131.0),
+        0.05 * STANDARD_GRAVITY, 2.0 * DEG, 0.02, 0.01, 3e-3,
+        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none'),
+    'industrial': ImuGrade(
+        NoiseModel(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
+        5e-3 * STANDARD_GRAVITY, 0.2 * DEG, 5e-3, 3e-3, 3e-3,
+        'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and arms before factory calibration'),
+    'tactical': ImuGrade(
+        NoiseModel(150 * MICRO_G, 0.002 * DEG, 200 * MICRO_G, 8 * DEG_H, 100.0, 250 * MICRO_G, 0.005 * DEG),
+        15e-3 * STANDARD_GRAVITY, 0.5 * DEG, 5e-3, 0.87e-3, 5e-3,
+        'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15 mg and 0.5 deg/s, axis to axis 0.05 deg'),
+    'navigation': ImuGrade(
+        NoiseModel(1 * MICRO_G, 0.002 / 60 * DEG, 10 * MICRO_G, 0.005 * DEG_H, 100.0),
+        75 * MICRO_G, 0.02 * DEG_H, 1e-4, 3e-5, 0.02,
+        'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h, run-to-run 50-100 ug and 0.01-0.03 deg/h'),
+}
+"""Grades by name."""
+
+
+def realistic(grade='industrial', encoder_resolution=0.001 * DEG, stamp_jitter=50e-6):
+    """Return the noise of a grade, with an encoder's resolution (rad) and a stamp jitter (s) beside it."""
+    return replace(GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter)
+
+
+def gauss_markov(standard_deviation, correlation_time, step, shape, rng):
+    """
+    Return a stationary first-order Gauss-Markov process along the first axis of `shape`.
+
+    ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, started from its stationary
+    distribution.
+    """
+    from scipy.signal import lfilter  # here, because scipy.signal takes a second to import
+    decay = np.exp(-step / correlation_time)
+    drive = rng.normal(0.0, standard_deviation, shape)
+    drive[1:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
+    return lfilter([1.0], [1.0, -decay], drive, axis=0)
+
+
+def quantise(values, step):
+    """Round `values` to multiples of `step`; 0 leaves them as they are."""
+    return np.asarray(values) if step == 0.0 else np.round(np.asarray(values) / step) * step
+
+
+def jitter_stamps(stamp_ns, standard_deviation, rng):
+    """Return stamps that came with white jitter (s), still int64 and in the order of arrival."""
+    if standard_deviation == 0.0:
+        return stamp_ns
+    return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(np.int64)
+
+
+def add_imu_noise(force_s, rate_s, model, sample_rate, rng):
+    """
+    Return the readings with white noise, bias wander and resolution.
+
+    Parameters
+    ----------
+    force_s, rate_s : array, shape (n, 3)
+        Outputs without noise, m/s^2 and rad/s.
+    model : NoiseModel
+    sample_rate : float
+        Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that the integral over t seconds
+        scatters by ``d sqrt(t)`` (random-walk convention).
+    rng : numpy.random.Generator
+
+    """
+    noisy = []
+    for true, density, instability, resolution in ((force_s, model.accel_density, model.accel_instability, model.accel_resolution),
+                                                   (rate_s, model.gyro_density, model.gyro_instability, model.gyro_resolution)):
+        values = true + rng.normal(0.0, density * np.sqrt(sample_rate), true.shape)
+        values += gauss_markov(instability, model.correlation_time, 1.0 / sample_rate, true.shape, rng)
+        noisy.append(quantise(values, resolution))
+    return tuple(noisy)
+
+
+def read_encoders(position, model, rng):
+    """Return joint positions as noisy encoders of finite resolution tell them, rad, shape (n, n_joints)."""
+    return quantise(position + rng.normal(0.0, model.encoder_noise, np.shape(position)), model.encoder_resolution)

@@ -1,0 +1,134 @@
+"""Simulated sessions: a table that follows a profile and carries an IMU made of the catalogue's effects."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import owner_of
+from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders
+
+START_NS = 1_700_000_000_000_000_000
+"""First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
+BLOCK = 100_000
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """Rates and noise of a simulated session."""
+
+    imu_rate: float = 100.0
+    """IMU samples per second."""
+    joint_rate: float = 100.0
+    """Joint states per second."""
+    noise: NoiseModel = GRADES['industrial'].noise
+    """Noise of the IMU, the encoders and the stamps."""
+    with_velocity: bool = True
+    """Whether the joint states carry velocities."""
+    temperature_start_c: float | None = None
+    """Temperature at turn-on; None: no temperature topic."""
+    temperature_rise_c: float = 15.0
+    """How far it rises."""
+    temperature_time: float = 240.0
+    """Time constant of the warm-up, s."""
+    frame_id: str = 'imu_link'
+    """Frame of the messages."""
+
+
+def random_values(model, grade='industrial', seed=0):
+    """
+    Return parameter values of a random IMU of a grade, shape (n_params,).
+
+    Bias, matrix and arms scatter as the grade says; every other effect is zero.
+    """
+    rng, grade = np.random.default_rng([seed, 7]), GRADES[grade]
+    values = model.start()
+    for effect in model.effects:
+        part = model.slices[effect.sensor, effect.name]
+        if effect.name == 'bias':
+            values[part] += rng.normal(0.0, grade.accel_bias if effect.sensor == 'accelerometer' else grade.gyro_bias, 3)
+        elif effect.name == 'matrix':
+            spread = np.where(np.eye(3), grade.scale, grade.misalignment).ravel()
+            values[part] += rng.normal(0.0, 1.0, 9) * spread
+        elif effect.name == 'accel_size_effect':
+            arms = rng.normal(0.0, grade.arm, (3, 3))
+            values[part] = (arms - arms.mean(axis=0)).ravel()
+    return values
+
+
+def hidden_effect(name, joint_names, seed=0, share=0.3):
+    """Return (sensor, values) of an effect at a share of its plausible size, with random signs and spread."""
+    sensor = owner_of(name, joint_names)
+    model = SensorModel(joint_names=tuple(joint_names)).with_effect(sensor, name)
+    effect = next(e for e in model.effects if (e.sensor, e.name) == (sensor, name))
+    if not effect.plausible:
+        raise InputError(f"effect '{name}' cannot be simulated by name; use --calibration with a file that contains it")
+    rng = np.random.default_rng([seed, 11])
+    values = share * effect.plausible[-1][1] * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
+    if name.endswith('_bandwidth'):
+        values = np.abs(values)
+    if effect.components[-1] == 'time_constant' and effect.size > 1:
+        values[-1] = 240.0
+    return sensor, values
+
+
+def simulate(model, values, table, profile, options=SimulationOptions(), seed=0):
+    """
+    Simulate a session.
+
+    Parameters
+    ----------
+    model, values : SensorModel, ndarray
+        The true IMU, table and clock.
+    table : Table
+        The table as its description says.
+    profile : Profile
+        Motion of the joints as their encoders would read it without noise.
+    options : SimulationOptions
+    seed : int
+
+    Returns
+    -------
+    (ImuSamples, JointSamples, TemperatureSamples or None)
+
+    """
+    rng = np.random.default_rng([seed, 3])
+    n_imu, n_joint = (int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate))
+    time = np.arange(n_imu) / options.imu_rate
+    outputs = _outputs(model, values, table, profile, time, options)
+    force, rate = add_imu_noise(*outputs, options.noise, options.imu_rate, rng)
+    force, rate = (clip(model, sensor, values, output) for sensor, output in zip(SENSORS, (force, rate)))
+    stamps = jitter_stamps(START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
+    imu = ImuSamples(stamps, force, rate, options.frame_id)
+    joint_time = (np.arange(n_joint) + 0.5) / options.joint_rate
+    motion = profile.at(joint_time)
+    position = read_encoders(motion.position, options.noise, rng)
+    velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
+    joints = JointSamples(START_NS + np.round(joint_time * 1e9).astype(np.int64), position, velocity, tuple(table.joint_names))
+    return imu, joints, _temperature_topic(profile, options)
+
+
+def _outputs(model, values, table, profile, time, options):
+    parts = []
+    for start in range(0, len(time), BLOCK):
+        now = time[start:start + BLOCK]
+        parts.append(predict(model, values, table, profile.at(now), temperature_at(now, options)))
+    return tuple(np.concatenate(sensor) for sensor in zip(*parts))
+
+
+def temperature_at(time, options):
+    """Return the temperature of the warm-up, or None without a temperature topic: ``start + rise (1 - exp(-t / tau))``."""
+    if options.temperature_start_c is None:
+        return None
+    return options.temperature_start_c + options.temperature_rise_c * (1 - np.exp(-time / options.temperature_time))
+
+
+def _temperature_topic(profile, options):
+    if options.temperature_start_c is None:
+        return None
+    time = np.arange(0.0, profile.duration, 1.0)
+    return TemperatureSamples(START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
