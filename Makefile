@@ -81,10 +81,10 @@ bench: $(STAMP)
 	@$(PY) benchmarks/run.py
 
 soak: $(STAMP)
-	@$(PY) test/soak.py --hours $(SOAK_HOURS)
+	@$(PY) test/ros/soak.py --hours $(SOAK_HOURS)
 
 hide-and-seek: $(STAMP)
-	@$(PY) test/hide_and_seek.py
+	@$(PY) test/worlds/hide_and_seek.py
 
 clean:
 	rm -rf build install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from figures import show
 
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.linear_least_squares import (
@@ -14,6 +13,8 @@ from imu_calibration.estimation.linear_least_squares import (
 )
 from imu_calibration.papers import avrutov2017 as avrutov
 from imu_calibration.papers import avrutov2017_budget as avrutov_budget
+
+from worlds.figures import show
 
 ANGLES = avrutov.equal_angles()
 CASES = [(order, axis) for order in avrutov.GIMBAL_ORDERS for axis in 'xyz']

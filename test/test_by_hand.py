@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.calibrate import ByHandSettings, KnownTurn, calibrate_by_hand
@@ -14,6 +13,8 @@ from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.variance_components import estimate_scatter
 from imu_calibration.samples import ImuSamples, NominalScaling
 from imu_calibration.segmentation.static_detector import find_still
+
+from worlds.hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
 
 
 def differences(found, truth):

@@ -3,10 +3,8 @@
 import time
 
 import numpy as np
-import physics
 import pytest
 import yaml
-from live_sessions import OPTIONS, TABLE, assert_same, make_session
 from test_by_hand import GRAVITY, simulate
 
 from imu_calibration.calibration.calibrate import calibrate
@@ -19,10 +17,13 @@ from imu_calibration.simulation.session import START_NS
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
-pytest.importorskip('rclpy')
-from live_station import Station, taken  # noqa: E402
+from worlds import physics
+from worlds.live_sessions import OPTIONS, TABLE, assert_same, make_session
 
+pytest.importorskip('rclpy')
 from imu_calibration.by_hand.workflow import calibrate_without_table
+
+from ros.live_station import Station, taken  # noqa: E402
 
 pytestmark = pytest.mark.dds
 RATE = 10.0

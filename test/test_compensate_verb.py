@@ -5,7 +5,6 @@ from shutil import rmtree
 
 import numpy as np
 import pytest
-from compensation_cases import FURTHER, random_calibration
 from scipy.spatial.transform import Rotation
 from test_adapters_copy import raw_messages
 
@@ -18,6 +17,8 @@ from imu_calibration.samples import ImuSamples, TemperatureSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS, parse_imu
 from msg_adapters.write import write_session
+
+from worlds.compensation_cases import FURTHER, random_calibration
 
 PERIOD_NS = 2_000_000
 N = 3000

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from compensation_cases import FURTHER, random_calibration, random_motion
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.document import Calibration
@@ -17,6 +16,8 @@ from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from imu_calibration.simulation.profiles import make_profile
+
+from worlds.compensation_cases import FURTHER, random_calibration, random_motion
 
 ALL = FURTHER['accelerometer'], FURTHER['gyroscope']
 EACH = [((name,), ()) for name in ALL[0]] + [((), (name,)) for name in ALL[1]]

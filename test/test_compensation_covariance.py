@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compensation_cases import FURTHER, random_calibration
 
 from imu_calibration.compensation.angular_acceleration import CausalDerivative
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.kernel import make_kernel
+
+from worlds.compensation_cases import FURTHER, random_calibration
 
 DERIVATIVE = CausalDerivative(5, 0.005)
 FORCE, RATE, SLOPE, DT = np.array([1.0, -2.0, 9.0]), np.array([1.5, -0.8, 2.0]), np.array([4.0, -6.0, 3.0]), 4.0

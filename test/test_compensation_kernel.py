@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from compensation_cases import FURTHER, random_calibration, random_motion
 from hypothesis import given
 from hypothesis import strategies as st
 
 from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.compensation.kernel import kernel_text, make_kernel
+
+from worlds.compensation_cases import FURTHER, random_calibration, random_motion
 
 some = {sensor: st.lists(st.sampled_from(names), unique=True).map(tuple) for sensor, names in FURTHER.items()}
 small = st.floats(-1.0, 1.0)

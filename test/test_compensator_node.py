@@ -5,8 +5,6 @@ import time
 
 import numpy as np
 import pytest
-from compensation_cases import random_calibration
-from ros_harness import Harness
 
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.compensation.compensate import Transfer
@@ -16,6 +14,9 @@ from imu_calibration.nodes.processes import NodeProcesses
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
+
+from ros.harness import Harness
+from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.dds

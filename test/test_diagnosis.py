@@ -4,12 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from hiding import Sizes, record
 from scipy.stats import chi2
 
 from imu_calibration.diagnosis.diagnose import diagnose, investigate
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
+
+from worlds.hiding import Sizes, record
 
 SEED = 3
 

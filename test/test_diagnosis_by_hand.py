@@ -4,12 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from hand_sessions import GRAVITY, simulate
 
 from imu_calibration.by_hand.calibrate import ByHandSettings, gather_by_hand, solve_by_hand
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
+
+from worlds.hand_sessions import GRAVITY, simulate
 
 NOTHING = np.zeros(3)
 MG, DEG = 9.80665e-3, np.pi / 180

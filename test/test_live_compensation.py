@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compensation_cases import random_calibration, random_motion
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,6 +17,8 @@ from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, N_DOUBLES, parse_imu, patch_imu
+
+from worlds.compensation_cases import random_calibration, random_motion
 
 PERIOD_NS = 2_000_000
 TRANSFER = Transfer.from_pose('base_link', (0.4, -0.3, 0.2), (0.3, 1.0, -2.0))

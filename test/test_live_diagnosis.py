@@ -5,7 +5,6 @@ import time
 from dataclasses import replace
 
 import numpy as np
-import physics
 import pytest
 from test_live_calibration import blocks
 
@@ -15,6 +14,8 @@ from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis, Recent
 from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
+
+from worlds import physics
 
 pytest.importorskip('rclpy')
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402

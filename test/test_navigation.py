@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from figures import show
 
 from imu_calibration import navigation
 from imu_calibration.constants import STANDARD_GRAVITY
@@ -12,6 +11,8 @@ from imu_calibration.papers import zhang2017_designs as zhang_designs
 from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
 from imu_calibration.papers import zhang2017_navigation as zhang_claims
 from imu_calibration.reference.reference_motion import Reference
+
+from worlds.figures import show
 
 G = STANDARD_GRAVITY
 MODEL = zhang.printed_static_model()

@@ -5,19 +5,19 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import physics
-import physics_table
 import pytest
-from physics import TABLES, Session, make_session
-from physics_draw import EFFECTS, OUTSIDE, G
-from physics_sensor import Triad, low_pass
-from physics_table import EARTH_RATE, local_gravity, move_table
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.reference.earth import normal_gravity
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table, tilt
 from imu_calibration.simulation.profiles import make_profile
+
+from worlds import physics, physics_table
+from worlds.physics import TABLES, Session, make_session
+from worlds.physics_draw import EFFECTS, OUTSIDE, G
+from worlds.physics_sensor import Triad, low_pass
+from worlds.physics_table import EARTH_RATE, local_gravity, move_table
 
 SHORT = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 
@@ -324,7 +324,7 @@ def test_the_simulator_does_not_know_what_is_searched_for():
     allowed = {'imu_calibration', 'imu_calibration.samples', 'imu_calibration.constants', 'imu_calibration.reference.joint_motion',
                'imu_calibration.simulation.profiles', 'imu_calibration.simulation.sensor_noise'}
     for name in ('physics.py', 'physics_draw.py', 'physics_table.py', 'physics_sensor.py'):
-        tree = ast.parse((Path(__file__).parent / name).read_text())
+        tree = ast.parse((Path(__file__).parent / 'worlds' / name).read_text())
         for node in ast.walk(tree):
             modules = [node.module or ''] if isinstance(node, ast.ImportFrom) else [a.name for a in getattr(node, 'names', []) if isinstance(a, ast.alias)]
             for module in modules:

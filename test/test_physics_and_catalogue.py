@@ -4,14 +4,15 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from physics import encoder_reading, make_session
-from physics_draw import EFFECTS
 
 from imu_calibration.effects.catalogue import owner_of
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
+
+from worlds.physics import encoder_reading, make_session
+from worlds.physics_draw import EFFECTS
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 LEFT = {'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3}

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from physics import make_session, write_bag
 
 from imu_calibration.cli.main import main
 from imu_calibration.preflight.axes import match_axes, signed_permutations
@@ -14,6 +13,8 @@ from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
 from imu_calibration.samples import SampleBlock
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
+
+from worlds.physics import make_session, write_bag
 
 G = 9.80665
 

@@ -5,15 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from live_sessions import assert_same, errors_in_sd, make_session, offline
 
 from imu_calibration.calibration.document import calibration_from_text
 from imu_calibration.samples import ImuSamples
 from msg_adapters.write import write_session
 
+from worlds.live_sessions import assert_same, errors_in_sd, make_session, offline
+
 pytest.importorskip('rclpy')
-from live_station import Publisher, Station  # noqa: E402
-from soak import LIMIT_MB, soak  # noqa: E402
+from ros.live_station import Publisher, Station  # noqa: E402
+from ros.soak import LIMIT_MB, soak  # noqa: E402
 
 pytestmark = pytest.mark.dds
 SIGMA = 5.0

@@ -6,7 +6,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import yaml
-from live_sessions import TABLE, make_session
 
 from imu_calibration.calibration.live import LiveSettings
 from imu_calibration.errors import InputError
@@ -19,10 +18,12 @@ from imu_calibration.simulation.sensor_noise import NoiseModel
 from imu_calibration.simulation.session import SimulationOptions, simulate
 from msg_adapters.write import write_session
 
-pytest.importorskip('rclpy')
-from live_station import ROOT, Station, taken  # noqa: E402
+from worlds.live_sessions import TABLE, make_session
 
+pytest.importorskip('rclpy')
 from imu_calibration.nodes.processes import node_command  # noqa: E402
+
+from ros.live_station import ROOT, Station, taken  # noqa: E402
 
 START = 1_800_000_000
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from figures import show
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError, NotObservableError
@@ -21,6 +20,8 @@ from imu_calibration.papers.zhang2017_designs import (
     two_axis,
 )
 from imu_calibration.papers.zhang2017_joint_fit import PARAM_NAMES, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
+
+from worlds.figures import show
 
 G = STANDARD_GRAVITY
 MG = 1e-3 * G

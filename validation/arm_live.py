@@ -237,8 +237,8 @@ def _draw(section, plots, case, found):
     time_s = 1e-9 * (stamps[:len(found['moved'])] - case.imu_a.stamp_ns[0])
     figure, axes = new_figure(3, 1, (9, 6))
     for axis, panel in enumerate(axes):
-        for name, colour, text in (('turned', 'tab:orange', 'without the arm'), ('moved', 'tab:blue', 'with the arm')):
-            panel.plot(time_s, found[name][:, axis], '.', markersize=2, color=colour, label=text)
+        for name, colour, label in (('turned', 'tab:orange', 'without the arm'), ('moved', 'tab:blue', 'with the arm')):
+            panel.plot(time_s, found[name][:, axis], '.', markersize=2, color=colour, label=label)
         panel.set_ylabel(f'{"xyz"[axis]}, m/s²')
     axes[0].legend()
     axes[-1].set_xlabel(f'time in the stretch of {NAMES[-1]}, s')

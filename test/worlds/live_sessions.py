@@ -1,7 +1,6 @@
 """Short sessions for the tests of the nodes: enough motion for an answer in a few seconds of processing."""
 
 import numpy as np
-from live_station import TABLE as TABLE_FILE
 
 from imu_calibration import documents
 from imu_calibration.calibration.calibrate import calibrate
@@ -11,6 +10,8 @@ from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+
+from ros.live_station import TABLE as TABLE_FILE
 
 TABLE = Table.from_mapping(documents.from_text(TABLE_FILE.read_text()))
 TOLERANCES = documents.from_text((TABLE_FILE.parent / 'tolerances.yaml').read_text())

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import physics
-from physics_draw import EFFECTS, draw_value, generator
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
@@ -15,6 +13,9 @@ from imu_calibration.diagnosis.search import FAMILY_WISE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window_finder import MotionGatherer
+
+from worlds import physics
+from worlds.physics_draw import EFFECTS, draw_value, generator
 
 NOT_SIZED = {'earth_rate'}
 """The Earth turns as fast as it does: it is sought with a tactical grade of noise, where it is well above detectability."""

@@ -4,7 +4,8 @@ import re
 from datetime import date
 
 import numpy as np
-from hide_and_seek_report import both_found, first_is_right, strictly_first
+
+from worlds.hide_and_seek_report import both_found, first_is_right, strictly_first
 
 BEGIN, END = '<!-- figures: begin -->', '<!-- figures: end -->'
 

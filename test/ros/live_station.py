@@ -11,7 +11,7 @@ import numpy as np
 from imu_calibration.nodes.processes import NodeProcesses
 from msg_adapters.live import LiveGatherer
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / 'config' / 'table_three_axis.yaml'
 PATIENCE = 90.0
 """Seconds after which a test gives up; a busy machine needs some of them."""

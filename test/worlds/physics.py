@@ -10,14 +10,15 @@ import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
-from physics_sensor import low_pass
-from physics_table import local_gravity, move_table
 
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders, realistic
+
+from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
+from worlds.physics_sensor import low_pass
+from worlds.physics_table import local_gravity, move_table
 
 PLACE = {'gravity': None, 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 20.0}
 Z_Y_X = [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}]

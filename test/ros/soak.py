@@ -9,9 +9,9 @@ import sys
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
+sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
 
-from live_station import Station  # noqa: E402
+from ros.live_station import Station  # noqa: E402
 
 LIMIT_MB = 10.0
 NODES = ('calibration_node', 'compensator_node')

@@ -16,20 +16,18 @@ from pathlib import Path
 
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
 
 import numpy as np  # noqa: E402
-from hide_and_seek_figures import write_figures  # noqa: E402
-from hide_and_seek_report import report  # noqa: E402
-from hiding import Sizes, all_effects, options_of, record  # noqa: E402
-from physics_draw import OUTSIDE  # noqa: E402
 
-from imu_calibration.diagnosis.diagnose import (
-    diagnose,  # noqa: E402
-    investigate,  # noqa: E402
-)
+from imu_calibration.diagnosis.diagnose import diagnose, investigate  # noqa: E402
 from imu_calibration.diagnosis.explained_share import sensors_of  # noqa: E402
 from imu_calibration.diagnosis.gain import heldout_gain  # noqa: E402
+
+from worlds.hide_and_seek_figures import write_figures  # noqa: E402
+from worlds.hide_and_seek_report import report  # noqa: E402
+from worlds.hiding import Sizes, all_effects, options_of, record  # noqa: E402
+from worlds.physics_draw import OUTSIDE  # noqa: E402
 
 FIRST_SEED = 7000
 """Seeds from here on were never used while the search was developed."""
@@ -186,7 +184,7 @@ def main(arguments=None):
     parser.add_argument('--minutes', type=float, help='start nothing new after this time')
     parser.add_argument('--fast', action='store_true', help='one seed, white noise')
     parser.add_argument('--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session')
-    parser.add_argument('--docs', type=Path, default=Path(__file__).parent.parent / 'docs', help='where pictures go')
+    parser.add_argument('--docs', type=Path, default=Path(__file__).resolve().parents[2] / 'docs', help='where pictures go')
     parser.add_argument('--from-record', action='store_true', help='only print and draw what the record holds')
     options = parser.parse_args(arguments)
     if options.fast:

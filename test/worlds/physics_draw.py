@@ -3,9 +3,10 @@
 from zlib import crc32
 
 import numpy as np
-from physics_sensor import Triad
 
 from imu_calibration.samples import TemperatureSamples
+
+from worlds.physics_sensor import Triad
 
 G = 9.80665
 MG = 1e-3 * G

@@ -1,0 +1,1 @@
+"""Helpers of the tests that run nodes: stations that publish and listen over DDS, and the endurance test."""
