@@ -1,8 +1,42 @@
-"""Errors that a user can act on: one line saying what must hold, what came, and what to do."""
+"""
+Errors that a user can act on: one line saying what must hold, what came, and what to do.
+
+The core speaks of what must hold. Where something has to be given, the error carries a key of `KEYS`, and whoever shows the error adds what
+that is called there: an option of the command line, a parameter or topic of a node, an argument in a notebook.
+"""
+
+KEYS = {
+    'calibration': 'the calibration document', 'gravity': 'the local gravity', 'imu_topic': 'the topic of the IMU',
+    'joint_topic': 'the topic of the joints', 'nominal': 'nominal conversion of volts or counts', 'table': 'the description of the table',
+    'target_frame': 'the frame to move readings to', 'temperature_topic': 'the topic of the temperature',
+}
+"""What an error may ask for."""
 
 
 class ImuCalibrationError(Exception):
-    """Base of every error that the command line turns into one line and exit code 1."""
+    """
+    Base of every error that the command line turns into one line and exit code 1.
+
+    Parameters
+    ----------
+    text : str
+        What must hold, what came, what to do.
+    key : str, optional
+        What has to be given, a key of `KEYS`.
+
+    """
+
+    def __init__(self, text: str = '', *, key: str | None = None):
+        super().__init__(text)
+        self.key = key
+
+    def named(self, name: str) -> 'ImuCalibrationError':
+        """Return the error with the name of what it is about before its text."""
+        return type(self)(f'{name}: {self}', key=self.key)
+
+    def told(self, hints: dict[str, str]) -> str:
+        """Return the text with what the key is called here; `hints` as for `with_hint`."""
+        return with_hint(str(self), self.key, hints)
 
 
 class InputError(ImuCalibrationError):
@@ -15,3 +49,20 @@ class NotObservableError(ImuCalibrationError):
 
 class DocumentError(InputError):
     """A calibration document cannot be used."""
+
+
+def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
+    """
+    Return a text with what has to be given in the words of whoever shows it.
+
+    Parameters
+    ----------
+    text : str
+    key : str or None
+        A key of `KEYS`.
+    hints : dict
+        Key -> what it is called here, such as ``{'gravity': "parameter 'gravity'"}``; what has no name here
+        gets no hint.
+
+    """
+    return f'{text} ({hints[key]})' if key in hints else text

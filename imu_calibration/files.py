@@ -24,7 +24,7 @@ def read_mapping(path, what):
     try:
         return documents.from_text(read_text(path, what), what)
     except InputError as error:
-        raise InputError(f'{path}: {error}') from error
+        raise error.named(path) from error
 
 
 def read_table(path):

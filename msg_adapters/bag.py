@@ -15,7 +15,8 @@ from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
-OPTIONS = {IMU_TYPE: '--imu-topic', JOINT_STATE_TYPE: '--joint-topic', TEMPERATURE_TYPE: '--temperature-topic'}
+KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
+"""What an error calls the choice of a topic."""
 
 BLOCK_SAMPLES = 65536
 """IMU and joint samples per block, about."""
@@ -43,9 +44,9 @@ def open_recording(path, imu_topic=None, joint_topic=None, temperature_topic=Non
     imu_topic, joint_topic, temperature_topic : str, optional
         Names of topics.
     want_joints : bool or 'optional'
-        True: refuse a recording without JointState; 'optional': go on without.
-    want_temperature : bool
-        Whether to read temperatures when the recording has them.
+        True: refuse a recording without JointState; 'optional': go on without where there is none, or no telling which.
+    want_temperature : bool or 'optional'
+        Whether to read temperatures when the recording has them; 'optional': go on without where there is no telling which.
 
     Returns
     -------
@@ -60,10 +61,13 @@ def open_recording(path, imu_topic=None, joint_topic=None, temperature_topic=Non
     path = Path(path)
     source = _open_source(path)
     try:
-        topics = tuple(Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types))
+        topics = _listed(source)
         imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
-        joints = _choose(path, topics, JOINT_STATE_TYPE, joint_topic, want_joints is True) if want_joints else None
-        temperature = _choose(path, topics, TEMPERATURE_TYPE, temperature_topic, False) if want_temperature else None
+        joints = temperature = None
+        if want_joints:
+            joints = _choose(path, topics, JOINT_STATE_TYPE, joint_topic, want_joints is True, want_joints == 'optional')
+        if want_temperature:
+            temperature = _choose(path, topics, TEMPERATURE_TYPE, temperature_topic, False, want_temperature == 'optional')
     except BaseException:
         source.close()
         raise
@@ -190,22 +194,41 @@ def _open_source(path):
                          'check the path, or record again') from error
 
 
-def _choose(path, topics, message_type, asked, required):
-    """Return the topic of a type by the rule of `open_recording`, or None."""
-    option = OPTIONS[message_type]
+def topics_of(path):
+    """Return the topics of a recording in order of name; raises as `open_recording`."""
+    source = _open_source(Path(path))
+    try:
+        return _listed(source)
+    finally:
+        source.close()
+
+
+def imu_topics(topics):
+    """Return the names of those Topics that carry IMU messages."""
+    return [topic.name for topic in topics if topic.type == IMU_TYPE]
+
+
+def _listed(source):
+    return tuple(Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types))
+
+
+def _choose(path, topics, message_type, asked, required, lenient=False):
+    """Return the topic of a type by the rule of `open_recording`, or None: where there is none, or, when `lenient`, no telling which."""
+    key = KEYS[message_type]
     fitting = [topic.name for topic in topics if topic.type == message_type]
     if asked is not None:
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
         if not names:
-            raise InputError(f'{option} must name a {message_type} topic of {path}, got {asked}; {_listing(topics, fitting)}')
+            raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}; {_listing(topics, fitting)}',
+                             key=key)
         return names[0]
     if DEFAULT_TOPICS[message_type] in fitting:
         return DEFAULT_TOPICS[message_type]
     if len(fitting) == 1:
         return fitting[0]
-    if fitting:
+    if fitting and not lenient:
         raise InputError(f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
-                         f'got {", ".join(fitting)}; choose by {option}')
+                         f'got {", ".join(fitting)}; choose one', key=key)
     if required:
         raise InputError(f'{path} must have a {message_type} topic, got none; {_listing(topics, fitting)}')
     return None

@@ -118,7 +118,7 @@ class JointDecoder(Decoder):
         if self.asked and self.seen and not self.n_fitting:
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
             raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}; '
-                             'correct the names in the table description, or choose another topic by --joint-topic')
+                             'correct the names in the table description, or choose another topic', key='joint_topic')
 
     def _checked(self, samples, n_messages):
         self.n_messages += n_messages

@@ -90,9 +90,9 @@ def test_topics_are_chosen_by_name_then_default_then_type(tmp_path):
     with open_recording(tmp_path / 'bag') as recording:
         assert (recording.imu_topic, recording.joint_topic, recording.temperature_topic) == ('/my/imu', '/my/joints', '/imu/temperature')
         assert [(topic.name, topic.count) for topic in recording.topics] == [('/imu/temperature', 1), ('/my/imu', 20), ('/my/joints', 4)]
-    with pytest.raises(InputError, match='--imu-topic must name a sensor_msgs/msg/Imu topic of .*, got /imu; choose one of /my/imu'):
+    with pytest.raises(InputError, match='must be a sensor_msgs/msg/Imu topic of .*, got /imu; choose one of /my/imu'):
         open_recording(tmp_path / 'bag', imu_topic='/imu')
-    with pytest.raises(InputError, match='--joint-topic .* got /my/imu; choose one of /my/joints'):
+    with pytest.raises(InputError, match='must be a sensor_msgs/msg/JointState topic .* got /my/imu; choose one of /my/joints'):
         open_recording(tmp_path / 'bag', joint_topic='/my/imu')
     write_session(tmp_path / 'alone', imu)
     with pytest.raises(InputError, match='must have a sensor_msgs/msg/JointState topic, got none; it holds /imu/data_raw'):

@@ -54,7 +54,7 @@ def test_a_shaft_recording_is_read_whole(recordings):
 
 @pytest.mark.real_data
 def test_several_imus_without_the_default_name_are_refused_with_a_list(recordings):
-    with pytest.raises(InputError, match='/imu_1/data_raw, /imu_3/data_raw, .* --imu-topic'):
+    with pytest.raises(InputError, match='/imu_1/data_raw, /imu_3/data_raw, .* choose one'):
         open_recording(recordings / 'array_2', want_joints=False)
     with open_recording(recordings / 'array_2', imu_topic='imu_3/data_raw', want_joints=False) as recording:
         assert recording.imu_topic == '/imu_3/data_raw'

@@ -12,6 +12,10 @@ from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
 from imu_calibration.samples import SampleBlock
 from msg_adapters.bag import open_recording
+from msg_adapters.bag_writer import BagWriter
+from msg_adapters.definitions import standard_definition
+from msg_adapters.encode import encode_imu, rows
+from msg_adapters.imu import IMU_TYPE
 from msg_adapters.write import write_session
 
 from worlds.physics import make_session, write_bag
@@ -166,8 +170,8 @@ def in_kelvin(imu, joints, temperature):
 FAULTS = (
     (in_g, 'force_unit', REFUSE, ('m/s^2', 'looks like g', 'accelerometer_scale 0.101972')),
     (in_mg, 'force_unit', REFUSE, ('mg', 'accelerometer_scale 101.972')),
-    (in_counts, 'force_unit', REFUSE, ('counts', '--nominal FILE')),
-    (in_counts, 'rate_unit', REFUSE, ('counts', '--nominal FILE')),
+    (in_counts, 'force_unit', REFUSE, ('counts', 'nominal scaling')),
+    (in_counts, 'rate_unit', REFUSE, ('counts', 'nominal scaling')),
     (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'look like deg/s', 'gyroscope_scale 57.29578')),
     (twice_converted, 'rate_unit', REFUSE, ('twice',)),
     (mirrored_gyroscope, 'handedness', REFUSE, ("the gyroscope's y is minus the accelerometer's y", 'left-handed')),
@@ -359,7 +363,7 @@ def several_topics(folder, session, imu=1, joints=1, temperature=1):
     return folder / 'bag'
 
 
-VERBS = {'inspect': [], 'calibrate': ['--output', 'OUT'], 'diagnose': ['--table', 'TABLE', '--output', 'OUT'],
+VERBS = {'calibrate': ['--output', 'OUT'], 'diagnose': ['--table', 'TABLE', '--output', 'OUT'],
          'calibrate on a table': ['--table', 'TABLE', '--output', 'OUT'], 'compensate': ['--calibration', 'CALIBRATION', '--output', 'OUT']}
 
 
@@ -384,6 +388,36 @@ def test_two_topics_of_a_type_are_refused_with_their_names(capsys, tmp_path, ses
     assert printed.out == '' and len(printed.err.splitlines()) == 1
     assert f'/{kind}_0, /{kind}_1' in printed.err and '--' in printed.err
     assert not (tmp_path / 'out').exists()
+
+
+def test_inspect_looks_at_every_imu(capsys, tmp_path, session):
+    bag = several_topics(tmp_path, session, imu=2)
+    assert main(['inspect', str(bag)]) == 0
+    listing, *looks = capsys.readouterr().out.split('\n\n')
+    assert [look.splitlines()[0].strip() for look in looks] == ['/imu_0', '/imu_1']
+    assert all('force unit' in look for look in looks)
+    assert {line.split()[0] for line in listing.splitlines() if line.rstrip().endswith('read')} == {'/imu_0', '/imu_1', '/joints_0', '/temperature_0'}
+    assert main(['inspect', str(bag), '--imu-topic', '/imu_1']) == 0
+    assert '\n/imu_0\n' not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('kind', ('joints', 'temperature'))
+def test_inspect_says_which_topics_it_leaves_alone(capsys, tmp_path, session, kind):
+    assert main(['inspect', str(several_topics(tmp_path, session, **{kind: 2}))]) == 0
+    line, = (line for line in capsys.readouterr().out.splitlines() if line.startswith('not read'))
+    assert f'/{kind}_0, /{kind}_1' in line and line.endswith(f'(--{kind.rstrip("s")}-topic)')
+
+
+@pytest.mark.parametrize('bad', (0, 1))
+def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, table, bad):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(2):
+            imu = in_g(session.imu, None, None)[0] if k == bad else session.imu
+            topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
+            bag.write(np.full(len(imu), topic), imu.stamp_ns, rows(encode_imu(imu)))
+    assert main(['inspect', str(tmp_path / 'bag')]) == 3
+    assert 'it looks like g;' in capsys.readouterr().out
+    assert main(['inspect', str(tmp_path / 'bag'), '--imu-topic', f'/imu_{1 - bad}']) == 0
 
 
 def test_the_only_topic_of_a_type_is_taken_whatever_its_name(capsys, tmp_path, session):

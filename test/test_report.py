@@ -129,7 +129,7 @@ def test_every_parameter_is_there_with_the_digits_that_it_deserves(on_table, pag
 
 
 @pytest.mark.parametrize(('name', 'word', 'next_step'), (
-    ('on_table', 'Good', 'compensate'), ('by_hand', 'Weak', 'give it with --gravity'), ('demanding', 'Weak', 'accelerometer.accel_size_effect')))
+    ('on_table', 'Good', 'compensate'), ('by_hand', 'Weak', 'give the local gravity'), ('demanding', 'Weak', 'accelerometer.accel_size_effect')))
 def test_the_verdict_comes_first_with_its_next_step(pages, name, word, next_step):
     head = pages[name][:pages[name].index('<nav>')]
     assert f'<p class="word">{word}</p>' in head

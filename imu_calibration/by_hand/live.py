@@ -202,9 +202,9 @@ class LiveByHand:
     def question(self):
         """Return None: what the model gets wrong is asked of recordings."""
 
-    def status(self):
-        """Return the HandStatus: what there is, and the pose or turn that helps most."""
-        status = hand_status(self.found, self.result and self.result.calibration, self._gravity is None)
+    def status(self, hints=None):
+        """Return the HandStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
+        status = hand_status(self.found, self.result and self.result.calibration, self._gravity is None, hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 

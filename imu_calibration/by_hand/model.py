@@ -64,7 +64,7 @@ class HandModel:
         strange = [e.name for e in self.model.effects if e.name not in ('bias', 'matrix') and not possible_by_hand(e)]
         if strange:
             raise InputError(f'calibration by hand knows gravity and the turns between poses, {", ".join(strange)} cannot be seen from them; '
-                             'give --table, or leave it out')
+                             'give a table, or leave it out', key='table')
 
     @cached_property
     def extras(self):

@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST, ByHandSettings
 from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes
 from imu_calibration.calibration.verdict import SCALES
+from imu_calibration.errors import with_hint
 from imu_calibration.segmentation.static_detector import find_still
 
 FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
@@ -61,7 +62,7 @@ def look_for_poses(imu, windows):
     return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
 
 
-def hand_status(found, calibration, gravity_unknown):
+def hand_status(found, calibration, gravity_unknown, hints=None):
     """
     Return the HandStatus.
 
@@ -72,10 +73,12 @@ def hand_status(found, calibration, gravity_unknown):
         The last solution.
     gravity_unknown : bool
         Whether the standard gravity stands in for the local one.
+    hints : dict, optional
+        As for `errors.with_hint`.
 
     """
     not_seen = unseen(found)
-    word, needs = _needs(found, not_seen, calibration, gravity_unknown)
+    word, needs = _needs(found, not_seen, calibration, gravity_unknown, hints or {})
     values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
               **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
               'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
@@ -97,7 +100,7 @@ def unseen(found):
     return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
 
 
-def _needs(found, not_seen, calibration, gravity_unknown):
+def _needs(found, not_seen, calibration, gravity_unknown, hints):
     if found.attitudes < POSES_LEAST or calibration is None:
         still = f'hold it still with {not_seen[0]} up' if not_seen else 'hold it still in an attitude between two faces'
         more = f' (not seen yet: {", ".join(not_seen)})' if len(not_seen) > 1 else ''
@@ -106,7 +109,7 @@ def _needs(found, not_seen, calibration, gravity_unknown):
     if not lacking:
         return 'determined', []
     if gravity_unknown and set(lacking) <= set(SCALES):
-        return 'weak', ["give the local gravity (parameter 'gravity'), which scales the accelerometer as a whole"]
+        return 'weak', [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
     return 'weak', list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 
 

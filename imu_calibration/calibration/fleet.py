@@ -39,6 +39,8 @@ class UnitResult:
     """0, 1 or 3, as for a single calibration."""
     error: str = ''
     """Why the unit was refused, one line."""
+    key: str | None = None
+    """What has to be given, a key of `errors.KEYS`."""
     files: dict | None = None
     """File name -> text."""
 
@@ -59,7 +61,7 @@ class FleetStep:
         try:
             return self._calibrated(unit)
         except ImuCalibrationError as error:
-            return UnitResult(unit.name, error=' '.join(str(error).split()))
+            return UnitResult(unit.name, error=' '.join(str(error).split()), key=error.key)
         except Exception as error:   # a fleet goes on past a unit, whatever is the matter with it
             return UnitResult(unit.name, error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}')
 

@@ -89,7 +89,7 @@ def naming(names, session):
         except ImuCalibrationError as error:
             if len(names) < 2:
                 raise
-            raise type(error)(f'{names[session]}: {error}') from error
+            raise error.named(names[session]) from error
     return call
 
 

@@ -33,10 +33,14 @@ class CalibrationResult:
     """What was asked for."""
 
 
-def summary(result):
-    """Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people (see `verdict`)."""
+def summary(result, hints=None):
+    """
+    Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people (see `verdict`).
+
+    `hints` as for `errors.with_hint`.
+    """
     found = judge(result.calibration, result.tolerances)
-    return found.word, found.lines
+    return found.word, found.lines(hints)
 
 
 def exit_code(result):

@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.calibration.document import HELD, WEAK, implausible
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import with_hint
 from imu_calibration.units import for_people, significant
 
 GOOD, BAD, NOTE = 'good', 'bad', 'note'
@@ -33,6 +34,8 @@ class Reason:
     """What was seen."""
     next: str
     """What to do about it; empty when nothing has to be done."""
+    key: str | None = None
+    """What has to be given for it, a key of `errors.KEYS`."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,12 @@ class Verdict:
     reasons: tuple
     """Reason, ..."""
 
-    @property
-    def lines(self):
-        """Reasons and next steps, a line each."""
+    def lines(self, hints: dict[str, str] | None = None) -> list[str]:
+        """Return reasons and next steps, a line each; `hints` as for `errors.with_hint`."""
         lines = []
         for reason in self.reasons:
             lines.append(reason.what if reason.word in (GOOD, self.word) else f'{reason.word}: {reason.what}')
-            lines += [f'next: {reason.next}'] if reason.next else []
+            lines += [f'next: {with_hint(reason.next, reason.key, hints or {})}'] if reason.next else []
         return list(dict.fromkeys(lines))
 
 
@@ -123,7 +125,8 @@ def _undetermined(calibration):
         names = [n for n, s in zip(calibration.param_names, calibration.status) if s == status and requested(n)]
         if status == WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
-            reasons.append(Reason(WEAK, f'{listed(scale)}: the local gravity was not given, which scales them together', 'give it with --gravity'))
+            what = f'{listed(scale)}: the local gravity was not given, which scales them together'
+            reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity'))
         for next_step, members in _by_need(calibration, names).items():
             reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step))
     return reasons

@@ -24,7 +24,6 @@ def run(options):
         raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
     imus = []
     for topic in options.imu_topic:
-        options.joint_topic = options.temperature_topic = None
         recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
         blocks = recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()
         preflight = Preflight()

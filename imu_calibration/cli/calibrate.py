@@ -10,6 +10,7 @@ from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.cli import recordings
+from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.pool import jobs_for, process_mapper
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import show_calibration, warn
@@ -57,7 +58,7 @@ def _into(folder, options, settings, table):
         from imu_calibration.report.calibration_page import calibration_report
         files.write_text(folder / 'report.html', calibration_report(result))
     files.write_text(folder / 'calibration.yaml', text)
-    show_calibration(result, folder, report=not options.no_report)
+    show_calibration(result, folder, hints_of(options), report=not options.no_report)
     return exit_code(result)
 
 

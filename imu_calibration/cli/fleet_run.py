@@ -8,9 +8,11 @@ from argparse import Namespace
 from imu_calibration import files
 from imu_calibration.calibration.fleet import FleetStep, fleet_exit_code, summarise
 from imu_calibration.cli.fleet_units import find_units, unit_of
+from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, warn
+from imu_calibration.errors import with_hint
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
@@ -34,7 +36,7 @@ def run_fleet(options, table, settings):
     files.write_text(folder / 'summary.csv', parameters_csv(spreads))
     files.write_text(folder / 'units.csv', units_csv(results))
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
-    show_fleet(results, spreads, folder)
+    show_fleet(results, spreads, folder, hints_of(options))
     return fleet_exit_code(results)
 
 
@@ -84,7 +86,7 @@ def shown(spread):
 COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
 
 
-def show_fleet(results, spreads, folder):
+def show_fleet(results, spreads, folder, hints):
     """Print the spread of each parameter, the units, and where the files are."""
     from rich.table import Table
     out, table = console(), Table(box=None, pad_edge=False)
@@ -94,7 +96,7 @@ def show_fleet(results, spreads, folder):
         table.add_row(*shown(spread))
     out.print(table)
     for result in results:
-        out.print(f'{result.name}: {result.error or result.verdict}', soft_wrap=True, markup=False)
+        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict}', soft_wrap=True, markup=False)
         if result.calibration is not None:
             warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
     calibrated = sum(result.calibration is not None for result in results)

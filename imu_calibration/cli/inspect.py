@@ -1,17 +1,20 @@
 """``imu_calibration inspect``: what a recording holds, what looks wrong with it, and what it can determine."""
 
 from collections import Counter
+from dataclasses import dataclass
 
 from imu_calibration import files
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.cli import recordings
+from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, show_findings
-from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.errors import ImuCalibrationError, with_hint
 from imu_calibration.preflight.checks import Preflight, unusable
 from imu_calibration.preflight.finding import REFUSE
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from msg_adapters.bag import KEYS, Recording, imu_topics, topics_of
 
 NAME = 'inspect'
 HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions found, and which parameters the recording can determine.'
@@ -27,55 +30,101 @@ def add_arguments(parser):
     recordings.add_model_arguments(parser)
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one Imu topic of a recording is like, with the joints and temperatures that go with it."""
+
+    recording: Recording
+    """The recording, closed again."""
+    checks: dict
+    """'imu', 'joints' or 'temperature' -> StreamCheck."""
+    findings: tuple
+    """What looks wrong."""
+    lost: Counter
+    """Reason -> messages that could not be read."""
+
+    @property
+    def refused(self):
+        """Whether a finding says that a calibration would be wrong."""
+        return any(finding.severity == REFUSE for finding in self.findings)
+
+    @property
+    def exit_code(self):
+        """0, or 3 where something is lost, unusable or refused."""
+        counts = any(check.counts for check in self.checks.values())
+        return 3 if self.refused or self.lost or counts or unusable(self.findings) else 0
+
+
 def run(options):
-    """Read once for streams and checks, and once more with the table for the motions."""
+    """Read each Imu topic once for streams and checks, and once more with the table for the motions."""
     table = files.read_table(options.table) if options.table else None
     settings = recordings.calibration_options(options)
-    preflight = Preflight(None if table is None else table.gravity_value, settings.nominal)
+    looks = [_look(options, table, settings.nominal, topic) for topic in _topics(options)]
     out = console()
-    with recordings.open_bag(options.bag, options, want_joints='optional') as recording:
-        checks, drops = _read(recording, preflight)
-        lost = Counter(recording.lost)
-    _show_topics(out, recording, {name: check.statistics() for name, check in checks.items()})
-    show_findings(out, preflight.findings)
-    for reason, count in (drops + lost).items():
-        out.print(f'lost: {count} {reason}')
-    refused = any(finding.severity == REFUSE for finding in preflight.findings)
-    lacking = drops or lost or any(check.counts for check in checks.values())
-    code = 3 if refused or lacking or unusable(preflight.findings) else 0
-    return _judge(options, settings, table, out, code) if table is not None and not refused else code
+    _show_topics(out, looks)
+    _show_unread(out, looks[0].recording, hints_of(options))
+    code = 0
+    for look in looks:
+        out.print()
+        if len(looks) > 1:
+            out.print(f'{look.recording.imu_topic}', style='bold')
+        show_findings(out, look.findings, hints_of(options))
+        for reason, count in look.lost.items():
+            out.print(f'lost: {count} {reason}')
+        judge = table is not None and not look.refused
+        code = max(code, look.exit_code, _judge(options, settings, table, out, look.recording.imu_topic) if judge else 0)
+    return code
 
 
-def _read(recording, preflight):
-    checks, drops = {name: StreamCheck() for _, name in TOPICS}, Counter()
-    with progress_bar('inspect', recording.message_counts.get(recording.imu_topic, 0)) as advance:
-        for block in preflight.watch(recording.blocks(), strict=False):
-            drops.update(block.dropped or {})
-            for name, check in checks.items():
-                check.push(getattr(block, name))
-            if block.imu is not None:
-                advance(len(block.imu))
+def _topics(options):
+    """Return the Imu topics to look at: the one that was asked for, or all."""
+    if options.imu_topic is None:
+        return imu_topics(topics_of(recordings.existing(options.bag))) or [None]
+    return [options.imu_topic]
+
+
+def _look(options, table, nominal, topic):
+    """Read one Imu topic through."""
+    preflight, checks, lost = Preflight(table and table.gravity_value, nominal), {name: StreamCheck() for _, name in TOPICS}, Counter()
+    with recordings.open_bag(options.bag, options, want_joints='optional', want_temperature='optional', imu_topic=topic) as recording:
+        with progress_bar('inspect', recording.message_counts.get(recording.imu_topic, 0)) as advance:
+            for block in preflight.watch(recording.blocks(), strict=False):
+                lost.update(block.dropped or {})
+                for name, check in checks.items():
+                    check.push(getattr(block, name))
+                if block.imu is not None:
+                    advance(len(block.imu))
+        lost.update(recording.lost)
     for check in checks.values():
         check.finish()
-    return checks, drops
+    return Look(recording, checks, preflight.findings, lost)
 
 
-def _show_topics(out, recording, statistics):
+def _show_topics(out, looks):
     """Print the topics; those that are read come with what their stamps say."""
     from rich.table import Table
-    used = {getattr(recording, attribute): name for attribute, name in TOPICS if getattr(recording, attribute)}
+    used = {getattr(look.recording, attribute): look.checks[name].statistics() for look in looks for attribute, name in TOPICS
+            if getattr(look.recording, attribute)}
     table = Table(box=None, pad_edge=False, header_style='dim')
     for heading in ('topic', 'type', 'messages', 'Hz', 'seconds', 'gaps', 'stamp step', ''):
         table.add_column(heading, justify='right' if heading in ('messages', 'Hz', 'seconds', 'gaps', 'stamp step') else 'left')
-    for topic in sorted(recording.topics, key=lambda topic: topic.name not in used):
-        found = statistics.get(used.get(topic.name))
+    for topic in sorted(looks[0].recording.topics, key=lambda topic: topic.name not in used):
+        found = used.get(topic.name)
         if found is None or not found.count:
             table.add_row(topic.name, topic.type, str(topic.count), style='dim')
         else:
             gaps = f'{found.n_gaps} ({found.gap_total:.2f} s)' if found.n_gaps else 'none'
             table.add_row(topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps, _step(found.stamp_step_ns), 'read')
     out.print(table)
-    out.print()
+
+
+def _show_unread(out, recording, hints):
+    """Print which topics were left alone because there is no telling which one belongs to the IMU."""
+    for message_type, key in KEYS.items():
+        names = [topic.name for topic in recording.topics if topic.type == message_type]
+        if names and getattr(recording, key) is None:
+            text = f'not read: {", ".join(names)}, no telling which belongs to the IMU; choose one'
+            out.print(with_hint(text, key, hints), soft_wrap=True)
 
 
 def _step(step_ns):
@@ -86,12 +135,13 @@ def _step(step_ns):
     return f'{step_ns} ns' if step_ns else ''
 
 
-def _judge(options, settings, table, out, code):
-    source = recordings.source_of(options.bag, options, table.joint_names)
+def _judge(options, settings, table, out, topic):
+    """Print which motions were found and which parameters they determine; return the exit code."""
+    source = recordings.source_of(options.bag, options, table.joint_names, imu_topic=topic)
     try:
         result = calibrate([source], table, settings)
     except ImuCalibrationError as error:
-        out.print(f'not usable for calibration: {error}', soft_wrap=True, markup=False)
+        out.print(f'not usable for calibration: {error.told(hints_of(options))}', soft_wrap=True, markup=False)
         return 3
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
@@ -103,4 +153,4 @@ def _judge(options, settings, table, out, code):
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
     for direction in result.calibration.undetermined:
         out.print(f'needs: {direction["needs"]}  ({", ".join(direction["parameters"])})', soft_wrap=True)
-    return max(code, exit_code(result))
+    return exit_code(result)

@@ -3,6 +3,7 @@
 import os
 import sys
 
+from imu_calibration.cli.hints import hints_of
 from imu_calibration.errors import ImuCalibrationError
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -17,7 +18,7 @@ def main(arguments=None):
     try:
         return options.run(options)
     except ImuCalibrationError as error:
-        print(f'imu_calibration {options.verb}: {error}', file=sys.stderr)
+        print(f'imu_calibration {options.verb}: {error.told(hints_of(options))}', file=sys.stderr)
         return 1
     except BrokenPipeError:
         return 1

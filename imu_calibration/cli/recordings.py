@@ -70,12 +70,21 @@ def nominal_of(path):
     return NominalScaling(**{name: float(value) for name, value in mapping.items()})
 
 
-def open_bag(path, options, want_joints=True, imu_topic=None):
-    """Open a recording with the topics that the options name."""
+def existing(path):
+    """Return the path of a bag that is there."""
     if not Path(path).exists():
         raise InputError(f'the bag {path} must exist, there is nothing there; correct the path')
-    return open_recording(path, imu_topic or options.imu_topic, getattr(options, 'joint_topic', None), getattr(options, 'temperature_topic', None),
-                          want_joints=want_joints)
+    return path
+
+
+def open_bag(path, options, want_joints=True, imu_topic=None, want_temperature=True):
+    """Open a recording with the topics that the options name."""
+    return open_recording(existing(path), *_topics(options, imu_topic), want_joints=want_joints, want_temperature=want_temperature)
+
+
+def _topics(options, imu_topic):
+    """Return the names of the topics that the options choose: IMU, joints, temperature."""
+    return imu_topic or options.imu_topic, getattr(options, 'joint_topic', None), getattr(options, 'temperature_topic', None)
 
 
 def read_blocks(path, topics, joint_names, want_joints, label, quiet=False):
@@ -99,8 +108,7 @@ def lost_block(recording):
 
 def source_of(path, options, joint_names=None, want_joints=True, imu_topic=None, quiet=False):
     """Return a callable that yields the blocks of a recording, each time anew."""
-    topics = (imu_topic or options.imu_topic, getattr(options, 'joint_topic', None), getattr(options, 'temperature_topic', None))
-    return partial(read_blocks, str(path), topics, joint_names, want_joints, Path(path).name, quiet)
+    return partial(read_blocks, str(path), _topics(options, imu_topic), joint_names, want_joints, Path(path).name, quiet)
 
 
 def provenance_of(paths, options):

@@ -1,6 +1,7 @@
 """What the verbs print: short tables on standard output."""
 
 from imu_calibration.calibration.result import summary
+from imu_calibration.errors import with_hint
 from imu_calibration.preflight.finding import SEVERITIES
 from imu_calibration.units import for_people, with_sd
 
@@ -23,8 +24,8 @@ def warn(found):
 STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}
 
 
-def show_findings(out, findings):
-    """Print findings on a console, the worst first."""
+def show_findings(out, findings, hints):
+    """Print findings on a console, the worst first; `hints` as for `errors.with_hint`."""
     from rich.table import Table
     from rich.text import Text
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -32,15 +33,16 @@ def show_findings(out, findings):
     table.add_column(no_wrap=True, style='bold')
     table.add_column(overflow='fold')
     for finding in sorted(findings, key=lambda found: SEVERITIES.index(found.severity)):
-        table.add_row(Text(finding.severity, STYLES[finding.severity]), finding.check.replace('_', ' '), Text(finding.text))
+        text = with_hint(finding.text, finding.key, hints)
+        table.add_row(Text(finding.severity, STYLES[finding.severity]), finding.check.replace('_', ' '), Text(text))
     out.print(table)
 
 
-def show_calibration(result, folder, report=True):
+def show_calibration(result, folder, hints, report=True):
     """Print the parameters, the verdict and where the files are."""
     from rich.table import Table
     out, calibration = console(), result.calibration
-    verdict, lines = summary(result)
+    verdict, lines = summary(result, hints)
     table = Table(title=None, box=None, pad_edge=False)
     for heading in ('parameter', 'value', 'sd', 'unit', 'status'):
         table.add_column(heading, justify='right' if heading in ('value', 'sd') else 'left')

@@ -131,7 +131,7 @@ def refuse_corrected(topic):
 
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
-        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic with --imu-topic")
+        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic", key='imu_topic')
 
 
 def requested_transfer(frame_id, xyz, rpy):
@@ -147,7 +147,8 @@ def requested_transfer(frame_id, xyz, rpy):
     if frame_id:
         return Transfer.from_pose(frame_id, xyz, rpy)
     if any(xyz) or any(rpy):
-        raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well')
+        raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well',
+                         key='target_frame')
     return None
 
 

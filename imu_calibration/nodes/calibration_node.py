@@ -18,6 +18,7 @@ from imu_calibration.nodes.batches import BatchSubscription
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, accumulator_file
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
@@ -77,7 +78,8 @@ class CalibrationNode(Node):
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self.worker = CalibrationWorker(self._gatherer, self._make_live, self.settings.save_file, self.settings.autosave_period,
-                                        self._publish_document, self._publish_residuals, self._complain, self._table is None)
+                                        self._publish_document, self._publish_residuals, self._complain, self._table is None,
+                                        HINTS['calibration_node'])
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         for what in ('solve', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', lambda request, response, what=what: self._serve(what, response))
@@ -160,7 +162,7 @@ class CalibrationNode(Node):
 
 def main(arguments=None):
     """Run the node; return the exit code."""
-    return run_node(CalibrationNode, arguments)
+    return run_node(CalibrationNode, arguments, hints=HINTS['calibration_node'])
 
 
 if __name__ == '__main__':

@@ -67,14 +67,18 @@ class CalibrationWorker(threading.Thread):
         Called with one line when something cannot be used.
     by_hand : bool
         Whether there is no table, and so no joint states.
+    hints : dict, optional
+        As for `errors.with_hint`.
 
     """
 
-    def __init__(self, gatherer, make_live, save_file, autosave_period, on_calibration, on_residuals, on_trouble, by_hand=False):
+    def __init__(self, gatherer, make_live, save_file, autosave_period, on_calibration, on_residuals, on_trouble, by_hand=False,
+                 hints=None):
         super().__init__(name='calibration', daemon=True)
         self.gatherer, self.make_live = gatherer, make_live
         self.save_file, self.autosave_period = Path(save_file).expanduser(), autosave_period
         self.on_calibration, self.on_residuals, self.on_trouble = on_calibration, on_residuals, on_trouble
+        self.hints = hints or {}
         self.live = make_live(resume=True)
         self.failure = None
         self.state = WorkerState(groups=self.live.groups())
@@ -132,7 +136,7 @@ class CalibrationWorker(threading.Thread):
             self._watch.note(block, now)
             windows = self.live.push(block)
         except ImuCalibrationError as error:
-            self._complain(str(error))
+            self._complain(error.told(self.hints))
             return
         if block.imu is not None or block.joints is not None:
             self._closed = False
@@ -150,7 +154,7 @@ class CalibrationWorker(threading.Thread):
             try:
                 success, message = True, getattr(self, '_' + request.what)()
             except ImuCalibrationError as error:
-                success, message = False, str(error)
+                success, message = False, error.told(self.hints)
             self._tell()   # who asked looks at the diagnostics next
             request.answer(success, message)
 
@@ -166,10 +170,10 @@ class CalibrationWorker(threading.Thread):
             if idle:
                 self._diagnosis.want()
         except NotObservableError as error:
-            self._trouble = str(error)
+            self._trouble = error.told(self.hints)
         except ImuCalibrationError as error:
-            self._trouble = str(error)
-            self._complain(str(error))
+            self._trouble = error.told(self.hints)
+            self._complain(error.told(self.hints))
 
     def _diagnose_when_due(self):
         n_windows = self.live.n_windows
@@ -190,7 +194,7 @@ class CalibrationWorker(threading.Thread):
     def _solve(self):
         self._publish_solution(pending=True)
         self._diagnosis.want()
-        verdict, lines = summary(self.live.result)
+        verdict, lines = summary(self.live.result, self.hints)
         return f'{verdict} ({self.live.n_windows} {"poses" if self._by_hand else "windows"})' + ''.join(f'; {line}' for line in lines)
 
     def _save(self):
@@ -220,7 +224,7 @@ class CalibrationWorker(threading.Thread):
                 self._save_accumulator(pending=False)
             except ImuCalibrationError as error:
                 self._saved = (time.monotonic(), n_windows)
-                self._complain(str(error))
+                self._complain(error.told(self.hints))
 
     def _complain(self, line):
         self._trouble = line
@@ -230,7 +234,7 @@ class CalibrationWorker(threading.Thread):
         now, counts = time.monotonic(), self.live.counts
         self._watch.note_counts(counts, now)
         result = self.live.result
-        verdict, lines = ('', ()) if result is None else summary(result)
+        verdict, lines = ('', ()) if result is None else summary(result, self.hints)
         gathered = 'poses' if self._by_hand else 'windows'
         values = {gathered: self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
@@ -240,7 +244,7 @@ class CalibrationWorker(threading.Thread):
             groups = self.live.groups()
         else:
             groups = self.state.groups
-        hand, diagnosis = (self.live.status(), None) if self._by_hand else (None, self._diagnosis_state())
+        hand, diagnosis = (self.live.status(self.hints), None) if self._by_hand else (None, self._diagnosis_state())
         self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values,
                                  hand, diagnosis)
 

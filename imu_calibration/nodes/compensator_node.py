@@ -16,6 +16,7 @@ from imu_calibration.errors import DocumentError, ImuCalibrationError, InputErro
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.parameters import declare_parameters
@@ -117,7 +118,7 @@ class CompensatorNode(Node):
                 raise DocumentError(f'{strange[0]}; calibrate again')
             self._check_frame(calibration.frame_id)
         except ImuCalibrationError as error:
-            return self._refuse(source, str(error))
+            return self._refuse(source, error.told(HINTS['compensator_node']))
         chosen = self.settings
         compensation = LiveCompensation(calibration, self._transfer, chosen.check_frame_id, chosen.parameter_covariance,
                                         chosen.correct_stamps)
@@ -186,7 +187,7 @@ class CompensatorNode(Node):
 
 def main(arguments=None):
     """Run the node; return the exit code."""
-    return run_node(CompensatorNode, arguments, CompensatorNode.spin)
+    return run_node(CompensatorNode, arguments, CompensatorNode.spin, HINTS['compensator_node'])
 
 
 if __name__ == '__main__':

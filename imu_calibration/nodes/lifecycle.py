@@ -9,7 +9,7 @@ from rclpy.executors import ExternalShutdownException
 from imu_calibration.errors import ImuCalibrationError
 
 
-def run_node(make_node, arguments=None, spin=None):
+def run_node(make_node, arguments=None, spin=None, hints=None):
     """
     Run one node until the process is asked to end, and return the exit code.
 
@@ -22,6 +22,8 @@ def run_node(make_node, arguments=None, spin=None):
         Command line; default ``sys.argv``.
     spin : callable, optional
         Called with the node, returns or raises ExternalShutdownException when the context ends; default ``rclpy.spin``.
+    hints : dict, optional
+        As for `errors.with_hint`.
 
     """
     # rclpy's handler, installed by init, ends the wait; without this line Python would also raise KeyboardInterrupt in mid-write.
@@ -37,7 +39,7 @@ def run_node(make_node, arguments=None, spin=None):
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except ImuCalibrationError as error:
-        print(f'error: {error}', file=sys.stderr, flush=True)
+        print(f'error: {error.told(hints or {})}', file=sys.stderr, flush=True)
         return 1
     except Exception:
         # A context that ends while something is being made or published fails in many ways; none of them is news.

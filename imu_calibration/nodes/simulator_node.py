@@ -17,6 +17,7 @@ from imu_calibration import files
 from imu_calibration.calibration.document import DETERMINED, Calibration, calibration_to_text
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
@@ -187,7 +188,7 @@ class SimulatorNode(Node):
 
 def main(arguments=None):
     """Run the node; return the exit code."""
-    return run_node(SimulatorNode, arguments)
+    return run_node(SimulatorNode, arguments, hints=HINTS['simulator_node'])
 
 
 if __name__ == '__main__':

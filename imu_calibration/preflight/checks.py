@@ -60,7 +60,7 @@ def refuse(findings):
     """Raise the first finding that makes the result wrong as an InputError."""
     for finding in findings:
         if finding.severity == REFUSE:
-            raise InputError(finding.text)
+            raise InputError(finding.text, key=finding.key)
 
 
 def warnings(findings):

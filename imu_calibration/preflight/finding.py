@@ -19,6 +19,8 @@ class Finding:
     """What must hold, what came, what to do; for GOOD what was seen."""
     samples: int = 0
     """Samples that are unusable because of it and that no other count holds."""
+    key: str | None = None
+    """What has to be given, a key of `errors.KEYS`."""
 
     def named(self, name):
         """Return the finding with the name of its recording before the text."""

@@ -77,13 +77,13 @@ def _rate_units(moments):
         return
     if 40 < ratio < 80:
         yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
-                      'convert them in the driver or give --nominal FILE with gyroscope_scale 57.29578')
+                      'convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578', key='nominal')
     elif 1 / 80 < ratio < 1 / 40:
         yield Finding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
                       'degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
         yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
-                      'give --nominal FILE with gyroscope_offset and gyroscope_scale')
+                      'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
 
 
 def _axes(sensor, moments, table):
@@ -150,6 +150,7 @@ def check_force(length):
     """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
     if 0.8 < length < 1.25:
         raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
-                         f'give --nominal with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}')
+                         f'give a nominal scaling with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}', key='nominal')
     if not 3.0 < length < 30.0:
-        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; give --nominal with offset and scale')
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; '
+                         'give a nominal scaling with offset and scale', key='nominal')

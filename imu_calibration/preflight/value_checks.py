@@ -34,37 +34,43 @@ def force_unit(evidence):
     if length is None:
         return
     came = f'specific force must be in m/s^2, its length {"at rest" if evidence.rest is not None else "in the middle"} is {length:.4g}: '
+    convert = 'convert it in the driver or give a nominal scaling with accelerometer_scale'
     if 0.8 < length < 1.25:
-        yield Finding('force_unit', REFUSE, f'{came}it looks like g; convert it in the driver or give --nominal FILE with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}')
+        yield _unit('force_unit', f'{came}it looks like g; {convert} {1 / STANDARD_GRAVITY:.6f}')
     elif 800 < length < 1250:
-        yield Finding('force_unit', REFUSE, f'{came}it looks like mg; convert it in the driver or give --nominal FILE with accelerometer_scale '
-                      f'{1000 / STANDARD_GRAVITY:.6g}')
+        yield _unit('force_unit', f'{came}it looks like mg; {convert} {1000 / STANDARD_GRAVITY:.6g}')
     elif not 3.0 < length < 30.0:
-        yield Finding('force_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with accelerometer_offset and accelerometer_scale')
+        yield _unit('force_unit', f'{came}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale')
     else:
         yield Finding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
+
+
+def _unit(check, text):
+    """Return the refusal of a unit that a nominal scaling would put right."""
+    return Finding(check, REFUSE, text, key='nominal')
 
 
 def rate_unit(evidence):
     """Angular rate is in rad/s: gravity turns by what the rates add up to."""
     turning = evidence.turning
     largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
+    scaling = 'give a nominal scaling with gyroscope_offset and gyroscope_scale'
     if turning is not None:
         ratio = 1.0 / turning.factor
         came = f'angular rates must be in rad/s, they are {significant(ratio)} times what turns the measured gravity: '
         if 0.6 < ratio * DEG < 1.6:
-            yield Finding('rate_unit', REFUSE, f'{came}they look like deg/s; convert them in the driver or give --nominal FILE with gyroscope_scale 57.29578')
+            yield _unit('rate_unit', f'{came}they look like deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
         elif 0.6 < ratio / DEG < 1.6:
-            yield Finding('rate_unit', REFUSE, f'{came}they look as if converted from deg/s twice; convert once, or give --nominal FILE with '
-                          'gyroscope_scale 0.01745329')
+            yield _unit('rate_unit', f'{came}they look as if converted from deg/s twice; convert once, or give a nominal scaling with '
+                                     'gyroscope_scale 0.01745329')
         elif not 0.5 < ratio < 2.0:
-            yield Finding('rate_unit', REFUSE, f'{came}counts or volts?; give --nominal FILE with gyroscope_offset and gyroscope_scale')
+            yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
         else:
             yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
     elif largest > FASTEST:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
-        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
-                      'convert them in the driver or give --nominal FILE with gyroscope_offset and gyroscope_scale')
+        yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
+                                 f'convert them in the driver or {scaling}')
 
 
 def handedness(evidence):

@@ -1,4 +1,4 @@
-"""Named motions of a turntable: what `simulate --profile NAME` can run."""
+"""Named motions of a turntable, for the verb simulate and the simulator node."""
 
 from dataclasses import dataclass
 from functools import partial

@@ -66,7 +66,7 @@ def hidden_effect(name, joint_names, seed=0, share=0.3):
     model = SensorModel(joint_names=tuple(joint_names)).with_effect(sensor, name)
     effect = next(e for e in model.effects if (e.sensor, e.name) == (sensor, name))
     if not effect.plausible:
-        raise InputError(f"effect '{name}' cannot be simulated by name; use --calibration with a file that contains it")
+        raise InputError(f"effect '{name}' cannot be simulated by name; simulate with a calibration that contains it", key='calibration')
     rng = np.random.default_rng([seed, 11])
     values = share * effect.plausible[-1][1] * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
     if name.endswith('_bandwidth'):
