@@ -32,11 +32,11 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast test-oldest validate bench soak hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast test-oldest validate config bench soak hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, test-oldest, validate, bench, soak, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-fast, test-oldest, validate, config, bench, soak, hide-and-seek, clean'
 
 setup: $(STAMP)
 
@@ -76,6 +76,10 @@ validate: $(STAMP)-validate
 $(STAMP)-validate: $(STAMP) constraints/validate.txt
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/validate.txt
 	@touch $@
+
+# The parameter files of the nodes from what the nodes declare.
+config: $(STAMP)
+	@$(PY) config/write.py
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

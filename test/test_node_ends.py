@@ -57,6 +57,8 @@ def test_interrupted_while_ros_starts():
 
 
 def test_other_programs_keep_their_interrupt(monkeypatch):
-    assert not is_node_process() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    handler = "import signal, sys; before = signal.getsignal(signal.SIGINT); import imu_calibration.nodes; "
+    done = subprocess.run([sys.executable, '-c', handler + 'sys.exit(signal.getsignal(signal.SIGINT) is not before)'], env=environment(), timeout=60)
+    assert done.returncode == 0 and not is_node_process()
     monkeypatch.setattr(sys, 'argv', ['/opt/ros/lib/imu_calibration/calibration_node', '--ros-args'])
     assert is_node_process()

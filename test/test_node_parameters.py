@@ -1,66 +1,26 @@
-"""
-The parameter files in config/ are the declarations of the nodes, with their defaults.
+"""The parameter files in config/ are the declarations of the nodes, with their defaults; ``make config`` writes them."""
 
-Run as a program, this writes the files anew: ``.venv/bin/python test/test_node_parameters.py``.
-"""
-
-import ast
 import difflib
-import importlib
-import json
-import textwrap
+import runpy
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 
-from imu_calibration.settings import describe
+from imu_calibration.settings import describe, setting
 
 ROOT = Path(__file__).resolve().parents[1]
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
-
-
-def settings_of(node):
-    """Settings classes that the module of `node` declares as parameters."""
-    name = f'imu_calibration.nodes.{node}'
-    tree = ast.parse(ROOT.joinpath(*name.split('.')).with_suffix('.py').read_text())
-    calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
-    module = importlib.import_module(name)
-    return [getattr(module, call.args[1].id) for call in sorted(calls, key=lambda call: call.lineno)]
-
-
-def rendered(node):
-    """Text of the parameter file of `node`."""
-    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and what you see when it is wrong.', '/**:', '  ros__parameters:']
-    for group in settings_of(node):
-        for name, default, unit, text, bounds, symptom in describe(group):
-            words = text + (f' [{unit}]' if unit not in ('', '1') else '') + range_text(bounds) + (f'. When wrong: {symptom}' if symptom else '')
-            lines += textwrap.wrap(words, 120, initial_indent='    # ', subsequent_indent='    # ')
-            lines.append(f'    {name}: {value_text(default)}')
-    return '\n'.join(lines) + '\n'
-
-
-def range_text(bounds):
-    """Say which values are allowed."""
-    low, high = (bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds)
-    if high is not None:
-        return f', {low} to {high}' if low is not None else f', at most {high}'
-    return f', at least {low}' if low is not None else ''
-
-
-def value_text(value):
-    """Write `value` so that YAML reads the same type back."""
-    if isinstance(value, tuple):
-        return '[' + ', '.join(map(value_text, value)) + ']'
-    text = json.dumps(value)
-    return text.replace('e', '.0e') if isinstance(value, float) and 'e' in text and '.' not in text else text
+WRITER = runpy.run_path(str(ROOT / 'config' / 'write.py'))
+NODES, rendered, settings_of, value_text = (WRITER[name] for name in ('NODES', 'rendered', 'settings_of', 'value_text'))
 
 
 @pytest.mark.parametrize('node', NODES)
 def test_parameter_file_is_the_declaration(node):
     written, declared = (ROOT / 'config' / f'{node}.yaml').read_text(), rendered(node)
     difference = '\n'.join(difflib.unified_diff(written.splitlines(), declared.splitlines(), 'written', 'declared', lineterm=''))
-    assert not difference, f'run python {Path(__file__).name}\n{difference}'
+    assert not difference, f'run make config\n{difference}'
 
 
 @pytest.mark.parametrize('node', NODES)
@@ -77,6 +37,28 @@ def test_values_keep_their_type(value):
     assert (tuple(read) if isinstance(value, tuple) else read) == value and isinstance(read, (type(value), list))
 
 
-if __name__ == '__main__':
-    for each in NODES:
-        (ROOT / 'config' / f'{each}.yaml').write_text(rendered(each))
+def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys):
+    for node in NODES[1:]:
+        (tmp_path / f'{node}.yaml').write_text(rendered(node))
+    WRITER['main'](tmp_path)
+    assert capsys.readouterr().out == f'written: {tmp_path}/{NODES[0]}.yaml\n'
+    assert (tmp_path / f'{NODES[0]}.yaml').read_text() == rendered(NODES[0])
+
+
+def test_a_new_setting_is_a_parameter_and_a_line_of_its_file(monkeypatch):
+    """Nothing but the declaration is touched."""
+    node_module = pytest.importorskip('imu_calibration.nodes.compensator_node')
+    from imu_calibration.nodes.parameters import declare_parameters
+
+    @dataclass(frozen=True)
+    class Wider(node_module.CompensatorSettings):
+        """With one more setting."""
+
+        patience: float = setting(2.5, 's', 'how long to wait', (0.0, 9.0), 'it waits too long')
+
+    class Bench:
+        def declare_parameter(self, name, default, descriptor):
+            return SimpleNamespace(value=3.5 if name == 'patience' else default, descriptor=descriptor)
+    monkeypatch.setattr(node_module, 'CompensatorSettings', Wider)
+    assert '    # how long to wait [s], 0 to 9. When wrong: it waits too long\n    patience: 2.5\n' in rendered('compensator_node')
+    assert declare_parameters(Bench(), Wider).patience == 3.5

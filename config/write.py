@@ -1,0 +1,66 @@
+"""
+Writes the parameter files of the nodes from the settings that they declare: ``make config``.
+
+A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and what a wrong value looks like.
+"""
+
+import ast
+import importlib
+import json
+import textwrap
+from pathlib import Path
+
+from imu_calibration.settings import describe
+
+ROOT = Path(__file__).resolve().parents[1]
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+
+
+def main(folder=ROOT / 'config'):
+    """Write one file for each node, and say which have changed."""
+    for node in NODES:
+        path = folder / f'{node}.yaml'
+        text = rendered(node)
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+            print(f'written: {path}')
+
+
+def settings_of(node):
+    """Return the settings classes that the module of `node` declares as parameters."""
+    name = f'imu_calibration.nodes.{node}'
+    tree = ast.parse(ROOT.joinpath(*name.split('.')).with_suffix('.py').read_text())
+    calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
+    module = importlib.import_module(name)
+    return [getattr(module, call.args[1].id) for call in sorted(calls, key=lambda call: call.lineno)]
+
+
+def rendered(node):
+    """Return the text of the parameter file of `node`."""
+    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and what you see when it is wrong.', '/**:', '  ros__parameters:']
+    for group in settings_of(node):
+        for name, default, unit, text, bounds, symptom in describe(group):
+            words = text + (f' [{unit}]' if unit not in ('', '1') else '') + range_text(bounds) + (f'. When wrong: {symptom}' if symptom else '')
+            lines += textwrap.wrap(words, 120, initial_indent='    # ', subsequent_indent='    # ')
+            lines.append(f'    {name}: {value_text(default)}')
+    return '\n'.join(lines) + '\n'
+
+
+def range_text(bounds):
+    """Return which values are allowed."""
+    low, high = (bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds)
+    if high is not None:
+        return f', {low} to {high}' if low is not None else f', at most {high}'
+    return f', at least {low}' if low is not None else ''
+
+
+def value_text(value):
+    """Return `value` so that YAML reads the same type back."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(map(value_text, value)) + ']'
+    text = json.dumps(value)
+    return text.replace('e', '.0e') if isinstance(value, float) and 'e' in text and '.' not in text else text
+
+
+if __name__ == '__main__':
+    main()
