@@ -79,7 +79,7 @@ $(STAMP)-validate: $(STAMP) constraints/validate.txt
 
 # The parameter files of the nodes from what the nodes declare.
 config: $(STAMP)
-	@$(PY) config/write.py
+	@$(PY) -m imu_calibration.nodes.parameter_files
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

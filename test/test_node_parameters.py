@@ -1,7 +1,6 @@
 """The parameter files in config/ are the declarations of the nodes, with their defaults; ``make config`` writes them."""
 
 import difflib
-import runpy
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +8,10 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
+from imu_calibration.nodes.parameter_files import NODES, main, rendered, settings_of, value_text
 from imu_calibration.settings import describe, setting
 
 ROOT = Path(__file__).resolve().parents[1]
-WRITER = runpy.run_path(str(ROOT / 'config' / 'write.py'))
-NODES, rendered, settings_of, value_text = (WRITER[name] for name in ('NODES', 'rendered', 'settings_of', 'value_text'))
 
 
 @pytest.mark.parametrize('node', NODES)
@@ -40,7 +38,7 @@ def test_values_keep_their_type(value):
 def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys):
     for node in NODES[1:]:
         (tmp_path / f'{node}.yaml').write_text(rendered(node))
-    WRITER['main'](tmp_path)
+    main(tmp_path)
     assert capsys.readouterr().out == f'written: {tmp_path}/{NODES[0]}.yaml\n'
     assert (tmp_path / f'{NODES[0]}.yaml').read_text() == rendered(NODES[0])
 

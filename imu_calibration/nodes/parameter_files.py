@@ -1,5 +1,5 @@
 """
-Writes the parameter files of the nodes from the settings that they declare: ``make config``.
+Parameter files of the nodes, written from the settings that the nodes declare: ``make config``.
 
 A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and what a wrong value looks like.
 """
@@ -12,11 +12,10 @@ from pathlib import Path
 
 from imu_calibration.settings import describe
 
-ROOT = Path(__file__).resolve().parents[1]
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
 
 
-def main(folder=ROOT / 'config'):
+def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
     """Write one file for each node, and say which have changed."""
     for node in NODES:
         path = folder / f'{node}.yaml'
@@ -26,16 +25,15 @@ def main(folder=ROOT / 'config'):
             print(f'written: {path}')
 
 
-def settings_of(node):
+def settings_of(node: str) -> list[type]:
     """Return the settings classes that the module of `node` declares as parameters."""
-    name = f'imu_calibration.nodes.{node}'
-    tree = ast.parse(ROOT.joinpath(*name.split('.')).with_suffix('.py').read_text())
+    tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
     calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
-    module = importlib.import_module(name)
+    module = importlib.import_module(f'imu_calibration.nodes.{node}')
     return [getattr(module, call.args[1].id) for call in sorted(calls, key=lambda call: call.lineno)]
 
 
-def rendered(node):
+def rendered(node: str) -> str:
     """Return the text of the parameter file of `node`."""
     lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and what you see when it is wrong.', '/**:', '  ros__parameters:']
     for group in settings_of(node):
@@ -46,7 +44,7 @@ def rendered(node):
     return '\n'.join(lines) + '\n'
 
 
-def range_text(bounds):
+def range_text(bounds: tuple) -> str:
     """Return which values are allowed."""
     low, high = (bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds)
     if high is not None:
@@ -54,7 +52,7 @@ def range_text(bounds):
     return f', at least {low}' if low is not None else ''
 
 
-def value_text(value):
+def value_text(value: object) -> str:
     """Return `value` so that YAML reads the same type back."""
     if isinstance(value, tuple):
         return '[' + ', '.join(map(value_text, value)) + ']'
