@@ -50,7 +50,7 @@ setup(
     python_requires='>=3.11',
     install_requires=[
         'numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11',
-        'lz4', 'backports.zstd; python_version < "3.14"',
+        'lz4', 'backports.zstd; python_version < "3.14"', 'urdfdom-py', 'xacro',
     ],
     extras_require={'dask': ['dask', 'distributed']},
     zip_safe=False,

@@ -4,6 +4,8 @@ import math
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2: the g of people's units, never the gravity of a place."""
+STANDARD_GRAVITY_SD = 0.02
+"""What it may be off by where nobody knows the local gravity, m/s^2."""
 MILLI_G = 1e-3 * STANDARD_GRAVITY
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 DEG = math.pi / 180

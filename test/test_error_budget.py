@@ -11,7 +11,8 @@ from imu_calibration.calibration.error_budget import ReferenceErrors, _Faster, _
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
-from imu_calibration.reference.table import Table, tilt
+from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES

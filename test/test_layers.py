@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EDGE = {'cli', 'nodes', 'resources', '__main__'}
 ROS = {'rclpy', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
-LATE = {'yaml', 'matplotlib', 'jinja2', 'rich'}
+LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
 
 BLOCKED_IMPORTS = '''
 import importlib, sys

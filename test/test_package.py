@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node'}
 ROSDEP_KEYS = {
     'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip',
+    'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
     # installed with those that need them; compression is in the standard library from Python 3.14 on
     'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
 }

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.reference.earth import normal_gravity
 from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table, tilt
+from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
 from worlds import physics, physics_table

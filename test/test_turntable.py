@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
+from imu_calibration.reference.axis_angles import axis_error_directions, with_axis_angles
 from imu_calibration.reference.earth import earth_rate_n
+from imu_calibration.reference.joint import TYPES, Joint, Mimic
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.levelling import tilt
 from imu_calibration.reference.reference_motion import skew
-from imu_calibration.reference.table import Joint, Table, axis_error_directions, tilt, with_axis_errors
+from imu_calibration.reference.table import Table
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
               'gravity': 9.81}
@@ -25,8 +28,16 @@ directions = coordinate_axes | vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 @st.composite
+def chain_joints(draw, number_):
+    """A joint that turns or slides, with its frame turned or not; some follow the first one."""
+    mimic = Mimic('joint0', 2 * draw(number), draw(number)) if number_ and draw(st.integers(0, 3)) == 0 else None
+    degrees = draw(st.just((0.0, 0.0, 0.0)) | vectors.map(lambda v: tuple(180 * x for x in v)))
+    return Joint(f'joint{number_}', draw(directions), draw(vectors), degrees, draw(st.sampled_from(TYPES)), mimic)
+
+
+@st.composite
 def tables(draw):
-    joints = [Joint(f'joint{k}', draw(directions), draw(vectors)) for k in range(draw(st.integers(1, 4)))]
+    joints = [draw(chain_joints(k)) for k in range(draw(st.integers(1, 4)))]
     degrees = tuple(180 * x for x in draw(vectors))
     return Table(joints, up=draw(directions), gravity=9.81, latitude=draw(st.none() | st.floats(-90, 90)),
                  azimuth_deg=draw(st.none() | number), mount_rpy_deg=degrees, mount_xyz=draw(st.none() | vectors))
@@ -35,8 +46,8 @@ def tables(draw):
 def joint_motion(table, seed, time):
     """Sines about a ramp; every second joint of an odd seed stands still."""
     rng = np.random.default_rng(seed)
-    angle, rate, amplitude, pulsation, phase = rng.uniform(-1.0, 1.0, (5, len(table.joints))) * [[3.0], [2.0], [0.5], [3.0], [3.0]]
-    moving = np.arange(len(table.joints)) % 2 < 2 - seed % 2
+    angle, rate, amplitude, pulsation, phase = rng.uniform(-1.0, 1.0, (5, len(table.joint_names))) * [[3.0], [2.0], [0.5], [3.0], [3.0]]
+    moving = np.arange(len(table.joint_names)) % 2 < 2 - seed % 2
     rate, amplitude = rate * moving, amplitude * moving
     argument = pulsation * time[:, None] + phase
     return JointMotion(time, angle + rate * time[:, None] + amplitude * np.sin(argument), rate + amplitude * pulsation * np.cos(argument),
@@ -47,9 +58,15 @@ def pose(table, position):
     """Return attitude (sensor to level) and place of the reference point by products of rotations, one link after the other."""
     turn = Rotation.from_matrix(table.mat_nb)
     place = np.zeros(3)
-    for joint, angle in zip(table.joints, position, strict=True):
+    at = dict(zip(table.joint_names, position, strict=True))
+    for joint in table.joints:
         place = place + turn.apply(joint.xyz)
-        turn = turn * Rotation.from_rotvec(angle * np.array(joint.axis))
+        turn = turn * Rotation.from_euler('xyz', joint.rpy_deg, degrees=True)
+        moved = at[joint.source] if joint.mimic is None else joint.mimic.multiplier * at[joint.source] + joint.mimic.offset
+        if joint.turns:
+            turn = turn * Rotation.from_rotvec(moved * np.array(joint.axis))
+        else:
+            place = place + turn.apply(moved * np.array(joint.axis))
     place = place + turn.apply(table.mount_xyz or (0.0, 0.0, 0.0))
     return turn * Rotation.from_euler('xyz', table.mount_rpy_deg, degrees=True), place
 
@@ -122,7 +139,7 @@ def test_joints_that_stand_still_are_not_special():
 
 
 def test_long_records_are_the_same_as_their_pieces():
-    table = with_axis_errors(Table.from_mapping(THREE_AXES), [[0, 0], [1e-3, 2e-3], [0, 1e-3]])
+    table = with_axis_angles(Table.from_mapping(THREE_AXES), [1e-3, 2e-3])
     motion = joint_motion(table, 0, np.linspace(0, 20, 20001))
     whole, part = reference_motion(table, motion), reference_motion(table, motion.select(slice(9000, 9010)))
     np.testing.assert_array_equal(whole.mat_sn[9000:9010], part.mat_sn)
@@ -183,13 +200,14 @@ def test_tilt_turns_up_and_north_together(table, angles):
 
 
 @given(axis=directions, error=st.tuples(number, number))
-def test_axis_errors_turn_about_the_declared_directions(axis, error):
-    table = Table([Joint('a', axis)], gravity=9.81)
+def test_axes_that_should_be_parallel_turn_about_the_declared_directions(axis, error):
+    table = Table([Joint('a', axis), Joint('rail', (1, 0, 0), type='prismatic'), Joint('b', axis)], gravity=9.81)
+    assert table.joint_names.angles == ('a_b_u', 'a_b_v')
     axis = np.array(table.joints[0].axis)
     triad = np.vstack([axis_error_directions(axis), axis])
     np.testing.assert_allclose(triad @ triad.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(triad) > 0
-    turned = with_axis_errors(table, [error]).joints[0].axis
+    turned = with_axis_angles(table, error).joints[2].axis
     np.testing.assert_allclose(turned, Rotation.from_rotvec(np.array(error) @ triad[:2]).apply(axis), atol=1e-12)
 
 
@@ -212,7 +230,7 @@ joint_noise_rad: 5e-6
 mount: {rpy_deg: [0, 0, 90], xyz: null}
 """
     table = Table.from_mapping(yaml.safe_load(text))
-    assert table.joint_names == ('outer', 'inner')
+    assert table.joint_names.read == ('outer', 'inner')
     assert table.joints[0].axis == (0.0, 0.0, 1.0)
     assert table.joint_noise_rad == 5e-6
     assert table.gravity_value == pytest.approx(9.8089 - 3.086e-6 * 500, abs=2e-4)

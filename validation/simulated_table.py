@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.reference.table import Joint, Table
+from imu_calibration.reference.joint import Joint
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session

@@ -11,7 +11,7 @@ from imu_calibration.calibration.from_solution import conditions, preflight_stat
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import parse_effects
 from imu_calibration.errors import InputError
@@ -19,9 +19,6 @@ from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_force
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
-
-GRAVITY_SD = 0.02
-"""What the standard gravity may be off by where nobody knows the local one, m/s^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +110,7 @@ def calibrate_samples_by_hand(recording, gravity=None, tolerances=None, provenan
 
 def reference_gravity(gravity):
     """Return (gravity, its sd): as given, or the standard one with what it may be off by, m/s^2."""
-    return (STANDARD_GRAVITY, GRAVITY_SD) if gravity is None else (gravity, 0.0)
+    return (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if gravity is None else (gravity, 0.0)
 
 
 def document_of_hand(hand, gathered, n_samples, tolerances=None, provenance=None):

@@ -9,6 +9,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import find_effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.reference.joint import JointNames
 
 FORMAT = 'imu_calibration/1'
 SECTIONS = SENSORS + ('reference',)
@@ -108,6 +109,8 @@ def to_mapping(calibration):
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
     document['joint_names'] = list(calibration.model.joint_names)
+    if (errors := calibration.model.joint_names.errors) is not None:
+        document['joint_errors'] = errors
     document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
     document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
     for name in ('statistics', 'conditions', 'provenance'):
@@ -173,7 +176,7 @@ def _check_format(found):
 
 
 def _parse(document):
-    joint_names = tuple(document.get('joint_names', ('outer', 'middle', 'inner')))
+    joint_names = JointNames.of(document.get('joint_names', ('outer', 'middle', 'inner')), document.get('joint_errors'))
     members = {section: [] for section in SECTIONS}
     entries = {}
     for section in SECTIONS:

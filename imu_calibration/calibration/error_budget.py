@@ -17,7 +17,7 @@ from imu_calibration.effects.forward_equations import coefficient_jacobian, sens
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.table import tilt
+from imu_calibration.reference.levelling import tilt
 from imu_calibration.settings import setting
 
 MOVING_SAMPLES = 20_000

@@ -41,7 +41,7 @@ def choose_model(options, table, temperature_c=None):
     else:
         reference = tuple(name for name in options.reference_model.split('+') if name not in ('', 'none'))
     reference_c = 25.0 if temperature_c is None else float(round(temperature_c))
-    return SensorModel(accelerometer, gyroscope, reference, tuple(names), reference_c)
+    return SensorModel(accelerometer, gyroscope, reference, names, reference_c)
 
 
 def settle_model(model, options, gathered):

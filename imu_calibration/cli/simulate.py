@@ -63,7 +63,7 @@ def run(options):
 
 
 def _truth(options, table):
-    names = tuple(table.joint_names)
+    names = table.joint_names
     if options.calibration:
         calibration = files.read_calibration(options.calibration)
         if calibration.model.reference and set(calibration.model.joint_names) != set(names):

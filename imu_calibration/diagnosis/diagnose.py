@@ -145,7 +145,7 @@ def _that_help(attempt, named):
 
 def with_joints_of(model, table):
     """Return the model with the joints of the table."""
-    return model if tuple(model.joint_names) == tuple(table.joint_names) else replace(model, joint_names=tuple(table.joint_names))
+    return model if model.joint_names == table.joint_names else replace(model, joint_names=table.joint_names)
 
 
 def _without_clipping(windows, table, model):

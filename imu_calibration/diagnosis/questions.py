@@ -65,7 +65,7 @@ def sort_effects(model, why_not):
     """
     known, lacking = [], []
     have = {(e.sensor, e.name) for e in model.effects}
-    for key, effect in catalogue(tuple(model.joint_names)).items():
+    for key, effect in catalogue(model.joint_names).items():
         if key in have:
             continue
         why = why_not(effect)

@@ -13,13 +13,13 @@ __all__ = ['AXES', 'SENSORS', 'Effect', 'catalogue', 'find_effect', 'owner_of']
 @lru_cache(maxsize=8)
 def catalogue(joint_names=('outer', 'middle', 'inner')):
     """Return every effect by (sensor, name) for a table with these joints."""
-    every = ACCELEROMETER + GYROSCOPE + reference_effects(tuple(joint_names))
+    every = ACCELEROMETER + GYROSCOPE + reference_effects(joint_names)
     return {(effect.sensor, effect.name): effect for effect in every if effect.size}
 
 
 def find_effect(sensor, name, joint_names=('outer', 'middle', 'inner')):
     """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
-    effects = catalogue(tuple(joint_names))
+    effects = catalogue(joint_names)
     if (sensor, name) not in effects:
         known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
         raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
@@ -28,8 +28,8 @@ def find_effect(sensor, name, joint_names=('outer', 'middle', 'inner')):
 
 def owner_of(name, joint_names=('outer', 'middle', 'inner')):
     """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
-    owners = [sensor for sensor, known in catalogue(tuple(joint_names)) if known == name]
+    owners = [sensor for sensor, known in catalogue(joint_names) if known == name]
     if len(owners) != 1:
-        known = sorted({known for _, known in catalogue(tuple(joint_names))} - {'bias', 'matrix'})
+        known = sorted({known for _, known in catalogue(joint_names)} - {'bias', 'matrix'})
         raise InputError(f"effect '{name}' is unknown or ambiguous; choose from {', '.join(known)}")
     return owners[0]

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import Effect
-from imu_calibration.reference.kinematics import rotation
-from imu_calibration.reference.table import shifted, tilt, with_encoder_harmonics
+from imu_calibration.reference.axis_angles import with_axis_angles
+from imu_calibration.reference.encoder import with_encoder_harmonics
+from imu_calibration.reference.joint import JointNames
+from imu_calibration.reference.joint_delay import shifted
+from imu_calibration.reference.levelling import tilt
 
 LAGUERRE = np.polynomial.laguerre.laggauss(5)
 """Nodes and weights that turn an exponential lag into a weighted mean of delays: int e^-x f(t - tau x) dx."""
@@ -24,25 +27,24 @@ def _tilt_derivative(ref):
 
 
 def _axes(table, motion, values):
-    """Turn each axis but the first about the common perpendicular with the axis before it, so that their angle changes."""
-    joints = list(table.joints)
-    for k, angle in enumerate(values, start=1):
-        before, axis = np.asarray(table.joints[k - 1].axis, float), np.asarray(table.joints[k].axis, float)
-        normal = np.cross(before, axis)
-        turned = rotation(angle * normal / np.linalg.norm(normal)) @ axis
-        joints[k] = replace(joints[k], axis=tuple(turned))
-    return [(1.0, replace(table, joints=tuple(joints)), motion)]
+    """Turn each axis against the axis before it."""
+    return [(1.0, with_axis_angles(table, values), motion)]
 
 
 def _zero(table, motion, values):
     """Shift the joints between the first and the last: the first one's zero is the azimuth, the last one's belongs to the mount."""
     offset = np.zeros(motion.position.shape[1])
-    offset[1:-1] = values
+    offset[_columns(table, table.joint_names.zeros)] = values
     return [(1.0, table, replace(motion, position=motion.position + offset))]
 
 
+def _columns(table, names):
+    return [table.joint_names.index(name) for name in names]
+
+
 def _harmonics(table, motion, values):
-    amplitudes = np.reshape(values, (-1, len(ORDERS), 2))
+    amplitudes = np.zeros((motion.position.shape[1], len(ORDERS), 2))
+    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ORDERS), 2))
     for index, order in enumerate(ORDERS):
         motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], amplitudes[:, index, 1])
     return [(1.0, table, motion)]
@@ -72,20 +74,20 @@ def _lag_effect(sensor):
 
 
 def reference_effects(joint_names):
-    """Return the effects of a table with these joints, of its clock, and of the sensors' lags."""
-    names, n_joints = list(joint_names), len(joint_names)
+    """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
+    names = JointNames.of(joint_names)
     return (
         Effect('table_tilt', 'reference', ('x', 'y'), (2,), 'rad', 1e-4, 2e-3,
                'The table does not stand level: its vertical is turned by a small angle about the base axes.', ('turn_about_vertical',), 'none',
                warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),)),
-        Effect('axis_non_orthogonality', 'reference', tuple(f'{a}_{b}' for a, b in zip(names, names[1:])), (max(n_joints - 1, 0),), 'rad',
-               1e-4, 0.01, 'The axes of the table are not perpendicular to one another.', ('two_axis', 'static_dense'), 'none',
+        Effect('axis_non_orthogonality', 'reference', names.angles, (len(names.angles),), 'rad',
+               1e-4, 0.01, 'The axes of the table do not stand at the angles to one another that its description says.', ('two_axis', 'static_dense'), 'none',
                warp=_axes, needs=('joints', 'two_joints'), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),)),
-        Effect('encoder_zero', 'reference', tuple(names[1:-1]), (max(n_joints - 2, 0),), 'rad', 1e-4, 0.01,
+        Effect('encoder_zero', 'reference', names.zeros, (len(names.zeros),), 'rad', 1e-4, 0.01,
                'The zero of an inner joint angle is not where the table description says.', ('static_dense',), 'none',
                warp=_zero, needs=('joints', 'three_joints'), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),)),
-        Effect('encoder_harmonic', 'reference', tuple(f'{name}_{kind}{order}' for name in names for order in ORDERS for kind in ('cos', 'sin')),
-               (n_joints, len(ORDERS), 2), 'rad', 1e-4, 0.01,
+        Effect('encoder_harmonic', 'reference', tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
+               (len(names.turning), len(ORDERS), 2), 'rad', 1e-4, 0.01,
                'The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).', ('slow_turn',), 'none',
                warp=_harmonics, needs=('joints',), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),)),
         Effect('time_offset', 'reference', ('offset',), (), 's', 1e-4, 0.1, 'The IMU stamps are late against the joint stamps.',

@@ -9,6 +9,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import find_effect
 from imu_calibration.effects.regressors import WIDTH
 from imu_calibration.errors import InputError
+from imu_calibration.reference.joint import JointNames
 
 NAMED_MODELS = {
     'axial': ('bias', 'matrix'),
@@ -49,12 +50,15 @@ class SensorModel:
     """Names of the gyroscope's effects."""
     reference: tuple = ()
     """Names of the effects of table and clock."""
-    joint_names: tuple = ('outer', 'middle', 'inner')
-    """Joints of the table."""
+    joint_names: JointNames = ('outer', 'middle', 'inner')
+    """Joints of the table; a plain sequence of names is taken for turning joints of which no two neighbours are parallel."""
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
     point: dict = field(default_factory=dict)
     """Where the columns were linearised: effect name -> values."""
+
+    def __post_init__(self):
+        object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
 
     def __reduce__(self):
         """Travel to other processes without what was worked out: effects hold functions that cannot be sent."""

@@ -114,7 +114,7 @@ class SimulatorNode(Node):
         if settings.calibration_file:
             calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
             return calibration.model, calibration.values
-        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(self._table.joint_names))
+        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=self._table.joint_names)
         return model, random_values(model, settings.grade, settings.seed if settings.imu_seed < 0 else settings.imu_seed)
 
     def _options(self):

@@ -1,43 +1,61 @@
-"""Exact kinematics of a chain of revolute joints."""
+"""Exact kinematics of a serial chain of joints that turn or slide."""
+
+from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from imu_calibration.reference.earth import earth_rate_n
-from imu_calibration.reference.reference_motion import Reference, skew
+from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.reference.rotations import align, rotation
+
+if TYPE_CHECKING:
+    from imu_calibration.reference.joint_motion import JointMotion
+    from imu_calibration.reference.table import Table
 
 _BLOCK = 8192  # samples whose intermediates fit in the processor's cache
 
 
-def rotation(vector):
-    """Return ``exp(vector x)``, shape (3, 3): the turn by a rotation vector, rad (Rodrigues)."""
-    vector = np.asarray(vector, float)
-    cross = skew(vector)
-    angle = np.linalg.norm(vector)
-    # numpy's sinc is sin(pi x) / (pi x); it has no trouble at zero.
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+class _Link(NamedTuple):
+    """A joint as the recursion needs it."""
+
+    axis: np.ndarray
+    xyz: np.ndarray
+    mat_in: np.ndarray
+    """From the frame of the link before to the joint's frame, shape (3, 3)."""
+    turns: bool
+    column: int
+    """Column of the motion that drives it."""
+    multiplier: float
+    plus: float
 
 
-def align(direction):
-    """Return the smallest rotation that takes the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
-    x, y, z = direction
-    across = x * x + y * y
-    if z < 0 and across < 1e-24:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = skew([y, -x, 0.0])
-    # 1 + z cancels when z is near -1.
-    return np.eye(3) + cross + cross @ cross / (1 + z if z > 0 else across / (1 - z))
+class _Step(NamedTuple):
+    """What happens to vectors on the way out: an offset, a constant matrix, then the joint."""
+
+    offset: np.ndarray
+    matrix: np.ndarray
+    link: _Link | None
+    """The joint that moves, or None after the last one."""
+    sense: float = 1.0
+    third: int = 2
+    """Coordinate axis that the joint turns about, in this sense."""
 
 
-def reference_motion(table, motion, temperature_c=None):
+def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None) -> Reference:
     """
     Return what a perfect sensor at the reference point of the mount feels.
 
-    From link to link, with C the inverse of the joint's turn, a its axis and r the step to its origin::
+    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin and q how far it has turned::
 
         force' = C (force + alpha x r + omega x (omega x r)),   omega' = C omega + a q',
         alpha' = C alpha + a q'' + (C omega) x a q'
+
+    and for a joint that has slid by q, after the step r::
+
+        force' = force + alpha x a q + omega x (omega x a q) + 2 omega x a q' + a q''
 
     starting at the base with gravity (upwards) and, when latitude and azimuth are known, the Earth's rate.
 
@@ -46,7 +64,7 @@ def reference_motion(table, motion, temperature_c=None):
     table : Table
         The chain.
     motion : JointMotion
-        Joints at the instants wanted, columns in the table's order.
+        Joints at the instants wanted, columns in the order of ``table.joint_names``.
     temperature_c : array, shape (n,), optional
         Passed on.
 
@@ -58,34 +76,34 @@ def reference_motion(table, motion, temperature_c=None):
     n_samples = len(motion.time)
     mat_sn, force_s = np.empty((n_samples, 3, 3)), np.empty((n_samples, 3))
     rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
-    base, mat_sl, gravity = _constants(table)
-    steps = _chain_steps(table, motion, mat_sl)
+    constants = _constants(table)
+    steps = _chain_steps(constants, motion)
     for start in range(0, n_samples, _BLOCK):
         part = slice(start, min(start + _BLOCK, n_samples))
-        columns = _run_chain(base, motion, steps, part)
+        columns = _run_chain(constants.base, motion, steps, part)
         mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
-    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=gravity,
+    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=constants.gravity,
                      temperature_c=temperature_c, motion=motion)
 
 
-def _chain_steps(table, motion, mat_sl):
-    """Return what happens to vectors on the way out: (constant matrix, offset before it, moving joint or None, plane)."""
-    steps, fixed = [], np.eye(3)
-    offset = np.zeros(3)
-    for column, joint in enumerate(table.joints):
-        axis, offset = np.array(joint.axis), offset + fixed.T @ np.array(joint.xyz)
-        if not _moves(motion, column):
-            angle = motion.position[0, column] if len(motion.time) else 0.0
-            fixed = rotation(-angle * axis) @ fixed
+def _chain_steps(constants, motion):
+    """Return the `_Step`s; joints that stand still are folded into the constant matrix and the offset of the next one."""
+    steps, matrix, offset = [], np.eye(3), np.zeros(3)
+    for link in constants.links:
+        offset = offset + matrix.T @ link.xyz
+        matrix = link.mat_in @ matrix
+        if not _moves(motion, link.column):
+            at = link.plus + (link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0)
+            if link.turns:
+                matrix = rotation(-at * link.axis) @ matrix
+            else:
+                offset = offset + matrix.T @ (at * link.axis)
             continue
-        before, sense, third = _to_coordinate_axis(axis)
-        steps.append((before @ fixed, offset, column, sense, third))
-        fixed, offset = before.T, np.zeros(3)
-    if table.mount_xyz is not None:
-        offset = offset + fixed.T @ np.array(table.mount_xyz)
-    steps.append((mat_sl @ fixed, offset, None, 1.0, 2))
-    return steps
+        before, sense, third = _to_coordinate_axis(link.axis) if link.turns else (np.eye(3), 1.0, 2)
+        steps.append(_Step(offset, before @ matrix, link, sense, third))
+        matrix, offset = before.T, np.zeros(3)
+    return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
 
 
 def _moves(motion, column):
@@ -103,13 +121,28 @@ def _to_coordinate_axis(axis):
     return align(axis), 1.0, 2
 
 
+class _Constants(NamedTuple):
+    """What the recursion needs of a table."""
+
+    base: np.ndarray
+    """`_base_columns`."""
+    links: tuple
+    mount_xyz: np.ndarray
+    mat_sl: np.ndarray
+    gravity: float
+
+
 @lru_cache(maxsize=64)
 def _constants(table):
-    """Return `_base_columns`, the mount's matrix and gravity: thousands of short windows share one table."""
-    constants = _base_columns(table), table.mat_sl
-    for array in constants:
+    """Return the `_Constants`: thousands of short windows share one table."""
+    columns = {name: column for column, name in enumerate(table.joint_names)}
+    links = tuple(_Link(np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, joint.turns, columns[joint.source],
+                        *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset))) for joint in table.joints)
+    mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
+    constants = _Constants(_base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value)
+    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in link[:3])):
         array.flags.writeable = False
-    return *constants, table.gravity_value
+    return constants
 
 
 def _base_columns(table):
@@ -125,23 +158,45 @@ def _base_columns(table):
 
 def _run_chain(columns, motion, steps, part):
     """Return the columns of `_base_columns` at the sensor, in its frame, shape (3, 6, n)."""
-    for matrix, offset, column, sense, third in steps:
-        if offset.any():
+    for step in steps:
+        if step.offset.any():
             columns = columns.copy()
-            columns[:, 5] += _arm_force(columns[:, 3], columns[:, 4], offset)
-        if not np.array_equal(matrix, np.eye(3)):
-            columns = np.tensordot(matrix, columns, 1)
-        if column is not None:
-            values = (motion.position, motion.rate, motion.acceleration)
-            columns = _turn(columns, third, *(sense * value[part, column] for value in values))
+            columns[:, 5] += _arm_force(columns[:, 3], columns[:, 4], step.offset[:, None])
+        if not np.array_equal(step.matrix, np.eye(3)):
+            columns = np.tensordot(step.matrix, columns, 1)
+        if step.link is not None:
+            columns = _move(columns, step, motion, part)
     return np.broadcast_to(columns, (3, 6, part.stop - part.start))
 
 
+def _move(columns, step, motion, part):
+    """Bring `columns` past a joint that moves."""
+    link = step.link
+    factor = step.sense * link.multiplier
+    position, rate, acceleration = (factor * values[part, link.column] for values in (motion.position, motion.rate, motion.acceleration))
+    position += step.sense * link.plus
+    if link.turns:
+        return _turn(columns, step.third, position, rate, acceleration)
+    return _slide(columns, link.axis[:, None], position, rate, acceleration)
+
+
 def _arm_force(rate, alpha, arm):
-    """Return ``alpha x arm + rate x (rate x arm)``, all (3, n) but `arm` (3,)."""
-    along = np.tensordot(arm, rate, 1)
-    squared = (rate * rate).sum(axis=0)
-    return skew(-arm) @ alpha + rate * along - arm[:, None] * squared
+    """Return ``alpha x arm + rate x (rate x arm)``, all shape (3, n) or (3, 1)."""
+    return _cross(alpha, arm) + rate * (rate * arm).sum(axis=0) - arm * (rate * rate).sum(axis=0)
+
+
+def _cross(first, second):
+    """Return the cross product of vectors, shape (3, n)."""
+    return np.stack([first[1] * second[2] - first[2] * second[1], first[2] * second[0] - first[0] * second[2],
+                     first[0] * second[1] - first[1] * second[0]])
+
+
+def _slide(columns, axis, position, rate, acceleration):
+    """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
+    slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
+    spin, alpha = slid[:, 3], slid[:, 4]
+    slid[:, 5] += _arm_force(spin, alpha, axis * position) + 2 * rate * _cross(spin, axis) + axis * acceleration
+    return slid
 
 
 def _turn(columns, third, angle, rate, acceleration):

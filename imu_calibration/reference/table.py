@@ -1,48 +1,34 @@
-"""The turntable: its description, checked, and small errors of it (levelling, axes)."""
+"""The turntable or arm that carries the sensor: its description, checked."""
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.errors import InputError
+from imu_calibration.reference.axis_angles import axis_angles
+from imu_calibration.reference.checked_values import finite_number, require_keys, three_numbers, unit_vector
 from imu_calibration.reference.earth import normal_gravity
-from imu_calibration.reference.encoder import with_encoder_harmonics
-from imu_calibration.reference.joint_delay import shifted
-from imu_calibration.reference.kinematics import align, reference_motion, rotation
-
-__all__ = ['Joint', 'Table', 'axis_error_directions', 'reference_motion', 'shifted', 'tilt', 'with_axis_errors', 'with_encoder_harmonics']
+from imu_calibration.reference.joint import Joint, JointNames, joint_from_mapping, joint_to_mapping
+from imu_calibration.reference.rotations import align, rotation_from_rpy
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
 
 
 @dataclass(frozen=True)
-class Joint:
-    """One revolute joint."""
-
-    name: str
-    """Name in the joint states."""
-    axis: tuple
-    """Unit vector in the frame of the link before it, at joint zero (made unit here)."""
-    xyz: tuple = (0.0, 0.0, 0.0)
-    """A point of the axis, from the origin of the link before it, m; the origin of the link that the joint turns."""
-
-    def __post_init__(self):
-        object.__setattr__(self, 'axis', _unit(self.axis, f"axis of joint '{self.name}'"))
-        object.__setattr__(self, 'xyz', _vector(self.xyz, f"xyz of joint '{self.name}'"))
-
-
-@dataclass(frozen=True)
 class Table:
     """
-    A chain of revolute joints that carries the sensor.
+    A chain of joints that carries the sensor, and where it stands.
 
     The level frame n is the base frame turned by the smallest rotation that makes `up` its z axis (half a turn about
     the base x axis when the base hangs upside down).
     """
 
-    joints: tuple
+    joints: tuple[Joint, ...]
     """Joints from the base outwards."""
-    up: tuple = (0.0, 0.0, 1.0)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Up, a unit vector in the base frame (made unit here)."""
     gravity: float | None = None
     """Local gravity, m/s^2; None: WGS 84 normal gravity from latitude and height."""
@@ -56,20 +42,22 @@ class Table:
     """Heading of the base x axis in the horizontal, clockwise from true north (of the x axis of n when base x is vertical)."""
     joint_noise_rad: float | None = None
     """Noise or resolution of the encoders, rad; None: estimated from the data."""
-    mount_rpy_deg: tuple = (0.0, 0.0, 0.0)
+    joint_error_rad: float | None = None
+    """What zeros and axes of the joints may be off by, a standard deviation, rad; None: they are taken as described unless asked for."""
+    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Inner link to sensor frame, roll, pitch, yaw about fixed axes as in URDF, degrees."""
-    mount_xyz: tuple | None = None
+    mount_xyz: tuple[float, float, float] | None = None
     """Reference point in the frame of the inner link, m; None: its origin, where the axes meet."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         joints = tuple(self.joints)
         _require_joints(joints)
-        checked = {'joints': joints, 'up': _unit(self.up, 'up'), 'mount_rpy_deg': _vector(self.mount_rpy_deg, 'mount rpy_deg')}
+        checked = {'joints': joints, 'up': unit_vector(self.up, 'up'), 'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
         if self.mount_xyz is not None:
-            checked['mount_xyz'] = _vector(self.mount_xyz, 'mount xyz')
+            checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():
             value = getattr(self, name)
-            checked[name] = None if value is None else _number(value, name, low, high, advice)
+            checked[name] = None if value is None else finite_number(value, name, low, high, advice)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:
@@ -77,7 +65,7 @@ class Table:
                              'add gravity in m/s^2, or latitude in degrees (and height)')
 
     @classmethod
-    def from_mapping(cls, mapping):
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'Table':
         """
         Return the table that a mapping, as read from the table's YAML, describes.
 
@@ -87,47 +75,45 @@ class Table:
             When a key is unknown, a joint is missing or a value does not fit.
 
         """
-        _require_keys(mapping, [f.name for f in fields(cls) if not f.name.startswith('mount_')] + ['mount'], 'table')
-        values = {name: value for name, value in mapping.items() if value is not None and name != 'mount'}
-        values['joints'] = [_joint(item) for item in _sequence(mapping.get('joints'))]
-        mount = mapping.get('mount') or {}
-        _require_keys(mount, _MOUNT_KEYS, 'table mount')
-        values.update({f'mount_{name}': value for name, value in mount.items() if value is not None})
-        return cls(**values)
+        return cls(joints=tuple(joint_from_mapping(item) for item in joint_entries(mapping)), **site_from_mapping(mapping))
 
-    def to_mapping(self):
+    def to_mapping(self) -> dict[str, Any]:
         """Return the mapping that `from_mapping` turns into an equal table."""
         mapping = {f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith('mount_')}
-        mapping['joints'] = [{'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)} for joint in self.joints]
+        mapping['joints'] = [joint_to_mapping(joint) for joint in self.joints]
         mapping['up'] = list(self.up)
         mapping['mount'] = {'rpy_deg': list(self.mount_rpy_deg), 'xyz': None if self.mount_xyz is None else list(self.mount_xyz)}
         return mapping
 
-    @property
-    def joint_names(self):
-        """Names of the joints from the base outwards."""
-        return tuple(joint.name for joint in self.joints)
+    @cached_property
+    def joint_names(self) -> JointNames:
+        """Names of the joints that are read, from the base outwards, and of what may be wrong with them."""
+        turning = [joint.source for joint in self.joints if joint.turns]
+        # A zero that nothing but the first or the last axis feels is the azimuth, or belongs to the mount.
+        apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
+        read, turning = (tuple(dict.fromkeys(names)) for names in ((joint.source for joint in self.joints), turning))
+        angles = tuple(angle.name for angle in axis_angles(self.joints))
+        return JointNames(read, turning, tuple(name for name in turning if name not in apart), angles)
 
     @property
-    def gravity_value(self):
+    def gravity_value(self) -> float:
         """Local gravity, m/s^2: as given, else normal gravity."""
         return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)
 
     @property
-    def mat_nb(self):
+    def mat_nb(self) -> np.ndarray:
         """Base frame to level frame, shape (3, 3)."""
         return align(np.array(self.up))
 
     @property
-    def mat_sl(self):
-        """Frame of the inner link to sensor frame, shape (3, 3): inverse of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
-        roll, pitch, yaw = np.radians(self.mount_rpy_deg)
-        return (rotation([0, 0, yaw]) @ rotation([0, pitch, 0]) @ rotation([roll, 0, 0])).T
+    def mat_sl(self) -> np.ndarray:
+        """Frame of the last link to sensor frame, shape (3, 3): inverse of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
+        return rotation_from_rpy(np.radians(self.mount_rpy_deg)).T
 
     @property
-    def azimuth_n_deg(self):
+    def azimuth_n_deg(self) -> float | None:
         """Heading of the x axis of n, degrees clockwise from true north, or None."""
-        return None if self.azimuth_deg is None else self.azimuth_deg + _base_heading_deg(self.mat_nb)
+        return None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
 
 
 _NUMBERS = {
@@ -137,75 +123,29 @@ _NUMBERS = {
     'height': (-12000.0, 1e5, 'give it in m'),
     'azimuth_deg': (-720.0, 720.0, 'give it in degrees clockwise from true north'),
     'joint_noise_rad': (0.0, 0.1, 'give it in rad'),
+    'joint_error_rad': (0.0, 0.1, 'give it in rad'),
 }
 
 
-def tilt(table, angles):
-    """
-    Return the table with its true `up` turned by the rotation vector (tx, ty, 0) of the level frame.
-
-    A levelling error: ``up_true = exp((tx, ty, 0) x) up``, rad. North turns with it, so that the Earth's rate is the same
-    vector of n turned alike; `azimuth_deg` changes where the convention of n asks for it.
-    """
-    mat_bn = table.mat_nb.T @ rotation([angles[0], angles[1], 0.0])
-    tilted = replace(table, up=tuple(mat_bn[:, 2].tolist()))
-    if table.azimuth_deg is None:
-        return tilted
-    azimuth = np.radians(table.azimuth_n_deg)
-    north = tilted.mat_nb @ mat_bn @ np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    azimuth_n_deg = np.degrees(np.arctan2(north[1], north[0]))
-    return replace(tilted, azimuth_deg=float((azimuth_n_deg - _base_heading_deg(tilted.mat_nb)) % 360.0))
+def joint_entries(mapping: Any) -> tuple:
+    """Return the entries of the joints in a table description, none when it has no list of them."""
+    joints = mapping.get('joints') if isinstance(mapping, Mapping) else None
+    return tuple(joints) if isinstance(joints, (list, tuple)) else ()
 
 
-def with_axis_errors(table, errors):
-    """
-    Return the table with each joint axis turned by small angles.
-
-    ``axis_true = exp((errors[j] @ axis_error_directions(axis)) x) axis``.
-
-    Parameters
-    ----------
-    table : Table
-        The nominal table.
-    errors : array, shape (n_joints, 2)
-        Rotation about the two directions of `axis_error_directions`, rad.
-
-    """
-    joints = []
-    for joint, error in zip(table.joints, np.asarray(errors, float), strict=True):
-        turned = rotation(error @ axis_error_directions(joint.axis)) @ np.array(joint.axis)
-        joints.append(replace(joint, axis=tuple(turned.tolist())))
-    return replace(table, joints=tuple(joints))
+def site_from_mapping(mapping: Any) -> dict[str, Any]:
+    """Return what a table description says beside the joints, as arguments of `Table`."""
+    require_keys(mapping, [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'], 'table')
+    values = {name: value for name, value in mapping.items() if value is not None and name not in ('mount', 'joints')}
+    mount = mapping.get('mount') or {}
+    require_keys(mount, _MOUNT_KEYS, 'table mount')
+    return values | {f'mount_{name}': value for name, value in mount.items() if value is not None}
 
 
-def axis_error_directions(axis):
-    """
-    Return two unit vectors u, v that form a right-handed triad u, v, axis; shape (2, 3).
-
-    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal to it; v = axis x u.
-    """
-    axis = np.asarray(axis, float)
-    start = np.eye(3)[np.argmin(np.round(np.abs(axis), 6))]
-    first = start - axis * (axis @ start)
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(axis, first)])
-
-
-def _base_heading_deg(mat_nb):
+def base_heading_deg(mat_nb: np.ndarray) -> float:
+    """Return where the base x axis points in the level frame, degrees counter-clockwise from its x axis; zero when it is vertical."""
     x, y, _ = mat_nb[:, 0]
     return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > 1e-9 else 0.0
-
-
-def _joint(item):
-    _require_keys(item, [f.name for f in fields(Joint)], 'table joint')
-    for key in ('name', 'axis'):
-        if item.get(key) is None:
-            raise InputError(f'table: every joint must have name and axis, got {item!r}; add {key}')
-    return Joint(**{key: value for key, value in item.items() if value is not None})
-
-
-def _sequence(value):
-    return value if isinstance(value, (list, tuple)) else ()
 
 
 def _require_joints(joints):
@@ -215,39 +155,8 @@ def _require_joints(joints):
     for name in names:
         if not isinstance(name, str) or not name or names.count(name) > 1:
             raise InputError(f'table: joint names must be different and not empty, got {names}; use the names of the joint states')
-
-
-def _require_keys(mapping, known, what):
-    if not hasattr(mapping, 'items'):
-        raise InputError(f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description')
-    for key in mapping:
-        if key not in known:
-            raise InputError(f"{what}: key '{key}' is unknown; the keys here are {', '.join(known)}")
-
-
-def _unit(value, what):
-    vector = np.array(_vector(value, what))
-    norm = np.linalg.norm(vector)
-    if norm < 1e-9:
-        raise InputError(f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers')
-    # Idempotent, so that a table written and read again is equal.
-    return tuple((vector / norm if abs(norm - 1) > 4e-16 else vector).tolist())
-
-
-def _vector(value, what):
-    if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != 3:
-        raise InputError(f'table: {what} must be three numbers, got {value!r}; correct it')
-    return tuple(_number(item, what, None, None, 'give three numbers') for item in value)
-
-
-def _number(value, what, low, high, advice):
-    # YAML 1.1 reads 1e-5, without a point, as text.
-    try:
-        number = float('nan') if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = float('nan')
-    if not np.isfinite(number):
-        raise InputError(f'table: {what} must be a finite number, got {value!r}; {advice}')
-    if low is not None and not low <= number <= high:
-        raise InputError(f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}')
-    return number
+    followers = {joint.name for joint in joints if joint.mimic is not None}
+    for joint in joints:
+        if joint.source in followers:
+            raise InputError(f"table: joint '{joint.name}' must follow a joint that moves by itself, '{joint.source}' follows another one; "
+                             'name that one')

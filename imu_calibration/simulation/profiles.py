@@ -94,8 +94,9 @@ def _joint_names(entry, table):
         return tuple(joint['name'] for joint in entry.table['joints'])
     if table is None:
         return THREE_AXIS if entry.n_joints in (None, 3) else THREE_AXIS[:1] + THREE_AXIS[2:]
-    joints = table['joints'] if isinstance(table, dict) else table.joints
-    return tuple(joint['name'] if isinstance(joint, dict) else joint.name for joint in joints)
+    if isinstance(table, dict):
+        return tuple(joint['name'] for joint in table['joints'])
+    return tuple(table.joint_names)
 
 
 def _calibration(builder, rng):

@@ -63,7 +63,7 @@ def random_values(model, grade='industrial', seed=0):
 def hidden_effect(name, joint_names, seed=0, share=0.3):
     """Return (sensor, values) of an effect at a share of its plausible size, with random signs and spread."""
     sensor = owner_of(name, joint_names)
-    model = SensorModel(joint_names=tuple(joint_names)).with_effect(sensor, name)
+    model = SensorModel(joint_names=joint_names).with_effect(sensor, name)
     effect = next(e for e in model.effects if (e.sensor, e.name) == (sensor, name))
     if not effect.plausible:
         raise InputError(f"effect '{name}' cannot be simulated by name; simulate with a calibration that contains it", key='calibration')

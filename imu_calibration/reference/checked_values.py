@@ -1,0 +1,54 @@
+"""Numbers, vectors and mappings of a table description, checked one by one."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+
+
+def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
+    """Refuse what is not a mapping, and keys that are not `known`."""
+    if not isinstance(mapping, Mapping):
+        raise InputError(f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description')
+    for key in mapping:
+        if key not in known:
+            raise InputError(f"{what}: key '{key}' is unknown; the keys here are {', '.join(known)}")
+
+
+def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
+    """Return the direction of three numbers as a unit vector; one that is a unit vector already stays as it is."""
+    vector = np.array(three_numbers(value, what))
+    norm = np.linalg.norm(vector)
+    if norm < 1e-9:
+        raise InputError(f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers')
+    # Idempotent, so that a table written and read again is equal.
+    return tuple((vector / norm if abs(norm - 1) > 4e-16 else vector).tolist())
+
+
+def three_numbers(value: Any, what: str) -> tuple[float, float, float]:
+    """Return three finite numbers."""
+    return several_numbers(value, 3, what)
+
+
+def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
+    """Return `count` finite numbers."""
+    words = {2: 'two', 3: 'three'}[count]
+    if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
+        raise InputError(f'table: {what} must be {words} numbers, got {value!r}; correct it')
+    return tuple(finite_number(item, what, None, None, f'give {words} numbers') for item in value)
+
+
+def finite_number(value: Any, what: str, low: float | None, high: float | None, advice: str) -> float:
+    """Return one finite number within [low, high]."""
+    # YAML 1.1 reads 1e-5, without a point, as text.
+    try:
+        number = float('nan') if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = float('nan')
+    if not np.isfinite(number):
+        raise InputError(f'table: {what} must be a finite number, got {value!r}; {advice}')
+    if low is not None and not low <= number <= high:
+        raise InputError(f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}')
+    return number

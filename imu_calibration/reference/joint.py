@@ -1,0 +1,184 @@
+"""One joint of a chain: how it moves, where it sits, how far and how fast it may go; and the names that a chain's joints go by."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from imu_calibration.reference.checked_values import finite_number, require_keys, several_numbers, three_numbers, unit_vector
+from imu_calibration.reference.rotations import rotation_from_rpy
+
+TYPES = ('revolute', 'prismatic')
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """How far and how fast a joint may go: rad, rad/s, rad/s^2, or m, m/s, m/s^2 of one that slides; None: not known, or no end."""
+
+    lower: float | None = None
+    """Smallest position."""
+    upper: float | None = None
+    """Largest position."""
+    speed: float | None = None
+    """Largest speed."""
+    acceleration: float | None = None
+    """Largest acceleration."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that follows another one: ``position = multiplier * position of the other + offset``."""
+
+    joint: str
+    """Name of the other."""
+    multiplier: float = 1.0
+    """How far it goes for one unit of the other."""
+    offset: float = 0.0
+    """Where it is when the other is at zero, rad or m."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint that turns about its axis or slides along it."""
+
+    name: str
+    """Name in the joint states."""
+    axis: tuple[float, float, float]
+    """Unit vector in the joint's frame, that of the link it moves at joint zero (made unit here)."""
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Origin of the joint's frame, a point of the axis, in the frame of the link before it, m."""
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Joint's frame in the frame of the link before it: roll, pitch, yaw about fixed axes as in URDF, degrees."""
+    type: str = 'revolute'
+    """'revolute' (with or without an end) or 'prismatic'."""
+    mimic: Mimic | None = None
+    """Set when the joint follows another one."""
+    limits: JointLimits = field(default=JointLimits())
+    """How far and how fast it may go."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
+        object.__setattr__(self, 'xyz', three_numbers(self.xyz, f"xyz of joint '{self.name}'"))
+        object.__setattr__(self, 'rpy_deg', three_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'"))
+        if self.type not in TYPES:
+            raise InputError(f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got {self.type!r}; correct it")
+        _require_limits(self.limits, f"joint '{self.name}'")
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns; else it slides."""
+        return self.type == 'revolute'
+
+    @property
+    def source(self) -> str:
+        """Name of the joint whose readings tell its position: its own, or the one that it follows."""
+        return self.name if self.mimic is None else self.mimic.joint
+
+    @property
+    def mat_before(self) -> np.ndarray:
+        """Joint's frame to the frame of the link before it, at joint zero, shape (3, 3)."""
+        return rotation_from_rpy(np.radians(self.rpy_deg))
+
+
+@dataclass(frozen=True)
+class JointNames(Sequence):
+    """Names that the readings of a chain and the parameters of its errors go by; as a sequence: the joints that are read."""
+
+    read: tuple[str, ...]
+    """Joints that are read, in the order of the columns of a `JointMotion`."""
+    turning: tuple[str, ...]
+    """Those of them that turn."""
+    zeros: tuple[str, ...]
+    """Those whose zero is an error of its own: the first one's is the azimuth, the last one's belongs to the mount."""
+    angles: tuple[str, ...]
+    """Angles between neighbouring axes."""
+
+    @classmethod
+    def of(cls, names: Sequence[str], errors: Mapping[str, Sequence[str]] | None = None) -> 'JointNames':
+        """Return `names` as they are, or those of a chain of turning joints of which no two neighbours are parallel, unless `errors` says."""
+        if isinstance(names, cls):
+            return names
+        names = tuple(names)
+        if errors is not None:
+            return cls(names, *(tuple(errors[key]) for key in ('turning', 'zeros', 'angles')))
+        return cls(names, names, names[1:-1], tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)))
+
+    @property
+    def errors(self) -> dict[str, list[str]] | None:
+        """Return what `of` needs beside the names that are read, or None when these say it all."""
+        if self == self.of(self.read):
+            return None
+        return {'turning': list(self.turning), 'zeros': list(self.zeros), 'angles': list(self.angles)}
+
+    def __getitem__(self, index: int | slice) -> Any:
+        return self.read[index]
+
+    def __len__(self) -> int:
+        return len(self.read)
+
+
+LIMIT_KEYS = {'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2'), 'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2')}
+"""Keys of the limits in a table description, by type."""
+_KEYS = ('name', 'axis', 'xyz', 'rpy_deg', 'type', 'mimic')
+
+
+def joint_from_mapping(item: Any) -> Joint:
+    """Return the joint that an entry of a table description describes."""
+    kind = item.get('type') or 'revolute' if isinstance(item, Mapping) else 'revolute'
+    require_keys(item, (*_KEYS, *LIMIT_KEYS.get(kind, ())), 'table joint')
+    for key in ('name', 'axis'):
+        if item.get(key) is None:
+            raise InputError(f'table: every joint must have name and axis, got {item!r}; add {key}')
+    values = {key: item[key] for key in _KEYS if item.get(key) is not None}
+    if 'mimic' in values:
+        values['mimic'] = _mimic(values['mimic'], item['name'])
+    return Joint(**values, limits=limits_from_mapping(item, kind))
+
+
+def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
+    """Return the limits in an entry of a table description."""
+    what = f"of joint '{item.get('name')}'"
+    range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])
+    unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
+    ends = (None, None) if item.get(range_key) is None else (unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
+    return JointLimits(*ends, *(None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, None, 'give a number')
+                                for key in others))
+
+
+def _require_limits(limits: JointLimits, what: str) -> None:
+    lower, upper = limits.lower, limits.upper
+    if (lower is None) != (upper is None) or (lower is not None and lower > upper):
+        raise InputError(f'table: the range of {what} must go from a smaller to a larger number, got [{lower}, {upper}]; correct it')
+    for name in ('speed', 'acceleration'):
+        value = getattr(limits, name)
+        if value is not None and not value > 0:
+            raise InputError(f'table: the largest {name} of {what} must be above zero, got {value:g}; correct it, or leave it out')
+
+
+def _mimic(item: Any, name: str) -> Mimic:
+    require_keys(item, ('joint', 'multiplier', 'offset'), f"mimic of joint '{name}'")
+    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'", None, None, 'give a number')
+               for key in ('multiplier', 'offset') if item.get(key) is not None}
+    if not isinstance(item.get('joint'), str):
+        raise InputError(f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME")
+    return Mimic(item['joint'], **numbers)
+
+
+def joint_to_mapping(joint: Joint) -> dict[str, Any]:
+    """Return the entry that `joint_from_mapping` turns into an equal joint; what is at its default is left out, but for the place."""
+    item = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
+    if any(joint.rpy_deg):
+        item['rpy_deg'] = list(joint.rpy_deg)
+    if not joint.turns:
+        item['type'] = joint.type
+    if joint.mimic is not None:
+        item['mimic'] = {'joint': joint.mimic.joint, 'multiplier': joint.mimic.multiplier, 'offset': joint.mimic.offset}
+    limits, unit = joint.limits, np.radians(1.0) if joint.turns else 1.0
+    ends = None if limits.lower is None else [limits.lower, limits.upper]
+    for key, value in zip(LIMIT_KEYS[joint.type], (ends, limits.speed, limits.acceleration), strict=True):
+        if value is not None:
+            # Twelve digits of a degree's fraction, so that what was read comes back as it was written.
+            item[key] = np.round(np.asarray(value) / unit, 10).tolist()
+    return item
