@@ -2,6 +2,15 @@
 
 from imu_calibration.errors import InputError
 
+LARGEST = 2_000_000
+"""Characters of a document at most; the covariance of a hundred parameters takes 300 000."""
+MOST_PARTS = 60_000
+"""Numbers, texts, lists and mappings in a document at most: reading so many takes half a second."""
+LONGEST = 5000
+"""Characters of one text or number at most; a number in base sixty takes time with the square of its length."""
+DEEPEST = 20
+"""Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
+
 
 def to_text(document):
     """
@@ -37,19 +46,40 @@ def from_text(text, what='document'):
     Raises
     ------
     InputError
-        When the text is not YAML or not a mapping.
+        When the text is not YAML or not a mapping, or too large, too deep or built on aliases; a text of a few lines could otherwise
+        take all memory.
 
     """
     import yaml
     loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+    _within_limits(len(text), LARGEST, what, 'characters')
     try:
+        _look_through(yaml.parse(text, Loader=loader), what)
         document = yaml.load(text, Loader=loader)
-    except yaml.YAMLError as error:
-        line = str(error).replace('\n', ' ')
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError) as error:   # the last four: dates and numbers that are none
+        line = ' '.join(str(error).split())
         raise InputError(f'a {what} must be YAML, this is not: {line}; correct the file') from error
     if not isinstance(document, dict):
         raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file')
     return document
+
+
+def _look_through(events, what):
+    """Refuse what would take long or much memory to build, from the parser's events, which take neither."""
+    depth = 0
+    for count, event in enumerate(events):
+        kind = type(event).__name__
+        depth += kind.endswith('StartEvent') - kind.endswith('EndEvent')
+        if kind == 'AliasEvent':
+            raise InputError(f'a {what} must say everything where it stands, this one has YAML aliases (*{event.anchor}); write it without')
+        _within_limits(depth - 2, DEEPEST, what, 'levels')   # the stream and the document are levels too
+        _within_limits(count, MOST_PARTS, what, 'parts')
+        _within_limits(len(getattr(event, 'value', '')), LONGEST, what, 'characters in a row')
+
+
+def _within_limits(number, limit, what, unit):
+    if number > limit:
+        raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?')
 
 
 def version_of(text):

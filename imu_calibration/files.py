@@ -2,7 +2,9 @@
 
 import hashlib
 import os
-from contextlib import contextmanager
+import zlib
+from contextlib import contextmanager, suppress
+from errno import EISDIR
 from pathlib import Path
 
 from imu_calibration import documents
@@ -11,12 +13,34 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 
 
-def read_text(path, what):
-    """Return the text of a file, or refuse in one line."""
+def user_path(text):
+    """
+    Return the absolute path that a user means, with ``~`` for the home folder.
+
+    Raises
+    ------
+    InputError
+        When there is no such user.
+
+    """
     try:
-        return Path(path).read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'the {what} {path} must be a readable text file: {getattr(error, "strerror", None) or error}; correct the path') from error
+        return Path(os.path.abspath(Path(text).expanduser()))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f'{text!r} must be a path: {error}; correct it') from error
+
+
+def read_text(path, what):
+    """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
+    try:
+        with open(path, encoding='utf-8') as stream:
+            text = stream.read(documents.LARGEST + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path') from error
+    return text
+
+
+def _why(error):
+    return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
 def read_mapping(path, what):
@@ -45,8 +69,8 @@ def make_folder(path):
         probe = folder / f'.write_test_{os.getpid()}'
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise InputError(f'the output folder {folder} must be writable: {error.strerror}; choose another one') from error
+    except (OSError, ValueError) as error:
+        raise InputError(f'the output folder {folder} must be writable: {_why(error)}; choose another one') from error
     return folder
 
 
@@ -58,23 +82,15 @@ def output_folder(path):
     try:
         yield folder
     except BaseException:
-        for made in missing:
-            if not made.is_dir() or any(made.iterdir()):
-                break
-            made.rmdir()
+        with suppress(OSError):   # a folder that holds something stays
+            for made in missing:
+                made.rmdir()
         raise
 
 
 def write_text(path, text):
-    """Write a file beside and rename it, so that it is never half written."""
-    path = Path(path)
-    beside = path.with_name(f'.{path.name}.{os.getpid()}')
-    try:
-        beside.write_text(text, encoding='utf-8')
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise InputError(f'{path} must be writable: {error.strerror}; choose another place') from error
+    """Write a text file whole or not at all; raises as `write_whole`."""
+    write_whole(path, text.encode(), to_disk=False)
 
 
 def hash_of(path):
@@ -106,15 +122,42 @@ def write_whole(path, data, to_disk=True):
 
     """
     path = Path(path)
-    beside = path.with_name(f'.{path.name}.{os.getpid()}')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _beside(path) as beside:
         with open(beside, 'wb') as stream:
             stream.write(data)
             if to_disk:
                 stream.flush()
                 os.fsync(stream.fileno())
         os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise InputError(f'{path} must be writable: {error.strerror}; choose another place') from error
+
+
+def try_place(path):
+    """
+    Try whether `write_whole` could write a file now; nothing is left behind but its folder.
+
+    Raises
+    ------
+    InputError
+        When it could not.
+
+    """
+    path = Path(path)
+    with _beside(path) as beside:
+        beside.write_bytes(b'.')
+        if path.is_dir():
+            raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+
+
+@contextmanager
+def _beside(path):
+    """Give a name in the same folder that no other process uses; what fails becomes one line, and nothing is left under that name."""
+    # A name as long as allowed leaves no room for an ending.
+    beside = path.parent / f'.{os.getpid()}.{zlib.crc32(path.name.encode(errors="replace")):08x}'
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield beside
+    except (OSError, ValueError) as error:
+        raise InputError(f'{path} must be writable: {_why(error)}; choose another place') from error
+    finally:
+        with suppress(OSError, ValueError):   # where nothing can be written, nothing can be taken away either
+            beside.unlink(missing_ok=True)

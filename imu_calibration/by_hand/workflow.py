@@ -11,6 +11,7 @@ from imu_calibration.calibration.from_solution import conditions, preflight_stat
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.verdict import judged
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import parse_effects
@@ -158,5 +159,5 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
 def result_by_hand(calibration, hand, gathered, tolerances, options=CalibrationOptions()):
     """Return the CalibrationResult of a calibration by hand, after a look at its units."""
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
-    calibration = replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity})
+    calibration = judged(replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity}), tolerances)
     return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances, options)

@@ -4,20 +4,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_calibration.calibration.document_checks import check_numbers, check_parts
+from imu_calibration.calibration.document_parts import IN_REFERENCE, SECTIONS, STATUSES, parts_of
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import find_effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.reference.joint import JointNames
 
 FORMAT = 'imu_calibration/1'
-SECTIONS = SENSORS + ('reference',)
-DETERMINED, WEAK, HELD = 'determined', 'weak', 'held'
-IN_REFERENCE = ('lever_arm', 'accel_bandwidth', 'gyro_bandwidth')
-"""Effects of a sensor that a document lists under `reference`: they belong to the table and the session."""
-CONDITION_LIMIT = 20.0
-"""A sensor matrix with a larger condition number cannot belong to three independent axes."""
+DETERMINED, WEAK, HELD = STATUSES
+_WHERE_KNOWN = ('verdict', 'verdict_reasons', 'proof')
+"""Parts of a document that are left out while nobody knows them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +41,12 @@ class Calibration:
     """Temperature range, largest rate, gravity, duration, date."""
     provenance: dict = field(default_factory=dict)
     """Software version, bag names and hashes, options."""
+    verdict: str = ''
+    """'good', 'weak' or 'bad' (see `verdict`); '' in files from before it was written down."""
+    verdict_reasons: tuple = ()
+    """What speaks for or against it, a line each, and what to do next."""
+    proof: dict = field(default_factory=dict)
+    """Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured."""
 
     @property
     def param_names(self):
@@ -113,8 +116,10 @@ def to_mapping(calibration):
         document['joint_errors'] = errors
     document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
     document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
-    for name in ('statistics', 'conditions', 'provenance'):
-        document[name] = _plain(getattr(calibration, name))
+    for name in ('statistics', 'conditions', 'verdict', 'verdict_reasons', 'proof', 'provenance'):
+        part = getattr(calibration, name)
+        if part or name not in _WHERE_KNOWN:
+            document[name] = _plain(part)
     return document
 
 
@@ -160,11 +165,18 @@ def from_mapping(document):
     if not isinstance(document, dict):
         raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; give a file written by 'imu_calibration calibrate'")
     _check_format(document.get('format'))
+    check_parts(document)
     try:
-        return _checked(_parse(document))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+        calibration = Calibration(**parts_of(document))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
         raise DocumentError(f'a calibration document must have the parts of {FORMAT}, something is missing or misshapen '
-                            f'({type(error).__name__}: {error}); write it anew') from error
+                            f'({_one_line(error)}); write it anew') from error
+    return check_numbers(calibration)
+
+
+def _one_line(error):
+    text = ' '.join(f'{type(error).__name__}: {error}'.split()) if not isinstance(error, InputError) else str(error)
+    return text if len(text) <= 200 else f'{text[:197]}...'
 
 
 def _check_format(found):
@@ -173,64 +185,6 @@ def _check_format(found):
         raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {found!r}; give a file written by 'imu_calibration calibrate'")
     if int(number) > int(FORMAT.partition('/')[2]):
         raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got '{found}'; update imu_calibration")
-
-
-def _parse(document):
-    joint_names = JointNames.of(document.get('joint_names', ('outer', 'middle', 'inner')), document.get('joint_errors'))
-    members = {section: [] for section in SECTIONS}
-    entries = {}
-    for section in SECTIONS:
-        part = document.get(section) or {'effects': []}
-        for name in part['effects']:
-            sensor = {'lever_arm': 'accelerometer', 'accel_bandwidth': 'accelerometer', 'gyro_bandwidth': 'gyroscope'}.get(name, section)
-            members[sensor].append(name)
-            entries[sensor, name] = part[name]
-    model = SensorModel(*(tuple(members[s]) for s in SECTIONS), joint_names=joint_names,
-                        temperature_ref_c=float(document.get('reference_temperature_c', 25.0)))
-    values, status = [], []
-    for effect in model.effects:
-        entry = entries[effect.sensor, effect.name]
-        values.append(_shaped(entry['value'], effect))
-        status += np.array(entry['status'], dtype=object).reshape(effect.size).tolist()
-    values = np.concatenate(values)
-    return Calibration(model.at(values), values, _covariance(document, model, entries), tuple(status), str(document.get('frame_id', '')),
-                       dict(document.get('gauge') or {}), tuple(document.get('undetermined_directions') or ()), document.get('statistics') or {},
-                       document.get('conditions') or {}, document.get('provenance') or {})
-
-
-def _shaped(value, effect):
-    array = np.asarray(value, float)
-    if array.shape != effect.shape:
-        raise DocumentError(f"'{effect.name}' must have shape {effect.shape}, got {array.shape}; correct the calibration file")
-    return array.ravel()
-
-
-def _covariance(document, model, entries):
-    """Return the covariance in the model's order; without one, the diagonal of the standard deviations."""
-    names = model.param_names
-    given = document.get('covariance')
-    if not given:
-        return np.diag(np.concatenate([np.asarray(entries[e.sensor, e.name]['sd'], float).ravel() for e in model.effects])**2)
-    order = [given['names'].index(name) for name in names]
-    return np.asarray(given['matrix'], float)[np.ix_(order, order)]
-
-
-def _checked(calibration):
-    saturation = np.array([name.endswith('saturation.level') for name in calibration.param_names], bool)
-    if not np.all(np.isfinite(calibration.values[~saturation])) or not np.all(np.isfinite(calibration.covariance)):
-        raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again')
-    if np.any(np.diag(calibration.covariance) < 0):
-        raise DocumentError('variances must not be negative, some are; calibrate again')
-    for sensor in SENSORS:
-        for needed in ('bias', 'matrix'):
-            if not calibration.has(sensor, needed):
-                raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
-        matrix = calibration.value(sensor, 'matrix')
-        condition = np.linalg.cond(matrix)
-        if not condition < CONDITION_LIMIT:
-            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {condition:.3g}; '
-                                'calibrate again with more attitudes')
-    return calibration
 
 
 def implausible(calibration):

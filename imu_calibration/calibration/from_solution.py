@@ -6,6 +6,7 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.calibration.document import Calibration, statuses
+from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
@@ -14,7 +15,7 @@ from imu_calibration.segmentation.window_cutter import dropped
 
 
 def document(solution, tolerances, table, gathered, provenance=None):
-    """Return the Calibration for a solution, with statuses, weak directions and the motions that would help."""
+    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
     sd = np.sqrt(np.diag(covariance))
@@ -25,8 +26,9 @@ def document(solution, tolerances, table, gathered, provenance=None):
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
     centred = ('accelerometer', 'lever_arm') in model.slices and ('accelerometer', 'accel_size_effect') in model.slices
     gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
-    return Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
-                       statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
+    calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
+                              statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
+    return judged(calibration, tolerances)
 
 
 def _need(weights, needed):

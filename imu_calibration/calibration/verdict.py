@@ -1,10 +1,10 @@
 """Good, weak or bad: whether a calibration may be used, why, and what to do next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.document import HELD, WEAK, implausible
+from imu_calibration.calibration.document import DETERMINED, HELD, WEAK, implausible
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import with_hint
@@ -66,7 +66,8 @@ def judge(calibration, tolerances):
     Return the Verdict on a calibration.
 
     Bad: a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
-    nothing was determined. Weak: a requested parameter is not determined to its tolerance. Good: neither.
+    nothing was determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not
+    determined to its tolerance. Good: neither.
 
     Parameters
     ----------
@@ -81,6 +82,12 @@ def judge(calibration, tolerances):
     order = (BAD, WEAK)
     against = sorted(against, key=lambda r: order.index(r.word))
     return Verdict(word, tuple(favour + against + _notes(calibration, tolerances)))
+
+
+def judged(calibration, tolerances):
+    """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
+    found = judge(calibration, tolerances)
+    return replace(calibration, verdict=found.word, verdict_reasons=tuple(found.lines()))
 
 
 def _implausible(calibration):
@@ -108,8 +115,9 @@ def _misfits(calibration):
 def _blind(calibration):
     reasons = []
     for sensor in SENSORS:
-        own = [s for n, s in zip(calibration.param_names, calibration.status) if n.startswith(sensor) and requested(n)]
-        if own and all(status == HELD for status in own):
+        own = {n: s for n, s in zip(calibration.param_names, calibration.status) if n.startswith(sensor) and requested(n)}
+        matrix_held = all(status == HELD for name, status in own.items() if '.matrix.' in name)
+        if own and matrix_held and DETERMINED not in own.values():
             reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor)))
     return reasons
 

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from imu_calibration import files
+from imu_calibration.calibration.trust import caveats, objections, refuse_untrusted
 from imu_calibration.cli import recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
-from imu_calibration.errors import InputError
+from imu_calibration.errors import DocumentError, InputError
 
 NAME = 'compensate'
 HELP = 'Write a bag with the corrected Imu topic beside all other topics.'
@@ -24,6 +25,7 @@ def add_arguments(parser):
                         help='place of the sensor in the target frame, m')
     parser.add_argument('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
                         help='roll, pitch, yaw of the sensor in the target frame, rad')
+    parser.add_argument('--anyway', action='store_true', help='also with a calibration whose verdict is bad or whose proof failed')
     parser.add_argument('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     recordings.add_topic_arguments(parser)
 
@@ -31,7 +33,7 @@ def add_arguments(parser):
 def run(options):
     """Compensate block by block."""
     from msg_adapters.write import copy_with_corrected
-    calibration = files.read_calibration(options.calibration)
+    calibration = _calibration(options)
     if Path(options.output).exists():
         raise InputError(f'the output bag {options.output} must not exist yet; choose another name or remove it')
     transfer = requested_transfer(options.target_frame, options.target_xyz, options.target_rpy)
@@ -46,9 +48,20 @@ def run(options):
         lost = copy_with_corrected(options.bag, options.output, recording.imu_topic, options.corrected_topic, correct, stream.propagate,
                                    options.target_frame or None, None if transfer is None else transfer.mat_ts,
                                    late_ns(calibration, options.correct_stamps))
-    for line in stream.warnings():
+    for line in objections(calibration) + caveats(calibration) + stream.warnings():
         print(f'note: {line}')
     print(f'written: {options.output} with {options.corrected_topic} ({stream.count} samples)')
     if lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in lost.items()))
     return 3 if lost else 0
+
+
+def _calibration(options):
+    """Return the calibration that was named, unless something speaks against it."""
+    calibration = files.read_calibration(options.calibration)
+    if not options.anyway:
+        try:
+            refuse_untrusted(calibration)
+        except DocumentError as error:
+            raise InputError(f'{options.calibration}: {error}; calibrate again, or add --anyway') from error
+    return calibration

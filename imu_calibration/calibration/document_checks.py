@@ -1,0 +1,148 @@
+"""What must hold of a calibration document beyond its layout: whoever uses one that was read needs no checks of its own."""
+
+import math
+
+import numpy as np
+
+from imu_calibration.calibration.document_parts import SECTIONS
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import DocumentError
+
+CONDITION_LIMIT = 20.0
+"""A sensor matrix with a larger condition number cannot belong to three independent axes."""
+LARGEST = 1e9
+"""Values and standard deviations beyond this belong to no sensor in any unit; their products would leave the range of numbers."""
+RANGE_C = (-273.15, 1000.0)
+"""Temperatures of a sensor, degrees Celsius."""
+MOST_JOINTS = 30
+ROUNDING = 1e-6
+"""By this much, relative to the variances, rounding may take a covariance out of what a covariance can be."""
+
+
+def _is_number(value, low=-LARGEST, high=LARGEST):
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
+
+
+def _is_size(value):
+    return _is_number(value, 0.0)
+
+
+def _is_count(value):
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 2**62
+
+
+def _is_text(value):
+    return isinstance(value, str)
+
+
+def _is_range(value, kind=_is_number):
+    return isinstance(value, (list, tuple)) and len(value) == 2 and all(map(kind, value)) and value[0] <= value[1]
+
+
+def _is_temperature_range(value):
+    return _is_range(value) and RANGE_C[0] <= value[0] and value[1] <= RANGE_C[1]
+
+
+def _is_triple_of_sizes(value):
+    return isinstance(value, (list, tuple)) and len(value) == 3 and all(map(_is_size, value))
+
+
+def _or_none(kind):
+    return lambda value: value is None or kind(value)
+
+
+def _is_list_of(kind):
+    return lambda value: isinstance(value, (list, tuple)) and all(map(kind, value))
+
+
+def _is_direction(value):
+    weights = value.get('parameters') if isinstance(value, dict) else None
+    return isinstance(weights, dict) and _is_text(value.get('needs')) and all(_is_text(k) and _is_number(v) for k, v in weights.items())
+
+
+_NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
+_PROOF = {'before': _is_size, 'after': _is_size, 'ci95': lambda value: _is_range(value, _is_size), 'unit': _is_text, 'windows': _is_count}
+
+
+def _is_proof(value):
+    return isinstance(value, dict) and all(name in value and kind(value[name]) for name, kind in _PROOF.items())
+
+
+_SECTION = {'effects': _is_list_of(_is_text)}
+KNOWN = {
+    **{section: _SECTION for section in SECTIONS}, 'covariance': {},
+    'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
+    'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
+    'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
+    'statistics': {sensor: _NOISE for sensor in SENSORS},
+    'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
+    'verdict': lambda value: value in ('good', 'weak', 'bad'), 'verdict_reasons': _is_list_of(_is_text),
+    'proof': {sensor: _is_proof for sensor in SENSORS},
+}
+"""Part of a document -> what it must be, when it is there: a function, or a mapping whose entries are told in the same way."""
+
+
+def check_parts(document, known=KNOWN, place=''):
+    """
+    Refuse a document (dict) in which a part that others read is not what it must be; further parts may be anything.
+
+    Raises
+    ------
+    DocumentError
+
+    """
+    for name, wanted in known.items():
+        if name not in document:
+            continue
+        value = document[name]
+        if isinstance(wanted, dict):
+            if value is not None and not isinstance(value, dict):
+                raise DocumentError(f"'{place}{name}' must be a mapping, got {_short(value)}; correct the calibration file or write it anew")
+            check_parts(value or {}, wanted, f'{place}{name}.')
+        elif not wanted(value):
+            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {_short(value)}; correct the calibration file or write it anew")
+
+
+def _short(value):
+    text = ' '.join(repr(value).split())
+    return text if len(text) <= 60 else f'{text[:57]}...'
+
+
+def check_numbers(calibration):
+    """
+    Return the calibration when its numbers can belong to an IMU.
+
+    Raises
+    ------
+    DocumentError
+        When a value is not finite, a covariance is none, or a sensor matrix cannot be inverted.
+
+    """
+    values, covariance = calibration.values, calibration.covariance
+    levels = np.array([name.endswith('saturation.level') for name in calibration.param_names], bool)
+    if not np.all(np.isfinite(values[~levels])) or not np.all(np.isfinite(covariance)):
+        raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again')
+    if not np.all(values[levels] > 0):
+        raise DocumentError('a saturation level must be larger than zero, one is not; calibrate again')
+    if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > LARGEST:
+        raise DocumentError(f'values and standard deviations must stay below {LARGEST:g}, some do not; calibrate again')
+    _check_covariance(covariance)
+    for sensor in SENSORS:
+        for needed in ('bias', 'matrix'):
+            if not calibration.has(sensor, needed):
+                raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
+        condition = np.linalg.cond(calibration.value(sensor, 'matrix'))
+        if not condition < CONDITION_LIMIT:
+            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {condition:.3g}; '
+                                'calibrate again with more attitudes')
+    return calibration
+
+
+def _check_covariance(covariance):
+    variance = np.diag(covariance)
+    if np.any(variance < 0):
+        raise DocumentError('variances must not be negative, some are; calibrate again')
+    scale = np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = covariance / np.outer(scale, scale)
+    if np.max(np.abs(correlation - correlation.T)) > ROUNDING or np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
+        raise DocumentError('the covariance must be symmetric and without negative directions, this one is not; calibrate again')

@@ -1,0 +1,79 @@
+"""From the mapping of a calibration document to the parts of a `Calibration`: its layout, nothing about its numbers."""
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import DocumentError
+from imu_calibration.reference.joint import JointNames
+
+SECTIONS = SENSORS + ('reference',)
+IN_REFERENCE = {'lever_arm': 'accelerometer', 'accel_bandwidth': 'accelerometer', 'gyro_bandwidth': 'gyroscope'}
+"""Effects of a sensor that a document lists under `reference`, since they belong to the table and the session -> that sensor."""
+STATUSES = ('determined', 'weak', 'held')
+
+
+def parts_of(document):
+    """
+    Return {field of a Calibration: value} from the mapping of its document, whose parts have passed `check_parts`.
+
+    Raises
+    ------
+    DocumentError, KeyError, TypeError, ValueError, AttributeError, OverflowError
+        When something is missing or misshapen.
+
+    """
+    model, entries = _model(document)
+    values = np.concatenate([_shaped(entries[e.sensor, e.name]['value'], e) for e in model.effects])
+    status = [word for e in model.effects for word in _statuses(entries[e.sensor, e.name]['status'], e)]
+    for effect in model.effects:
+        _check_unit(entries[effect.sensor, effect.name].get('unit'), effect)
+    return {'model': model.at(values), 'values': values, 'covariance': _covariance(document.get('covariance'), model, entries),
+            'status': tuple(status), 'frame_id': document.get('frame_id', ''),
+            'undetermined': tuple(document.get('undetermined_directions') or ()), 'verdict': document.get('verdict') or '',
+            'verdict_reasons': tuple(document.get('verdict_reasons') or ()),
+            **{name: dict(document.get(name) or {}) for name in ('gauge', 'statistics', 'conditions', 'proof', 'provenance')}}
+
+
+def _model(document):
+    """Return (SensorModel, {(sensor, effect): what the document says of it})."""
+    members, entries = {section: [] for section in SECTIONS}, {}
+    for section in SECTIONS:
+        part = document.get(section) or {'effects': []}
+        for name in part['effects']:
+            sensor = IN_REFERENCE.get(name, section)
+            if (sensor, name) in entries:
+                raise DocumentError(f"an effect must be listed once, '{name}' is there twice")
+            members[sensor].append(name)
+            entries[sensor, name] = part[name]
+    joint_names = JointNames.of(document.get('joint_names', ('outer', 'middle', 'inner')), document.get('joint_errors'))
+    return SensorModel(*(tuple(members[s]) for s in SECTIONS), joint_names=joint_names,
+                       temperature_ref_c=float(document.get('reference_temperature_c', 25.0))), entries
+
+
+def _shaped(value, effect):
+    array = np.asarray(value, float)
+    if array.shape != effect.shape or np.asarray(value).dtype == bool:
+        raise DocumentError(f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct the calibration file")
+    return array.ravel()
+
+
+def _statuses(value, effect):
+    words = np.array(value, dtype=object).reshape(effect.size).tolist()
+    if any(word not in STATUSES for word in words):
+        raise DocumentError(f"the status of '{effect.name}' must be {', '.join(STATUSES)}; correct the calibration file")
+    return words
+
+
+def _check_unit(found, effect):
+    wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
+    if found is not None and found != wanted:
+        raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {found!r}; correct the calibration file")
+
+
+def _covariance(given, model, entries):
+    """Return the covariance in the model's order; without one, the diagonal of the standard deviations."""
+    if not given:
+        return np.diag(np.concatenate([_shaped(entries[e.sensor, e.name]['sd'], e) for e in model.effects])**2)
+    order = [given['names'].index(name) for name in model.param_names]
+    return np.asarray(given['matrix'], float)[np.ix_(order, order)]

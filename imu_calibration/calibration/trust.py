@@ -1,0 +1,63 @@
+"""May a calibration be used? What its document says against it, and what whoever uses it should know."""
+
+from imu_calibration.calibration.document import DETERMINED, implausible
+from imu_calibration.calibration.verdict import BAD, GOOD, listed
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import DocumentError
+
+
+def objections(calibration):
+    """
+    Return why nobody should be corrected with a calibration unless they insist, a line each; the first is the gravest.
+
+    A bad verdict; values beyond what is known of any instrument; a proof that does not show a smaller error with the calibration
+    than without (`disproved`).
+    """
+    reasons = calibration.verdict_reasons[:1]
+    bad = [': '.join(['its verdict is bad', *reasons])] if calibration.verdict == BAD else []
+    return [*bad, *implausible(calibration), *disproved(calibration)]
+
+
+def disproved(calibration):
+    """Return a line for each sensor whose error on held-out data is not shown to be smaller with the calibration than without."""
+    lines = []
+    for sensor, found in calibration.proof.items():
+        if sensor in SENSORS and not (found['windows'] and found['after'] < found['before'] and found['ci95'][1] < 1.0):
+            low, high = found['ci95']
+            lines.append(f'on {found["windows"]} windows that took no part the {sensor} error is {found["after"]:.3g} {found["unit"]} with it and '
+                         f'{found["before"]:.3g} without (after / before {low:.2f} to {high:.2f}): that it helps is not shown')
+    return lines
+
+
+def caveats(calibration):
+    """Return what should be known about a calibration that may be used, a line each."""
+    if not calibration.verdict:
+        return ['it carries no verdict, as files of earlier versions do: calibrate again to know how good it is']
+    return [] if calibration.verdict == GOOD else [f'its verdict is {calibration.verdict}: {missing(calibration) or calibration.verdict_reasons[0]}']
+
+
+def missing(calibration):
+    """Return which parameters are not determined, as text; '' when all are."""
+    names = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
+    return f'{len(names)} of {len(calibration.status)} parameters not determined ({listed(names)})' if names else ''
+
+
+def standing(calibration):
+    """Return in a few words how well a calibration is known, for one line in a log."""
+    proof = 'proven on held-out data' if calibration.proof and not disproved(calibration) else 'no proof on held-out data'
+    return f'{calibration.verdict or "no verdict"}, {proof}'
+
+
+def refuse_untrusted(calibration):
+    """
+    Refuse a calibration that has objections against it.
+
+    Raises
+    ------
+    DocumentError
+        With the gravest of them.
+
+    """
+    against = objections(calibration)
+    if against:
+        raise DocumentError(f'a calibration must be shown to help before anybody is corrected with it; {against[0]}')
