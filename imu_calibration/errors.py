@@ -6,7 +6,7 @@ that is called there: an option of the command line, a parameter or topic of a n
 """
 
 KEYS = {
-    'calibration': 'the calibration document', 'gravity': 'the local gravity', 'imu_topic': 'the topic of the IMU',
+    'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document', 'gravity': 'the local gravity', 'imu_topic': 'the topic of the IMU',
     'joint_topic': 'the topic of the joints', 'nominal': 'nominal conversion of volts or counts', 'table': 'the description of the table',
     'target_frame': 'the frame to move readings to', 'temperature_topic': 'the topic of the temperature',
 }
@@ -49,6 +49,12 @@ class NotObservableError(ImuCalibrationError):
 
 class DocumentError(InputError):
     """A calibration document cannot be used."""
+
+
+def shortened(text: str, length: int = 60) -> str:
+    """Return a text on one line, cut off where it goes on for long: for what came, which may be anything."""
+    text = ' '.join(text.split())
+    return text if len(text) <= length else f'{text[:length - 3]}...'
 
 
 def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:

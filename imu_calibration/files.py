@@ -6,9 +6,10 @@ import zlib
 from contextlib import contextmanager, suppress
 from errno import EISDIR
 from pathlib import Path
+from stat import S_ISDIR
 
 from imu_calibration import documents
-from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.calibration.document import calibration_from_text, checked_tolerances
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 
@@ -43,10 +44,10 @@ def _why(error):
     return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
-def read_mapping(path, what):
-    """Return the mapping in a YAML file."""
+def read_mapping(path, what, checked=dict):
+    """Return the mapping in a YAML file, as `checked` returns it; an error of either names the file."""
     try:
-        return documents.from_text(read_text(path, what), what)
+        return checked(documents.from_text(read_text(path, what), what))
     except InputError as error:
         raise error.named(path) from error
 
@@ -54,6 +55,11 @@ def read_mapping(path, what):
 def read_table(path):
     """Return the table that a YAML file describes."""
     return Table.from_mapping(read_mapping(path, 'table description'))
+
+
+def read_tolerances(path):
+    """Return the tolerances in a YAML file: {section: {effect: tolerance}}."""
+    return read_mapping(path, 'tolerance file', checked_tolerances)
 
 
 def read_calibration(path):
@@ -144,8 +150,9 @@ def try_place(path):
     path = Path(path)
     with _beside(path) as beside:
         beside.write_bytes(b'.')
-        if path.is_dir():
-            raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+        with suppress(FileNotFoundError):
+            if S_ISDIR(os.stat(path).st_mode):
+                raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
 
 
 @contextmanager

@@ -7,9 +7,9 @@ import numpy as np
 from imu_calibration.calibration.document_checks import check_numbers, check_parts
 from imu_calibration.calibration.document_parts import IN_REFERENCE, SECTIONS, STATUSES, parts_of
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.catalogue import find_effect
+from imu_calibration.effects.catalogue import catalogue, find_effect
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.errors import DocumentError, InputError, shortened
 
 FORMAT = 'imu_calibration/1'
 DETERMINED, WEAK, HELD = STATUSES
@@ -105,6 +105,29 @@ def tolerances_of(model, overrides=None):
     return np.concatenate([np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance))) for e in model.effects])
 
 
+def checked_tolerances(mapping):
+    """
+    Return the content of a tolerance file when it is one: {section: {effect: number above zero}}.
+
+    Raises
+    ------
+    InputError
+        When a section or an effect does not exist, or a tolerance is no number above zero.
+
+    """
+    known = {section: [name for owner, name in catalogue() if owner == section] for section in SECTIONS}
+    for section, entries in mapping.items():
+        if section not in known or not isinstance(entries, dict):
+            raise InputError(f'a tolerance file must hold the mappings {", ".join(SECTIONS)}, it holds {shortened(repr(section))}: '
+                             f'{shortened(repr(entries))}; correct it')
+        for name, value in entries.items():
+            if name not in known[section]:
+                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; those are {", ".join(known[section])}')
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
+                raise InputError(f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it")
+    return mapping
+
+
 def to_mapping(calibration):
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
@@ -175,16 +198,15 @@ def from_mapping(document):
 
 
 def _one_line(error):
-    text = ' '.join(f'{type(error).__name__}: {error}'.split()) if not isinstance(error, InputError) else str(error)
-    return text if len(text) <= 200 else f'{text[:197]}...'
+    return shortened(str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}', 200)
 
 
 def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
-        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {found!r}; give a file written by 'imu_calibration calibrate'")
+        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; give a file written by 'imu_calibration calibrate'")
     if int(number) > int(FORMAT.partition('/')[2]):
-        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got '{found}'; update imu_calibration")
+        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; update imu_calibration")
 
 
 def implausible(calibration):

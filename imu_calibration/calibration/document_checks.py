@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.calibration.document_parts import SECTIONS
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.errors import DocumentError
+from imu_calibration.errors import DocumentError, shortened
 
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
@@ -60,6 +60,11 @@ def _is_direction(value):
     return isinstance(weights, dict) and _is_text(value.get('needs')) and all(_is_text(k) and _is_number(v) for k, v in weights.items())
 
 
+def _is_joint_errors(value):
+    return isinstance(value, dict) and all(_is_list_of(_is_text)(value.get(name)) and len(set(value[name])) == len(value[name]) <= MOST_JOINTS
+                                           for name in ('turning', 'zeros', 'angles'))
+
+
 _NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
 _PROOF = {'before': _is_size, 'after': _is_size, 'ci95': lambda value: _is_range(value, _is_size), 'unit': _is_text, 'windows': _is_count}
 
@@ -73,7 +78,7 @@ KNOWN = {
     **{section: _SECTION for section in SECTIONS}, 'covariance': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
-    'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
+    'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
     'verdict': lambda value: value in ('good', 'weak', 'bad'), 'verdict_reasons': _is_list_of(_is_text),
@@ -96,16 +101,11 @@ def check_parts(document, known=KNOWN, place=''):
             continue
         value = document[name]
         if isinstance(wanted, dict):
-            if value is not None and not isinstance(value, dict):
-                raise DocumentError(f"'{place}{name}' must be a mapping, got {_short(value)}; correct the calibration file or write it anew")
+            if not isinstance(value, dict) and (value is not None or place):
+                raise DocumentError(f"'{place}{name}' must be a mapping, got {shortened(repr(value))}; correct the calibration file or write it anew")
             check_parts(value or {}, wanted, f'{place}{name}.')
         elif not wanted(value):
-            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {_short(value)}; correct the calibration file or write it anew")
-
-
-def _short(value):
-    text = ' '.join(repr(value).split())
-    return text if len(text) <= 60 else f'{text[:57]}...'
+            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {shortened(repr(value))}; correct the calibration file or write it anew")
 
 
 def check_numbers(calibration):

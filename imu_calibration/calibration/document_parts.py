@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError
+from imu_calibration.errors import DocumentError, shortened
 from imu_calibration.reference.joint import JointNames
 
 SECTIONS = SENSORS + ('reference',)
@@ -27,7 +27,10 @@ def parts_of(document):
     values = np.concatenate([_shaped(entries[e.sensor, e.name]['value'], e) for e in model.effects])
     status = [word for e in model.effects for word in _statuses(entries[e.sensor, e.name]['status'], e)]
     for effect in model.effects:
-        _check_unit(entries[effect.sensor, effect.name].get('unit'), effect)
+        entry = entries[effect.sensor, effect.name]
+        _check_unit(entry.get('unit'), effect)
+        if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
+            raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; write it anew")
     return {'model': model.at(values), 'values': values, 'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
             'undetermined': tuple(document.get('undetermined_directions') or ()), 'verdict': document.get('verdict') or '',
@@ -68,7 +71,7 @@ def _statuses(value, effect):
 def _check_unit(found, effect):
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
-        raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {found!r}; correct the calibration file")
+        raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the calibration file")
 
 
 def _covariance(given, model, entries):

@@ -33,7 +33,8 @@ def caveats(calibration):
     """Return what should be known about a calibration that may be used, a line each."""
     if not calibration.verdict:
         return ['it carries no verdict, as files of earlier versions do: calibrate again to know how good it is']
-    return [] if calibration.verdict == GOOD else [f'its verdict is {calibration.verdict}: {missing(calibration) or calibration.verdict_reasons[0]}']
+    why = missing(calibration) or ''.join(calibration.verdict_reasons[:1])
+    return [] if calibration.verdict == GOOD else [f'its verdict is {calibration.verdict}' + (f': {why}' if why else '')]
 
 
 def missing(calibration):
@@ -60,4 +61,5 @@ def refuse_untrusted(calibration):
     """
     against = objections(calibration)
     if against:
-        raise DocumentError(f'a calibration must be shown to help before anybody is corrected with it; {against[0]}')
+        raise DocumentError(f'a calibration must help before anybody is corrected with it, against this one speaks: {against[0]}; calibrate '
+                            'again, or insist', key='anyway')

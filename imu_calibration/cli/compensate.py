@@ -7,7 +7,7 @@ from imu_calibration.calibration.trust import caveats, objections, refuse_untrus
 from imu_calibration.cli import recordings
 from imu_calibration.cli.progress import progress_bar
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
-from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.errors import InputError
 
 NAME = 'compensate'
 HELP = 'Write a bag with the corrected Imu topic beside all other topics.'
@@ -33,7 +33,9 @@ def add_arguments(parser):
 def run(options):
     """Compensate block by block."""
     from msg_adapters.write import copy_with_corrected
-    calibration = _calibration(options)
+    calibration = files.read_calibration(options.calibration)
+    if not options.anyway:
+        refuse_untrusted(calibration)
     if Path(options.output).exists():
         raise InputError(f'the output bag {options.output} must not exist yet; choose another name or remove it')
     transfer = requested_transfer(options.target_frame, options.target_xyz, options.target_rpy)
@@ -54,14 +56,3 @@ def run(options):
     if lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in lost.items()))
     return 3 if lost else 0
-
-
-def _calibration(options):
-    """Return the calibration that was named, unless something speaks against it."""
-    calibration = files.read_calibration(options.calibration)
-    if not options.anyway:
-        try:
-            refuse_untrusted(calibration)
-        except DocumentError as error:
-            raise InputError(f'{options.calibration}: {error}; calibrate again, or add --anyway') from error
-    return calibration

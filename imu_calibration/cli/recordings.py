@@ -41,7 +41,7 @@ def add_model_arguments(parser):
 
 def calibration_options(options):
     """Return CalibrationOptions from parsed arguments."""
-    tolerances = files.read_mapping(options.tolerances or config_file('tolerances.yaml'), 'tolerance file')
+    tolerances = files.read_tolerances(options.tolerances or config_file('tolerances.yaml'))
     return CalibrationOptions(options.accelerometer_model, options.gyroscope_model, options.reference_model, tolerances,
                               window_settings(options.setting), nominal_of(options.nominal))
 

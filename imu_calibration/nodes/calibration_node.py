@@ -99,7 +99,7 @@ class CalibrationNode(Node):
 
     def _read_options(self, windows):
         settings = self.settings
-        tolerances = files.read_mapping(settings.tolerances_file or config_file('tolerances.yaml'), 'tolerance file')
+        tolerances = files.read_tolerances(settings.tolerances_file or config_file('tolerances.yaml'))
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
                                   tolerances, windows)
 

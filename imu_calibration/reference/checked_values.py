@@ -7,6 +7,9 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 
+LARGEST = 1e6
+"""No number of a table (axis, place, angle, speed) is larger; the products of larger ones would leave the range of numbers."""
+
 
 def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
     """Refuse what is not a mapping, and keys that are not `known`."""
@@ -41,14 +44,15 @@ def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
 
 
 def finite_number(value: Any, what: str, low: float | None, high: float | None, advice: str) -> float:
-    """Return one finite number within [low, high]."""
+    """Return one finite number within [low, high], which default to what any number of a table can be."""
+    low, high = -LARGEST if low is None else low, LARGEST if high is None else high
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:
         number = float('nan') if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float('nan')
     if not np.isfinite(number):
         raise InputError(f'table: {what} must be a finite number, got {value!r}; {advice}')
-    if low is not None and not low <= number <= high:
+    if not low <= number <= high:
         raise InputError(f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}')
     return number
