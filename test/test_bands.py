@@ -5,7 +5,8 @@ import pytest
 
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.band_misfit import band_misfit, extra_weight, variance_along
+from imu_calibration.estimation.band_misfit import band_misfit, misfit_along
+from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window, slow_part
 from imu_calibration.reference.joint_motion import JointMotion
@@ -49,7 +50,7 @@ def test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate(fast_gain):
     windows = sweeps(np.random.default_rng(1), fast_gain)
     value, sd, noise = solved(windows)
     assert abs(value - GAIN) < 4 * sd < 0.01
-    assert noise.slow_scale['dynamic'][2] < 0.5 * noise.kind_scale['dynamic'][2]
+    assert noise.moving['dynamic'].slow[2] < 0.5 * noise.moving['dynamic'].every[2]
     x = np.concatenate([w.motion.rate[:, 0] - w.motion.rate[:, 0].mean() for w in windows])
     y = np.concatenate([w.rate_s[:, 2] for w in windows])
     assert abs(x @ y / (x @ x) - GAIN) > 3 * abs(value - GAIN)
@@ -75,21 +76,26 @@ def test_white_noise_has_the_same_variance_in_both_parts():
     assert not found.apart.any()
     np.testing.assert_allclose(found.overall, 4.0, rtol=0.05)
     np.testing.assert_allclose(found.slow, 4.0, rtol=0.2)
-    every, of_slow = found.weights(np.full(3, 4.0), np.ones(3))
-    np.testing.assert_array_equal(every, of_slow)
+    factors = found.factors(NoiseModel(np.full(3, 4.0), np.ones(3)))
+    np.testing.assert_array_equal(factors.every, factors.slow)
 
 
 def test_weights_of_slow_and_of_all_rows_give_each_part_its_own():
     fast, slow = np.full(3, 5.0), np.full(3, 2.0)
-    np.testing.assert_allclose(1 / fast + extra_weight(fast, slow)**2, 1 / slow)
-    np.testing.assert_array_equal(extra_weight(slow, slow), 0.0)
+    noise = NoiseModel(np.full(3, 0.1), np.full(3, 2.0), moving={'apart': MovingFactors(fast, slow), 'alike': MovingFactors(slow, slow)})
+    np.testing.assert_allclose(1 / noise.row_variance('apart') + noise.slow_weight('apart')**2, 1 / (0.2 * slow))
+    np.testing.assert_array_equal(noise.slow_weight('alike'), 0.0)
 
 
 def test_variance_along_the_columns_is_that_of_noise_and_shows_what_is_no_noise():
     rng = np.random.default_rng(4)
-    design = rng.normal(size=(20000, 4))
-    slow = slow_part(design, 25)
-    noise = rng.normal(0, 3.0, 20000)
-    none = (slow[:0], slow[:0, 0])
-    assert 9 * 0.05 < variance_along((design, noise), none) < 9 * 4
-    assert variance_along((design, noise + 0.2 * design[:, 1]), none) > 50
+    design, noise = rng.normal(size=(20000, 4)), rng.normal(0, 3.0, 20000)
+
+    def along(misfit):
+        rows = np.column_stack([design, misfit])
+        squares, rank = misfit_along((rows.T @ rows)[None])
+        assert rank == 4
+        return squares / rank
+
+    assert 9 * 0.05 < along(noise) < 9 * 4
+    assert along(noise + 0.2 * design[:, 1]) > 50

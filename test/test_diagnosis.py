@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from imu_calibration.diagnosis.diagnose import diagnose, investigate
+from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
+from imu_calibration.selection.investigation import investigate
 
 from worlds.hiding import Sizes, record
 

@@ -7,8 +7,8 @@ from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
+from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.noise_model import WindowNoise
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window
@@ -64,7 +64,7 @@ class SameMotion:
     def __init__(self):
         self.known = {}
 
-    def __call__(self, model, sensor, table, motion, temperature_c=None):
+    def __call__(self, model, sensor, table, motion, temperature_c=None, references=None):
         key = sensor, id(motion)
         if key not in self.known:
             self.known[key] = columns(model, sensor, table, motion, temperature_c)
@@ -131,7 +131,7 @@ def test_reported_standard_deviations_match_the_scatter(session):
 
 def cramer_rao(system, model):
     """Return the variances that an estimator reaches which knows the noise exactly."""
-    known = {sensor: WindowNoise(np.full(3, sd**2), np.ones(3), 0.0, wander, 100.0) for sensor, sd, wander in zip(
+    known = {sensor: noise_model.NoiseModel(np.full(3, sd**2), np.ones(3), bias_processes=(noise_model.BiasProcess(wander, 100.0),)) for sensor, sd, wander in zip(
         ('accelerometer', 'gyroscope'), WHITE, (INDUSTRIAL.accel_instability, INDUSTRIAL.gyro_instability))}
     return np.diag(solve(system, model, noise=known).covariance)
 

@@ -193,7 +193,7 @@ def test_residuals_are_what_the_model_leaves(quick):
     residuals = live.residuals(windows)
     samples = sum(len(window) for window in windows)
     assert 0.15 * samples < len(residuals) < 0.25 * samples
-    noise = result.solution.noise['gyroscope'].sample_sd()
+    noise = result.solution.noise['gyroscope'].white_sd
     assert np.all(np.abs(residuals.rate_s.std(axis=0) / noise - 1) < 0.15)
     assert set(residuals.stamp_ns) <= set(quick[0].stamp_ns)
 

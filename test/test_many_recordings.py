@@ -7,10 +7,7 @@ from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.noise_model import WindowNoise
-from imu_calibration.estimation.restricted_likelihood import OffsetLikelihood
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.whitening import predict_session_offsets, whiten
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
@@ -46,8 +43,8 @@ def recordings(motion, values, steps, rng):
         part = Accumulator()
         for window, designs in motion:
             outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s], (len(window.time), 3)) for s in SENSORS]
-            part.add(reduce_window(Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]}), MODEL, TABLE, session,
-                                   column_function=lambda model, sensor, *rest, known=designs: known[sensor]))
+            part.add(reduce_window(Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]}), MODEL, TABLE, session=session,
+                                   column_function=lambda model, sensor, *rest, known=designs, **shared: known[sensor]))
         total.merge(part)
     return total
 
@@ -101,44 +98,3 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     biases = np.concatenate([np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS])
     assert 0.6 < square[:, biases].mean() < 1.5
     assert 0.85 < np.delete(square, biases, axis=1).mean() < 1.15
-
-
-@pytest.fixture
-def offsets():
-    """Return rows of twenty windows in three recordings with their times, variances and covariance."""
-    rng = np.random.default_rng(5)
-    numbers = np.repeat([0, 1, 2], [9, 7, 4])
-    times = np.sort(rng.uniform(0, 500, 20))
-    variance = rng.uniform(0.5, 2, (20, 3))
-    same = numbers[:, None] == numbers
-    kernel = same * (0.7**2 * np.exp(-np.abs(times[:, None] - times) / 60.0) + 1.3**2)
-    return rng.normal(size=(20, 3, 4)), times, variance, [np.flatnonzero(numbers == k) for k in range(3)], kernel
-
-
-def test_whitening_inverts_the_covariance(offsets):
-    """Products of whitened rows are products weighted with the inverse covariance (to rounding)."""
-    rows, times, variance, sessions, kernel = offsets
-    white = whiten(rows, variance, times, sessions, 0.7, 60.0, 1.3**2)
-    for axis in range(3):
-        expected = rows[:, axis].T @ np.linalg.solve(kernel + np.diag(variance[:, axis]), rows[:, axis])
-        np.testing.assert_allclose(white[:, axis].T @ white[:, axis], expected, rtol=1e-10)
-
-
-def test_likelihood_is_that_of_the_dense_covariance(offsets):
-    """Log determinant and Gram matrix in linear time equal the dense ones."""
-    rows, times, variance, sessions, kernel = offsets
-    logs, gram = OffsetLikelihood(rows, variance, times, sessions, np.zeros((4, 4))).whitened(0.4, 0.7, 60.0, 1.3)
-    dense = [kernel + np.diag(variance[:, axis] + 0.4**2) for axis in range(3)]
-    np.testing.assert_allclose(logs, sum(np.linalg.slogdet(matrix)[1] for matrix in dense), rtol=1e-10)
-    np.testing.assert_allclose(gram, sum(rows[:, a].T @ np.linalg.solve(matrix, rows[:, a]) for a, matrix in enumerate(dense)), rtol=1e-9)
-
-
-def test_offsets_of_sessions_are_conditional_means(offsets):
-    """The prediction equals the regression of the offsets on the residuals."""
-    rows, times, variance, sessions, kernel = offsets
-    misfit = rows[:, :, 0]
-    noise = WindowNoise(np.ones(3), np.ones(3), 0.0, 0.7, 60.0, session_sd=1.3, session_variance=1.3**2)
-    found = predict_session_offsets(misfit, variance, times, sessions, noise)
-    for axis in range(3):
-        weighted = np.linalg.solve(kernel + np.diag(variance[:, axis]), misfit[:, axis])
-        np.testing.assert_allclose(found[:, axis], [1.3**2 * weighted[index].sum() for index in sessions], rtol=1e-9)

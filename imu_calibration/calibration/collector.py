@@ -64,7 +64,7 @@ class Collector:
         return [self._reduce(window) for window in windows if window.kind != 'unused']
 
     def _reduce(self, window):
-        reduced = reduce_window(window, self.model, self.table, self.session)
+        reduced = reduce_window(window, self.model, self.table, session=self.session)
         found = self.gathered
         found.accumulator.add(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))

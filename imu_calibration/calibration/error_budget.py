@@ -12,18 +12,18 @@ import numpy as np
 
 from imu_calibration.constants import ARCMIN, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import columns, warped_reference
+from imu_calibration.effects.columns import References, columns, warped_reference
 from imu_calibration.effects.forward_equations import coefficient_jacobian, sensor_output
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.levelling import tilt
 from imu_calibration.settings import setting
 
 MOVING_SAMPLES = 20_000
 """Samples of moving windows that are looked at: every so many of them stand for all."""
-DENSE_WINDOWS = 1500
-"""Up to this many windows the wander of the bias enters the weights in full."""
 
 
 @dataclass(frozen=True)
@@ -141,19 +141,23 @@ def parameter_shifts(result, changes):
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(pieces), len(solution.values)))
     for sensor in SENSORS:
+        design = np.array([piece.mean[sensor] for piece in pieces])
+        weighted = _whitening(solution.noise[sensor], pieces).weigh(design)
         for axis in range(3):
-            design = np.array([piece.mean[sensor][axis] for piece in pieces])
-            weighted = _weighted(solution.noise[sensor], axis, pieces, design)
-            normal = normal + weighted.T @ design
+            normal = normal + weighted[:, axis].T @ design[:, axis]
             for k, piece in enumerate(pieces):
                 normal += piece.within[sensor][axis]
-                right[:, k] += np.outer(piece.change[sensor][:, axis], weighted[k]) + piece.within_change[sensor][:, axis]
+                right[:, k] += np.outer(piece.change[sensor][:, axis], weighted[k, axis]) + piece.within_change[sensor][:, axis]
     index = np.flatnonzero(free)
-    scale = 1 / np.sqrt(np.diag(normal)[index])
-    inverse = np.linalg.pinv(normal[np.ix_(index, index)] * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
     shifts = np.zeros_like(right)
-    shifts[:, :, index] = right[:, :, index] @ inverse
+    shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
     return shifts
+
+
+def _whitening(noise, pieces):
+    """Return the `Whitening` of the means of the windows."""
+    variance = noise.mean_variance([p.kind for p in pieces], np.array([p.count for p in pieces])) + noise.offset_sd**2
+    return Whitening(variance, np.array([p.time for p in pieces]), sessions_of(pieces), noise.bias_processes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,16 +201,17 @@ def _piece(result, kind, time, session, count, stride, motion, temperature, chan
     model, values, table = result.solution.model, result.solution.values, result.table
     temperature = _known(model, motion, temperature)
     parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
+    references = References(model, table, motion, temperature)
     for sensor in SENSORS:
-        ref = warped_reference(model, sensor, table, motion, temperature)
-        design = columns(model, sensor, table, motion, temperature, ref)
+        ref = references.at(sensor)
+        design = columns(model, sensor, table, motion, temperature, references)
         slope = coefficient_jacobian(model, sensor, values)
         output = sensor_output(model, sensor, values, ref)
         moved = np.array([_output(model, sensor, values, *change(table, motion), temperature) - output for change in changes]).reshape(-1, len(motion), 3)
         mean = design.mean(axis=0)
         parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
         parts['change'][sensor] = moved.mean(axis=1)
-        variance = result.solution.noise[sensor].within_sd(kind)**2 / stride
+        variance = result.solution.noise[sensor].row_variance(kind) / stride
         centred = design - mean
         rest = moved - moved.mean(axis=1, keepdims=True)
         gram, cross = centred.T @ centred, np.einsum('nq,kna->kaq', centred, rest)
@@ -223,19 +228,6 @@ def _known(model, motion, temperature):
 
 def _output(model, sensor, values, table, motion, temperature):
     return sensor_output(model, sensor, values, warped_reference(model, sensor, table, motion, temperature))
-
-
-def _weighted(noise, axis, pieces, design):
-    """Return V^-1 @ design for the means of one axis, V with offsets and, for sessions of moderate length, the wander."""
-    counts, times = np.array([p.count for p in pieces]), np.array([p.time for p in pieces])
-    own = noise.white_variance[axis] * noise.inflation[axis] / counts + noise.offset_sd**2
-    if not noise.wander_sd or len(pieces) > DENSE_WINDOWS:
-        return design / (own + noise.wander_sd**2)[:, None]
-    variance = np.diag(own)
-    for index in sessions_of(pieces):
-        apart = np.abs(np.subtract.outer(times[index], times[index]))
-        variance[np.ix_(index, index)] += noise.wander_sd**2 * np.exp(-apart / noise.wander_time)
-    return np.linalg.solve(variance, design)
 
 
 def _budget_by_hand(result, errors):

@@ -52,8 +52,8 @@ def statistics(solution, gathered):
     for sensor in SENSORS:
         noise = solution.noise[sensor]
         result[sensor] = {
-            'noise_sd': noise.sample_sd(), 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd, 'wander_sd': noise.wander_sd,
-            'wander_time_s': noise.wander_time if noise.wander_sd else None, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
+            'noise_sd': noise.white_sd, 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd,
+            'wander_sd': float(np.sqrt(noise.bias_variance)), 'wander_time_s': noise.bias_time, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
         if sensor in solution.session_biases:
             result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}

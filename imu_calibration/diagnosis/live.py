@@ -4,10 +4,11 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 from imu_calibration.calibration.options import choose_model
-from imu_calibration.diagnosis.diagnose import LEAST_WINDOWS, diagnose
+from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.workflow import baseline_options, diagnosis_lines, in_words
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.estimation.window_store import owned_window
+from imu_calibration.selection.investigation import LEAST_WINDOWS
 
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = 'waiting', 'off', 'found', 'nothing found', 'unexplained', 'failed'
 

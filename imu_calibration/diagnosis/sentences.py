@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Candidate
-from imu_calibration.diagnosis.search import FAMILY_WISE
+from imu_calibration.selection.search import FAMILY_WISE
 
 READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'), 'm': (1e-3, 'mm'),
             '1': (1e-6, 'ppm'), 'm/s^2/K': (1e-3 * STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (DEG, 'deg/s/K'), '1/K': (1e-6, 'ppm/K'),

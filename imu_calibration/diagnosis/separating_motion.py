@@ -45,17 +45,17 @@ def _best_motion(solution, question, mate, gravity):
     for effect in solution.model.effects:
         values[model.slices[effect.sensor, effect.name]] = solution.values[solution.model.slices[effect.sensor, effect.name]]
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
-    own, other = model.slices[question.sensor, question.name], model.slices[mate.sensor, mate.name]
+    own = model.slices[question.sensor, question.name]
     best = (ENOUGH, None)
     for motion in MOTIONS:
         total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion, gravity)
-        left = _unimitated(total, values, own, other)
+        left = _unimitated(total, values, own)
         if left > best[0]:
             best = (left, motion.text)
     return best[1]
 
 
-def _unimitated(information, values, own, other):
+def _unimitated(information, values, own):
     """Return the squared standard deviations of the effect that nothing else in the model imitates, its mate included."""
     index = np.zeros(len(values), bool)
     index[own] = True

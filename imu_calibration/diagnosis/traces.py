@@ -1,10 +1,9 @@
 """Residuals before and after as a person looks at them: averaged over short blocks, and dead reckoning with both models."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from imu_calibration.diagnosis.reduced_recording import MOTION
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import INPUT_OF, warped_reference
 from imu_calibration.effects.forward_equations import predict
@@ -66,7 +65,7 @@ def residual_traces(windows, table, before, after):
         errors.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
         references.append({s: warped_reference(model, s, table, motion, temperature) for s in SENSORS})
     time = np.concatenate([w.time for w in windows])
-    navigation = _dead_reckoning(windows, time, (before, after), errors, references, rows)
+    navigation = _dead_reckoning(time, (before, after), errors, references, rows)
     known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
     block, number = _blocks(windows, known)
 
@@ -82,7 +81,7 @@ def residual_traces(windows, table, before, after):
 
 def _all_samples(windows):
     """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, name) for w in windows]) for name in MOTION))
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
@@ -112,7 +111,7 @@ def _block_mean(values, block, number):
     return means[:, 0] if values.ndim == 1 else means
 
 
-def _dead_reckoning(windows, time, solutions, errors, references, rows):
+def _dead_reckoning(time, solutions, errors, references, rows):
     """Return medians over stretches of 50 s without gaps, or None."""
     edges = np.flatnonzero(np.diff(time) > 0.1)
     starts, stops = np.r_[0, edges + 1], np.r_[edges + 1, len(time)]

@@ -22,7 +22,7 @@ class Rest:
     """Structure of one sensor's residual that no effect explains."""
 
     significant: bool
-    """Whether it stands out of noise and of the wander that every bias has."""
+    """Whether it stands out of noise and of the way in which every bias moves."""
     rms: float
     """Rms beyond noise, m/s^2 or rad/s: of the windows' means, or within windows where only that stands out."""
     sigma: float
@@ -41,18 +41,16 @@ class Rest:
 
 def unexplained(attempt, explained, chosen):
     """Return sensor -> Rest for a choice of effects."""
-    excess = explained.excess(chosen)
-    values = np.zeros(attempt.space.size + 1)
-    used = list(attempt.search.used(chosen))
-    values[used], values[-1] = -attempt.evidence.fit(tuple(used))[0], 1.0
+    excess, used = explained.excess(chosen), attempt.search.used(chosen)
+    values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
     return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
 
 
 def _rest(attempt, explained, sensor, excess, values):
-    space, lifted = attempt.space, attempt.lifted
-    residual = np.stack([space.mean[sensor][axis] @ values[np.r_[space.index[sensor][axis], space.size]] for axis in range(3)], axis=1)
+    space, recording = attempt.space, attempt.recording
+    residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
-    noise_sd = np.sqrt(floor.mean_variance(lifted.kind, lifted.count) + floor.wander_sd**2)
+    noise_sd = np.sqrt(floor.mean_variance(recording.kind, recording.count) + floor.bias_variance)
     sigma = sigma_means = excess[0] / np.sqrt(2 * explained.n_means)
     if excess[1] > WITHIN_SHARE * explained.n_within:
         sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
@@ -61,10 +59,10 @@ def _rest(attempt, explained, sensor, excess, values):
     if not significant:
         return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
     if sigma_means <= SIGNIFICANT:
-        inside = np.mean([floor.row_variance(kind) for kind in np.unique(lifted.kind[lifted.kind != 'static'])])
+        inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
         return Rest(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
-    name, share = correlate(_explanations(lifted), residual / noise_sd)
-    return Rest(True, rms, float(sigma), name, share, where_most(lifted.time, residual, noise_sd), residual, noise_sd)
+    name, share = correlate(_explanations(recording), residual / noise_sd)
+    return Rest(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
 
 
 def correlate(explanations, residual):
@@ -90,9 +88,9 @@ def correlate(explanations, residual):
     return best
 
 
-def _explanations(lifted):
+def _explanations(recording):
     """Yield (name, columns (k, m), windows where they are known)."""
-    describe, every = lifted.describe, np.ones(len(lifted.kind), bool)
+    describe, every = recording.describe, np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])
     yield 'rate', np.stack([describe['rate'], describe['rate']**2], axis=1), every
     yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
@@ -101,7 +99,7 @@ def _explanations(lifted):
             number = name[len('angle'):]
             angle, known = describe[name], describe['span' + number] < 0.7
             yield f'angle of joint {int(number) + 1}', np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1), known
-    yield 'motion (moving windows against windows at rest)', (lifted.kind != 'static')[:, None].astype(float), every
+    yield 'motion (moving windows against windows at rest)', recording.moving[:, None].astype(float), every
 
 
 def slow_explanations(time, temperature):

@@ -8,12 +8,7 @@ from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
 
 
-def warps_act(model):
-    """Tell whether any warp has a point other than zero, so that the sensors feel another motion than the table's."""
-    return any(effect.warp is not None and np.any(model.warp_point(effect)) for effect in model.effects)
-
-
-def warped_reference(model, sensor, table, motion, temperature_c=None, values=None, skip=None):
+def warped_reference(model, sensor, table, motion, temperature_c=None, values=None):
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -49,14 +44,32 @@ def mean_reference(weighted, motion):
 INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
 
 
-def columns(model, sensor, table, motion, temperature_c=None, ref=None):
+class References:
+    """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
+
+    def __init__(self, model, table, motion, temperature_c=None):
+        self.model, self.table, self.motion, self.temperature_c, self._known = model, table, motion, temperature_c, {}
+
+    def at(self, sensor, effect=None, values=None):
+        """Return the reference of `sensor`, with other values for one effect where given."""
+        lags = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and e.sensor == sensor and np.any(self.model.warp_point(e)))
+        own = effect is not None and effect.sensor == sensor
+        key = (sensor if own else lags, effect and effect.name, None if values is None else tuple(values))
+        if key not in self._known:
+            change = None if effect is None else {effect.name: values}
+            self._known[key] = warped_reference(self.model, sensor, self.table, self.motion, self.temperature_c, change)
+        return self._known[key]
+
+
+def columns(model, sensor, table, motion, temperature_c=None, references=None):
     """
     Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
 
     A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
     its coefficients are matrix times parameter. The derivative is a central difference of the exact kinematics.
     """
-    ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
+    references = references or References(model, table, motion, temperature_c)
+    ref = references.at(sensor)
     if ref.temperature_c is None and any(name.endswith('temperature') for name, _ in model.groups(sensor)):
         raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
     point, parts = model.full_point(), []
@@ -64,25 +77,34 @@ def columns(model, sensor, table, motion, temperature_c=None, ref=None):
     for name, _ in model.groups(sensor):
         kind, _, owner = name.partition(':')
         if kind == 'warp':
-            parts += warp_columns(model, warps[owner], sensor, table, motion, ref)
+            parts += warp_columns(model, warps[owner], sensor, references)
         elif kind != 'warp_lever':
             parts.append(GROUPS[name](ref, point))
     return np.concatenate(parts, axis=1)
 
 
-def warp_columns(model, effect, sensor, table, motion, ref):
+def warp_columns(model, effect, sensor, references):
     """
     Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
+
+    With `folded_arms` the true input is that at the sensitive points, and there is no second block.
     """
     if effect.derivative is not None:
-        return [effect.derivative(ref)]
+        return [effect.derivative(references.at(sensor))]
+    clock = next((e for e in model.effects if e.name == 'time_offset'), None)
+    if clock is not None and effect.sensor == sensor and not np.any(model.warp_point(effect)):
+        effect = clock   # a lag of zero is a delay to first order
     inputs, levers = [], []
     for above, below, width in _central_steps(effect, model.warp_point(effect)):
-        high, low = (warped_reference(model, sensor, table, motion, values={effect.name: at}) for at in (above, below))
-        inputs.append((getattr(high, INPUT_OF[sensor]) - getattr(low, INPUT_OF[sensor])) / width)
-        if sensor == 'accelerometer' and model.has_arms:
-            turns = [lever_matrix(end.rate_s, end.alpha_s).reshape(-1, 9) for end in (high, low)]
-            levers.append((turns[0] - turns[1]) / width)
+        ends = [references.at(sensor, effect, at) for at in (above, below)]
+        change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
+        if sensor == 'accelerometer' and model.has_arms and (model.folded_arms is None or model.folded_arms.any()):
+            turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(ends[1].rate_s, ends[1].alpha_s)
+            if model.folded_arms is None:
+                levers.append(turned.reshape(-1, 9) / width)
+            else:
+                change = change + np.einsum('nij,ij->ni', turned, model.folded_arms)
+        inputs.append(change / width)
     return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
 
 

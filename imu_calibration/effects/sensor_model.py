@@ -56,6 +56,11 @@ class SensorModel:
     """Temperature at which thermal effects vanish, degrees Celsius."""
     point: dict = field(default_factory=dict)
     """Where the columns were linearised: effect name -> values."""
+    folded_arms: np.ndarray | None = None
+    """
+    Arms, shape (3, 3), for which the columns of a warp hold its change of the lever-arm terms too; None: that change has columns of its
+    own. Folded, the columns are fewer and exact at these arms only, as everything is exact at `point` only.
+    """
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
@@ -117,7 +122,7 @@ class SensorModel:
                 names.setdefault(group, WIDTH[group])
             if effect.warp is not None:
                 names['warp:' + effect.name] = 3 * effect.size
-                if sensor == 'accelerometer' and effect.derivative is None and self.has_arms:
+                if sensor == 'accelerometer' and effect.derivative is None and self.has_arms and self.folded_arms is None:
                     names['warp_lever:' + effect.name] = 9 * effect.size
         return list(names.items())
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.linear_least_squares import triangular
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.triangular import triangular
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 
 CAPACITY = 4096
@@ -118,15 +119,18 @@ def _without_within(window):
     return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session)
 
 
-def restrict(accumulator, wide, narrow):
-    """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
+def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:
+    """Return sensor -> indices of the columns of `narrow`, and of the outputs, in rows made with the model `wide`."""
     chosen = {}
-    for sensor in ('accelerometer', 'gyroscope'):
-        index, start = {}, 0
-        for name, width in wide.groups(sensor):
-            index[name] = np.arange(start, start + width)
-            start += width
-        chosen[sensor] = np.concatenate([index[name] for name, _ in narrow.groups(sensor)] + [np.arange(start, start + 3)])
+    for sensor in SENSORS:
+        place = wide.layout(sensor).rows
+        chosen[sensor] = np.concatenate([*(np.arange(place[name].start, place[name].stop) for name, _ in narrow.groups(sensor)), [-3, -2, -1]])
+    return chosen
+
+
+def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -> Accumulator:
+    """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
+    chosen = selected_columns(wide, narrow)
     small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
     small.within, small.slow = ({(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
                                 for factors in (accumulator.within, accumulator.slow))
@@ -134,7 +138,8 @@ def restrict(accumulator, wide, narrow):
     return small
 
 
-def restricted_window(window, chosen):
+def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:
     """Return a reduced window with the columns `chosen` (sensor -> indices) only."""
-    sensors = {name: replace(s, mean=s.mean[chosen[name]], within=s.within[:, chosen[name]]) for name, s in window.sensors.items()}
+    sensors = {name: replace(s, mean=s.mean[chosen[name]], within=s.within[:, chosen[name]], slow=None if s.slow is None else s.slow[:, chosen[name]])
+               for name, s in window.sensors.items()}
     return replace(window, sensors=sensors)

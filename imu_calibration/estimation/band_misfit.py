@@ -4,14 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
+
 APART = 2.0
 """The parts are weighed apart from this ratio of their misfits on, fast over slow; below it all samples count alike."""
 SURE = 2.0
 """The misfit of the slow part is taken larger by this many of its standard deviations, when it is compared and used."""
 STRONG = 1e-6
 """Directions of a scaled design with less than this share of the largest eigenvalue do not count."""
-NO_SAY = 1e6
-"""Factor on a variance that takes the weight away."""
+SEEN = 1e-9
+"""The same where a misfit is to be as small as can be."""
+WEIGHTLESS = 1e6
+"""Factor on a variance that leaves next to no weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,16 +31,16 @@ class BandMisfit:
     apart: np.ndarray
     """Whether slow and fast part are to be weighed apart, shape (3,)."""
 
-    def weights(self, white, inflation):
-        """Return the factors on ``white * inflation`` for the variance of all rows and of the slow rows, both shape (3,)."""
-        unit = white * inflation
+    def factors(self, noise: NoiseModel) -> MovingFactors:
+        """Return what moving windows with this misfit scatter beyond the noise at rest."""
+        white, unit = noise.white_variance, noise.low_variance
         samples, pieces = np.where(self.apart, self.fast, self.overall), np.where(self.apart, 0.0, self.slow)
         every = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
-        return every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every)
+        return MovingFactors(every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every))
 
-    def without_fast(self):
-        """Return the same with so large a variance of the fast part that it has no say."""
-        return replace(self, fast=np.where(self.apart, NO_SAY * self.fast, self.fast))
+    def without_fast(self) -> 'BandMisfit':
+        """Return the same with so large a variance of the fast part that its weight is zero."""
+        return replace(self, fast=np.where(self.apart, WEIGHTLESS * self.fast, self.fast))
 
     @property
     def noise(self):
@@ -77,39 +81,32 @@ def own_misfit(rows):
     return output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0] if len(rows) else output
 
 
-def variance_along(every, slow):
+def misfit_along(products: np.ndarray) -> tuple[float, int]:
     """
-    Return the variance of the fast part of a misfit along the columns of a design, per dimension.
+    Return the squares of a misfit along the columns of designs, and the number of their dimensions.
 
-    For misfit e and design A of the fast rows: ``e' A (A'A)^+ A' e / rank``. It is the variance of e when e is noise, and more by
-    as many times as there are samples when the fast part asks for other parameters than the slow part has given.
+    For misfit e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their ratio is the variance of e when e is
+    noise, and more by as many times as there are samples when the misfit asks for other parameters than were given.
 
     Parameters
     ----------
-    every, slow : (design, misfit)
-        Of all rows and of the slow ones among them, shapes (k, p) and (k,).
+    products : array, shape (k, q + 1, q + 1)
+        Products of ``[design | misfit]``.
 
     """
-    gram = every[0].T @ every[0] - slow[0].T @ slow[0]
-    gradient = every[0].T @ every[1] - slow[0].T @ slow[1]
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    strong = eigenvalues > STRONG * eigenvalues[-1]
-    along = (vectors.T @ (gradient / scale))[strong]
-    return float((along**2 / eigenvalues[strong]).sum() / max(strong.sum(), 1))
+    gram, gradient = products[:, :-1, :-1], products[:, :-1, -1]
+    scale = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', gram), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
+    along = np.einsum('kij,ki->kj', vectors, gradient * scale)
+    strong = eigenvalues > STRONG * eigenvalues[:, -1:]
+    return float((along**2 * strong / np.where(strong, eigenvalues, 1.0)).sum()), int(strong.sum())
 
 
-def weighed(noise, misfits):
-    """Return the WindowNoise with the variances of kind -> BandMisfit."""
-    weights = {kind: misfit.weights(noise.white_variance, noise.inflation) for kind, misfit in misfits.items()}
-    return replace(noise, kind_scale={kind: every for kind, (every, _) in weights.items()},
-                   slow_scale={kind: slow for kind, (_, slow) in weights.items()})
-
-
-def extra_weight(fast_variance, slow_variance):
-    """
-    Return the weight w of slow rows beside all rows weighed as fast ones, ``w^2 = 1/s - 1/f``, shape (3,).
-
-    The sum of squares is then ``fast / f + slow / s``, without a difference of factors.
-    """
-    return np.sqrt(np.maximum(1 / slow_variance - 1 / fast_variance, 0.0))
+def least_misfit(products: np.ndarray) -> tuple[float, int]:
+    """Return the squares that the best fit leaves of products of ``[design | output]``, shape (q + 1, q + 1), and the rank of the design."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(products), 1e-300))
+    scaled = products * np.outer(scale, scale)
+    eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
+    seen = eigenvalues > SEEN * max(eigenvalues[-1], 1e-300)
+    along = (vectors.T @ scaled[:-1, -1])[seen]
+    return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1]**2, int(seen.sum())

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg import lapack
 
 from imu_calibration.errors import InputError, NotObservableError
 
@@ -269,58 +268,3 @@ def _as_text(direction):
     if len(direction) == 1:
         return next(iter(direction))
     return ' '.join(f'{weight:+.3g} {name}' for name, weight in direction.items())
-
-
-BLOCK = 2000
-"""Rows per orthogonal factorisation: taller blocks do not stay in the processor's cache."""
-
-
-PANEL = 4
-"""Columns that are reflected at a time."""
-
-
-def triangular(rows):
-    """Return the triangular factor of `rows` by Householder reflections, block after block, with as many rows as it has rank bound."""
-    count, width = rows.shape
-    if count < 2 * width:
-        return _r_factor(np.array(rows, order='F'))
-    factor = np.zeros((width, width), order='F')
-    for start in range(0, count, BLOCK):
-        # Each block is folded into the triangle, whose zeros cost nothing.
-        block = np.array(rows[start:start + BLOCK], order='F')
-        factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
-        _require_finite(info, factor)
-    return np.triu(factor)
-
-
-def _r_factor(stacked):
-    if not len(stacked):
-        return stacked
-    raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
-    _require_finite(info, raw[:, 0])
-    return np.triu(raw[:min(raw.shape)])
-
-
-def _require_finite(info, values):
-    if info != 0 or not np.isfinite(values).all():
-        raise FloatingPointError('orthogonal factorisation met values that are not finite')
-
-
-def _scaled_lstsq(matrix, right):
-    """Return the least-squares solution with columns scaled to unit norm first."""
-    scale = np.linalg.norm(matrix, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
-    diagonal = np.abs(np.diag(r))
-    rank = int((diagonal > 1e-15 * diagonal[0]).sum()) if len(diagonal) else 0
-    solved = np.zeros((matrix.shape[1],) + right.shape[1:])
-    solved[order[:rank]] = scipy.linalg.solve_triangular(r[:rank, :rank], (q.T @ right)[:rank])
-    return (solved.T / scale).T
-
-
-def _inverse_gram(matrix):
-    """Return (matrix' matrix)^-1 through the triangular factor of the scaled columns."""
-    scale = np.linalg.norm(matrix, axis=0)
-    r = scipy.linalg.qr(matrix / scale, mode='r')[0][:matrix.shape[1]]
-    inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
-    return (inverse @ inverse.T) / np.outer(scale, scale)

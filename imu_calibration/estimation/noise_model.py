@@ -1,75 +1,136 @@
-"""Noise of a session: white noise within windows, an offset per window, a bias that wanders from window to window."""
+"""The noise of one sensor: white noise within windows, offsets of windows, bias processes, what moving windows scatter beyond."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Sequence
 
 import numpy as np
 
-from imu_calibration.estimation.band_misfit import extra_weight
+DOF_FACTOR_MOST = 3.0
+"""Largest factor by which a variance grows because it was itself estimated."""
+
+
+@dataclass(frozen=True)
+class BiasProcess:
+    """First-order Gauss-Markov process of the bias: covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, each on its own."""
+
+    sd: float
+    """Standard deviation, m/s^2 or rad/s."""
+    time: float
+    """Correlation time, s; long against the session it is a random walk, several of them in a row of times make flicker noise."""
 
 
 @dataclass(frozen=True, eq=False)
-class WindowNoise:
+class MovingFactors:
+    """What moving windows of one kind scatter beyond the noise at rest, as factors on ``white_variance * inflation``, each shape (3,)."""
+
+    every: np.ndarray
+    """On the variance of the centred rows."""
+    slow: np.ndarray
+    """On that of their slow part, where it fits better than the fast one; else as `every`."""
+    means: np.ndarray = field(default_factory=lambda: np.ones(3))
+    """On the variance of the windows' means by the noise within."""
+    along: float = 1.0
+    """Part of `every` that comes from misfit along the columns of the model, correlated in time; at least 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
     """
     Noise of one sensor.
 
-    The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the
-    same recording, the covariance ``wander_sd^2 exp(-|t_k - t_l| / wander_time) + session_variance``.
+    The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the same recording,
+    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes.
     """
 
     white_variance: np.ndarray
-    """Variance of single samples, shape (3,)."""
+    """Variance of single samples at rest, shape (3,)."""
     inflation: np.ndarray
     """Factor by which the noise at low frequency exceeds white noise of that variance, shape (3,)."""
     offset_sd: float = 0.0
     """Standard deviation of an independent offset per window."""
-    wander_sd: float = 0.0
-    """Standard deviation of a first-order Gauss-Markov wander of the bias."""
-    wander_time: float = 100.0
-    """Correlation time of the wander, s."""
-    kind_scale: dict = field(default_factory=dict)
-    """Kind -> factor on the variance of the centred rows, shape (3,): what moving windows scatter beyond the noise at rest."""
-    slow_scale: dict = field(default_factory=dict)
-    """Kind -> the same of their slow part, where that fits better than the fast part, shape (3,)."""
+    bias_processes: tuple[BiasProcess, ...] = ()
+    """How the bias moves from window to window."""
+    moving: dict[str, MovingFactors] = field(default_factory=dict)
+    """Kind of window -> what it scatters beyond the noise at rest."""
     session_sd: float = 0.0
     """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
     session_variance: float = 0.0
     """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
 
-    def sample_sd(self):
-        """Return the standard deviation of single samples, shape (3,)."""
+    @property
+    def white_sd(self) -> np.ndarray:
+        """Standard deviation of single samples at rest, shape (3,)."""
         return np.sqrt(self.white_variance)
 
-    def within_sd(self, kind):
-        """Return the standard deviation per centred row of windows of `kind`, shape (3,)."""
-        return np.sqrt(self.white_variance * self.inflation * self.kind_scale.get(kind, np.ones(3)))
+    @property
+    def low_variance(self) -> np.ndarray:
+        """Variance of white noise that would scatter the means of samples as much, shape (3,)."""
+        return self.white_variance * self.inflation
 
-    def slow_weight(self, kind):
-        """Return the weight of the slow part of centred rows of `kind` beside all of them at `within_sd`, shape (3,)."""
-        if kind not in self.slow_scale:
+    @property
+    def bias_variance(self) -> float:
+        """Variance of all bias processes together."""
+        return sum(process.sd**2 for process in self.bias_processes)
+
+    @property
+    def bias_time(self) -> float | None:
+        """Correlation time of the largest bias process, s; None when there is none."""
+        return max(self.bias_processes, key=lambda process: process.sd).time if self.bias_processes else None
+
+    def mean_variance(self, kinds: Sequence[str], counts: np.ndarray) -> np.ndarray:
+        """Return the variance of means of windows of these kinds and lengths by the noise within, shape (k, 3)."""
+        factors = {kind: moving.means for kind, moving in self.moving.items()}
+        return self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
+
+    def row_variance(self, kind: str) -> np.ndarray:
+        """Return the variance per centred row of windows of `kind`, shape (3,)."""
+        return self.low_variance * self.moving[kind].every if kind in self.moving else self.low_variance
+
+    def slow_weight(self, kind: str) -> np.ndarray:
+        """
+        Return the weight w of the slow part of centred rows beside all of them at `row_variance`, ``w^2 = 1/slow - 1/every``, shape (3,).
+
+        The sum of squares is then ``fast / every + slow / slow``, without a difference of factors.
+        """
+        if kind not in self.moving:
             return np.zeros(3)
-        unit = self.white_variance * self.inflation
-        return extra_weight(unit * self.kind_scale[kind], unit * self.slow_scale[kind])
+        factors = self.moving[kind]
+        return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
 
-    def weighs_alike(self, other, change=0.05):
+    def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
+        """Return what noise alone would be: no offsets, no misfit along the columns, and only the bias processes that are given."""
+        moving = {kind: replace(factors, every=factors.every / factors.along) for kind, factors in self.moving.items()}
+        moving = {kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0))) for kind, factors in moving.items()}
+        return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
+
+    def weighs_alike(self, other: 'NoiseModel', change: float = 0.05) -> bool:
         """Return whether slow parts count no more than fast ones, or both as with `other`, to a relative change of their variances."""
-        unit, other_unit = (noise.white_variance * noise.inflation for noise in (self, other))
-        for kind, slow in self.slow_scale.items():
-            every = self.kind_scale[kind]
-            if np.all(slow == every):
+        for kind, mine in self.moving.items():
+            if np.all(mine.slow == mine.every):
                 continue
-            if kind not in other.slow_scale:
+            if kind not in other.moving:
                 return False
-            pairs = ((every, other.kind_scale[kind]), (slow, other.slow_scale[kind]))
-            if any(np.any(np.abs(unit * mine / (other_unit * its) - 1) > change) for mine, its in pairs):
+            its, unit = other.moving[kind], self.low_variance / other.low_variance
+            if any(np.any(np.abs(unit * a / b - 1) > change) for a, b in ((mine.every, its.every), (mine.slow, its.slow))):
                 return False
         return True
 
 
-def white_noise(rows, sensor):
+def dof_factor(dof):
+    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: what a variance from few data is taken larger by."""
+    return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
+
+
+def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
 
     Windows whose variance lies far from the median (clipped, knocked) are left out.
+
+    Parameters
+    ----------
+    rows : sequence of WindowStatistics
+
     """
     static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
     if not static:
@@ -89,7 +150,7 @@ def white_noise(rows, sensor):
     return np.maximum(pooled, floor), np.clip(factors, 0.8, None)
 
 
-def sessions_of(rows):
+def sessions_of(rows: Sequence) -> list[np.ndarray]:
     """Return the index arrays of the rows of each recording, in order of time."""
     numbers = np.array([row.session for row in rows])
     times = np.array([row.time for row in rows])

@@ -7,6 +7,7 @@ import scipy.linalg
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 
@@ -34,8 +35,8 @@ def _piece_information(model, sensor, values, noise, piece, point):
     information = np.zeros((dc.shape[2], dc.shape[2]))
     for axis in range(3):
         rows = mean @ dc[:, axis]
-        variance = noise.white_variance[axis] * noise.inflation[axis]
-        information += np.outer(rows, rows) / (variance / count + noise.offset_sd**2 + noise.wander_sd**2)
+        variance = noise.low_variance[axis]
+        information += np.outer(rows, rows) / (variance / count + noise.offset_sd**2 + noise.bias_variance)
         information += dc[:, axis].T @ within @ dc[:, axis] / variance
     return information
 
@@ -97,9 +98,7 @@ def needed_motions(solution, tolerances, gravity, prior_sd):
     predicted = {}
     for motion in MOTIONS:
         total = base + added_information(solution.model, solution.values, solution.noise, motion, gravity)
-        scale = np.sqrt(np.diag(total))
-        inverse = np.linalg.inv(total / np.outer(scale, scale))
-        predicted[motion] = np.sqrt(np.clip(np.diag(inverse), 0, None)) / scale
+        predicted[motion] = np.sqrt(np.clip(np.diag(inverse_normal(total)), 0, None))
     return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}
 
 

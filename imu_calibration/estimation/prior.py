@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.effects.sensor_model import SensorModel
+
 
 @dataclass(frozen=True, eq=False)
 class Prior:
@@ -15,12 +17,15 @@ class Prior:
     """Square root of the information, shape (k, n_params)."""
     sd: np.ndarray
     """Marginal standard deviations, shape (n_params,)."""
+    gauge: np.ndarray
+    """Rows of `root` that fix an origin rather than say what is likely, shape (k, n_params)."""
 
 
 GAUGE_SD = 1e-12
+"""How exactly a gauge holds, in the unit of its parameters."""
 
 
-def make_prior(model):
+def make_prior(model: SensorModel) -> Prior:
     """
     Return the prior of a model.
 
@@ -32,7 +37,7 @@ def make_prior(model):
     for effect in model.relinearised:
         if effect.components[-1] == 'time_constant' and effect.size > 1:
             mean[model.slices[effect.sensor, effect.name]][-1] = 300.0
-    rows = [np.diag(1 / sd)]
+    rows, gauge = [np.diag(1 / sd)], np.zeros((0, len(mean)))
     if ('accelerometer', 'accel_size_effect') in model.slices and ('accelerometer', 'lever_arm') in model.slices:
         arms = np.arange(len(mean))[model.slices['accelerometer', 'accel_size_effect']].reshape(3, 3)
         gauge = np.zeros((3, len(mean)))
@@ -41,9 +46,9 @@ def make_prior(model):
         rows.append(gauge)
         sd = sd.copy()
         sd[arms.ravel()] *= np.sqrt(2 / 3)
-    return Prior(mean, np.concatenate(rows), sd)
+    return Prior(mean, np.concatenate(rows), sd, gauge)
 
 
-def fixed_parameters(model):
+def fixed_parameters(model: SensorModel) -> np.ndarray:
     """Return a mask of parameters that least squares leaves alone (saturation is censoring, not a column)."""
     return np.concatenate([np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects])

@@ -1,65 +1,145 @@
-"""Rows whose errors are correlated from window to window, turned into independent rows of unit variance."""
+"""Means of windows whose errors are correlated in time, turned into independent rows of unit variance, in linear time."""
+
+from typing import Sequence
 
 import numpy as np
 from scipy.linalg import lapack
 
+from imu_calibration.estimation.noise_model import BiasProcess
 
-def whiten(values, variance, times, sessions, wander_sd, wander_time, session_variance=0.0):
+
+class Whitening:
     """
-    Turn rows with correlated offsets into independent rows of unit variance.
+    Multiplication with the inverse Cholesky factor of the covariance of window means, by the innovations of a Kalman filter.
 
-    Innovations of a scalar Kalman filter: the same as multiplying with the inverse Cholesky factor of
-    ``diag(variance) + wander_sd^2 exp(-|dt| / wander_time)``, in linear time. An offset of each session is taken out afterwards, with
-    ``(I + s^2 u u')^(-1/2)`` and u the whitened ones of the session.
+    The covariance is ``diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j)`` within a session, the sum over any number of bias processes,
+    each a state of the filter. An offset of each session is taken out afterwards with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
 
     Parameters
     ----------
-    values : ndarray, shape (n, n_axes, q)
-        Rows for each axis.
     variance : ndarray, shape (n, n_axes)
-        Independent part of the variance.
+        Independent part of the variance of each row.
+    times : ndarray, shape (n,)
+        Middle of each window, s.
     sessions : list of ndarray
         Indices of each session's rows in order of time.
+    processes : sequence of BiasProcess
     session_variance : float
         Variance of an offset that all rows of a session share.
 
-    Returns
-    -------
-    ndarray, shape (n, n_axes, q)
-
     """
-    white = np.empty_like(values)
-    for index in sessions:
-        white[index] = _whiten_session(values[index], variance[index], times[index], wander_sd, wander_time)
+
+    def __init__(self, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], processes: Sequence[BiasProcess] = (),
+                 session_variance: float = 0.0):
+        self._variance, self._sessions, self._session_variance = variance, sessions, session_variance
+        self._filter, self._ones = None, None
+        processes = [process for process in processes if process.sd > 0]
+        if processes:
+            self._order = np.concatenate(sessions)
+            steps = np.diff(times[self._order], prepend=-np.inf)
+            steps[np.cumsum([len(index) for index in sessions])[:-1]] = np.inf
+            self._filter = _Filter(self._chained(variance[:, :, None])[:, 0], np.tile(steps, variance.shape[1]), processes)
         if session_variance > 0:
-            ones = _whiten_session(np.ones((len(index), values.shape[1], 1)), variance[index], times[index], wander_sd, wander_time)[:, :, 0]
+            self._ones = self._filtered(np.ones(variance.shape + (1,)))[:, :, 0]
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Return the whitened rows of `values`, both shape (n, n_axes, q)."""
+        return self._with_session_offsets(self._filtered(values))
+
+    def weigh(self, values: np.ndarray) -> np.ndarray:
+        """Return ``V^-1 values`` with V the covariance, both shape (n, n_axes, q)."""
+        return self._filtered(self._with_session_offsets(self(values)), 'adjoint')
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the covariance, all axes together."""
+        logs = np.log(self._variance if self._filter is None else self._filter.total).sum()
+        if self._ones is not None:
+            logs += sum(np.log1p(self._session_variance * (self._ones[index]**2).sum(axis=0)).sum() for index in self._sessions)
+        return float(logs)
+
+    def _chained(self, values):
+        """Return the rows of all axes and sessions one after the other, each session in order of time, shape (n_axes n, q)."""
+        return values[self._order].transpose(1, 0, 2).reshape(-1, values.shape[2])
+
+    def _filtered(self, values, direction='forward'):
+        if self._filter is None:
+            return values / np.sqrt(self._variance)[:, :, None]
+        white = np.empty_like(values)
+        found = getattr(self._filter, direction)(self._chained(values))
+        white[self._order] = found.reshape(values.shape[1], -1, values.shape[2]).transpose(1, 0, 2)
+        return white
+
+    def _with_session_offsets(self, white):
+        """Multiply with ``(I + s^2 u u')^(-1/2)`` in each session, in place."""
+        for index in self._sessions if self._ones is not None else ():
+            ones = self._ones[index]
             square = (ones**2).sum(axis=0)
-            shrink = (1 - 1 / np.sqrt(1 + session_variance * square)) / square
+            shrink = (1 - 1 / np.sqrt(1 + self._session_variance * square)) / square
             white[index] -= (shrink * ones)[:, :, None] * np.einsum('ka,kaq->aq', ones, white[index])
-    return white
+        return white
 
 
-def _whiten_session(values, variance, times, wander_sd, wander_time):
-    """Return the innovations of one session: gains step by step, states by a bidiagonal system ``s_k - c_k s_(k-1) = d_k g_k v_k``."""
-    if wander_sd == 0:
-        return values / np.sqrt(variance)[:, :, None]
-    n_axes, decay = variance.shape[1], np.exp(-np.diff(times) / wander_time)
-    total, gain = np.empty_like(variance), np.empty_like(variance)
-    spread = np.full(n_axes, wander_sd**2)
-    fresh = np.append((1 - decay**2) * wander_sd**2, 0.0)
-    for k, square in enumerate(np.append(decay**2, 0.0)):
-        total[k] = spread + variance[k]
-        gain[k] = spread / total[k]
-        spread = square * spread * (1 - gain[k]) + fresh[k]
-    innovation = values.copy()
-    for axis in range(n_axes if len(values) > 1 else 0):
-        bands = np.stack([np.ones(len(decay)), np.append(-decay[1:] * (1 - gain[1:-1, axis]), 0.0)])
-        driven = np.asfortranarray((decay * gain[:-1, axis])[:, None] * values[:-1, axis])
-        innovation[1:, axis] -= lapack.dtbtrs(bands, driven, uplo='L', diag='U')[0]
-    return innovation / np.sqrt(total)[:, :, None]
+class _Filter:
+    """Innovations over their standard deviations of one chain of rows; an infinite step begins a new series."""
+
+    def __init__(self, variance, steps, processes):
+        power, times = np.array([(process.sd**2, process.time) for process in processes]).T
+        decay, fresh = np.exp(-steps[:, None] / times), -np.expm1(-2 * steps[:, None] / times) * power
+        self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0]) if len(power) == 1 else _gains(variance, decay, fresh)
+        self._width, self._driven_by = len(power), decay[1:] * gain[:-1]
+        # the states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded system for all of them at once
+        width = self._width
+        self._bands = np.zeros((2 * width, width * (len(variance) - 1)))
+        self._bands[0] = 1.0
+        for i in range(width):
+            for j in range(width):
+                self._bands[width + i - j, j:-width:width] = -decay[2:, i] * ((i == j) - gain[1:-1, i])
+
+    def forward(self, values):
+        if len(values) > 1:
+            driven = np.asfortranarray((self._driven_by[:, :, None] * values[:-1, None, :]).reshape(-1, values.shape[1]))
+            states = lapack.dtbtrs(self._bands, driven, uplo='L', diag='U', overwrite_b=1)[0]
+            values[1:] -= states if self._width == 1 else states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
+        return values / np.sqrt(self.total)[:, None]
+
+    def adjoint(self, white):
+        values = white / np.sqrt(self.total)[:, None]
+        if len(values) > 1:
+            states = np.asfortranarray(np.repeat(values[1:], self._width, axis=0))
+            driven = lapack.dtbtrs(self._bands, states, uplo='L', trans='T', diag='U')[0].reshape(len(values) - 1, self._width, -1)
+            values[:-1] -= np.einsum('kj,kjq->kq', self._driven_by, driven)
+        return values
 
 
-def predict_session_offsets(misfit, variance, times, sessions, noise):
+def _gains(variance, decay, fresh):
+    """Return (variances of the innovations, shape (n,), gains, shape (n, m)) of m processes."""
+    spread, total, gain = np.zeros((decay.shape[1],) * 2), np.empty(len(variance)), np.empty(decay.shape)
+    for k, own in enumerate(variance):
+        spread = decay[k][:, None] * spread * decay[k] + np.diag(fresh[k])
+        reach = spread.sum(axis=1)
+        total[k] = reach.sum() + own
+        gain[k] = reach / total[k]
+        spread = spread - np.outer(gain[k], reach)
+    return total, gain
+
+
+def _gains_of_one(variance, decay, fresh):
+    """
+    Return the same for one process, the common case, which is asked for hundreds of times.
+
+    Differences ``y_k - decay_k y_(k-1)`` have a tridiagonal covariance, whose pivots are the variances of the innovations.
+    """
+    carried = decay[1:] * variance[:-1]
+    diagonal = fresh + variance
+    diagonal[1:] += decay[1:] * carried
+    total, _, info = lapack.dpttrf(diagonal, -carried)
+    if info:
+        raise FloatingPointError('the covariance of the window means must be positive definite; variances are not finite')
+    return total, (1 - variance / total)[:, None]
+
+
+def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], noise) -> np.ndarray:
     """
     Return the offset of each session, shape (n_sessions, 3): the mean of its residuals, weighted, drawn towards zero by the noise of that mean.
 
@@ -67,11 +147,9 @@ def predict_session_offsets(misfit, variance, times, sessions, noise):
     ----------
     misfit, variance : ndarray, shape (n, 3)
         Residuals of the window means and the independent part of their variance.
+    noise : NoiseModel
 
     """
-    offsets = []
-    for index in sessions:
-        rows = np.stack([np.ones((len(index), 3)), misfit[index]], axis=2)
-        ones, rest = np.moveaxis(_whiten_session(rows, variance[index], times[index], noise.wander_sd, noise.wander_time), 2, 0)
-        offsets.append((ones * rest).sum(axis=0) / ((ones**2).sum(axis=0) + 1 / noise.session_variance))
-    return np.array(offsets)
+    rows = Whitening(variance, times, sessions, noise.bias_processes)(np.stack([np.ones_like(misfit), misfit], axis=2))
+    ones, rest = np.moveaxis(rows, 2, 0)
+    return np.array([(ones[index] * rest[index]).sum(axis=0) / ((ones[index]**2).sum(axis=0) + 1 / noise.session_variance) for index in sessions])

@@ -1,13 +1,17 @@
 """One window of data, reduced to what least squares needs of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Callable, Sequence
 
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import columns, warps_act
-from imu_calibration.estimation.linear_least_squares import triangular
-from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.effects.columns import References, columns
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.triangular import triangular
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 SLOW_TIME = 0.25
 """Length of the pieces whose means tell correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
@@ -54,31 +58,50 @@ class WindowStatistics:
     """Recording that the window comes from."""
 
 
-def reduce_window(window, model, table, session=0, column_function=columns):
+def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, *, session: int = 0,
+                   column_function: Callable = columns) -> list[WindowStatistics]:
     """
-    Reduce one window to its statistics.
+    Reduce windows to their statistics, their columns worked out in one go.
 
     Parameters
     ----------
-    window : Window
+    windows : sequence of Window
         Measured samples with the joints' motion.
     model : SensorModel
         Defines the columns.
     table : Table
         Reference kinematics.
+    session : int
+        Recording that the windows come from.
     column_function : callable
-        Same signature as `sensor_model.columns`.
+        Same signature as `effects.columns.columns`.
 
     """
-    static = window.kind == 'static'
-    temperature = window.temperature_c
-    if static and temperature is not None:
-        temperature = np.array([temperature.mean()])
+    motion, temperature = joined_motion(windows)
+    references = References(model, table, motion, temperature)
+    designs = {sensor: column_function(model, sensor, table, motion, temperature, references=references) for sensor in SENSORS}
+    edges = np.cumsum([0] + [len(window.motion) for window in windows])
+    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session) for window, a, b in zip(windows, edges, edges[1:])]
+
+
+def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, column_function: Callable = columns) -> WindowStatistics:
+    """Reduce one window to its statistics; arguments as in `reduce_windows`."""
+    return reduce_windows([window], model, table, session=session, column_function=column_function)[0]
+
+
+def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
+    """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
+    with_temperature = all(window.temperature_c is not None for window in windows)
+    temperatures = [[w.temperature_c.mean()] if w.kind == 'static' else w.temperature_c for w in windows] if with_temperature else None
+    if len(windows) == 1:
+        return windows[0].motion, None if temperatures is None else np.asarray(temperatures[0])
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
+    return motion, None if temperatures is None else np.concatenate(temperatures)
+
+
+def _reduced(window, designs, session):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    length = piece_length(window)
-    # Both sensors feel the same motion unless a lag or a delay acts: then it is worked out once.
-    shared = {'ref': reference_motion(table, window.motion, temperature)} if column_function is columns and not warps_act(model) else {}
-    designs = {sensor: column_function(model, sensor, table, window.motion, temperature, **shared) for sensor in SENSORS}
+    static, length = window.kind == 'static', piece_length(window)
     sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
     return WindowStatistics(window.kind, float(window.time.mean()), float(window.time[-1] - window.time[0]), len(window.time), sensors, session)
 

@@ -58,7 +58,7 @@ class WindowStore:
         accumulator = Accumulator()
         for entry in self._entries:
             if isinstance(entry, Window):
-                accumulator.add(reduce_window(entry, model, table, session))
+                accumulator.add(reduce_window(entry, model, table, session=session))
             else:
                 accumulator.add(_again(*entry, model, table))
         return accumulator

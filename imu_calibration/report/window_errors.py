@@ -50,7 +50,7 @@ def _on_table(result):
         parts['measured'][sensor], parts['true'][sensor] = found[sensor]['measured'], true
         parts['before'][sensor] = found[sensor]['before']
         parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(calibration.value(sensor, 'matrix')).T
-        parts['floor'][sensor] = np.sqrt(noise.white_variance * noise.inflation / count[:, None] + noise.offset_sd**2 + noise.wander_sd**2)
+        parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
     return WindowErrors(found['time'], kind, **parts)
 
 

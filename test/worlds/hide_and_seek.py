@@ -20,9 +20,10 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).res
 
 import numpy as np  # noqa: E402
 
-from imu_calibration.diagnosis.diagnose import diagnose, investigate  # noqa: E402
-from imu_calibration.diagnosis.explained_share import sensors_of  # noqa: E402
-from imu_calibration.diagnosis.gain import heldout_gain  # noqa: E402
+from imu_calibration.diagnosis.diagnose import diagnose  # noqa: E402
+from imu_calibration.selection.explained_share import sensors_of  # noqa: E402
+from imu_calibration.selection.gain import heldout_gain  # noqa: E402
+from imu_calibration.selection.investigation import investigate  # noqa: E402
 
 from worlds.hide_and_seek_figures import write_figures  # noqa: E402
 from worlds.hide_and_seek_report import report  # noqa: E402

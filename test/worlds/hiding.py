@@ -8,11 +8,11 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
-from imu_calibration.diagnosis.diagnose import investigate
-from imu_calibration.diagnosis.search import FAMILY_WISE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.search import FAMILY_WISE
 
 from worlds import physics
 from worlds.physics_draw import EFFECTS, draw_value, generator

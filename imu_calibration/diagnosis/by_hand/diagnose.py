@@ -9,15 +9,16 @@ from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
 from imu_calibration.diagnosis.by_hand.result import as_solution, rest_of, traces_of
 from imu_calibration.diagnosis.by_hand.rows import BASE, build_rows
-from imu_calibration.diagnosis.explained_share import SIGNIFICANT_REST, pruned
-from imu_calibration.diagnosis.gain import Gain, reduction_interval
-from imu_calibration.diagnosis.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
-from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
-from imu_calibration.diagnosis.search import Search
-from imu_calibration.diagnosis.sentences import candidates_of, sentence
+from imu_calibration.diagnosis.findings import finding
+from imu_calibration.diagnosis.result import Diagnosis
+from imu_calibration.diagnosis.sentences import candidates_of
 from imu_calibration.diagnosis.separating_motion import motions_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import NotObservableError
+from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
+from imu_calibration.selection.gain import Gain, reduction_interval
+from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
+from imu_calibration.selection.search import Search
 
 OUTER = 12
 """Times that the whole search is repeated without some of the poses, to measure the gain on them."""
@@ -47,7 +48,7 @@ class _Inquiry:
     def without(self, poses):
         """Return the same inquiry without some poses."""
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
-        return _Inquiry([b for b in blocks if len(b.rows) > 3], self.space, self.questions, self.search.baseline)
+        return _Inquiry([b for b in blocks if b.known.size > 3], self.space, self.questions, self.search.baseline)
 
     def named(self):
         """Return the findings: chosen, and each explaining most of what was unexplained."""
@@ -60,8 +61,8 @@ class _Inquiry:
         for block, new, old in zip(self.blocks, after, before):
             if block.sensor == question.sensor:
                 removed += np.sum((old**2 - new**2) / block.floor)
-                excess = np.sum(new**2 / block.floor) - len(new)
-                rest += excess if excess > SIGNIFICANT_REST * np.sqrt(2 * len(new)) else 0.0
+                excess = np.sum(new**2 / block.floor) - new.size
+                rest += excess if excess > SIGNIFICANT_REST * np.sqrt(2 * new.size) else 0.0
         return removed / (removed + rest) if removed > 0 else 0.0
 
 
@@ -174,14 +175,14 @@ def _held_out(inquiry, report):
 
 def _predicted(inquiry, held_out, allowed):
     """Return residuals per block of poses that had no part in the fit nor in the choice; only effects called `allowed` are used."""
-    found = [np.full(len(block.rows), np.nan) for block in inquiry.blocks]
+    found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
     for out, named, smaller in held_out:
         chosen = [q for q in named if q.name in allowed]
         used = smaller.search.used(chosen)
         values = smaller.evidence.fit(used)[0]
         for residual, block in zip(found, inquiry.blocks):
             rows = np.isin(block.pose, out)
-            residual[rows] = block.rows[rows, -1] - block.rows[rows][:, list(used)] @ values
+            residual[rows] = block.rows[rows, :, -1] - block.rows[rows][:, :, list(used)] @ values
     return found
 
 
@@ -199,7 +200,7 @@ def _gain(inquiry, held_out, before, after, sensor):
     block = inquiry.blocks[best[1]]
     poses = np.unique(block.pose)
     sums = [(np.array([np.sum(p[best[1]][block.pose == pose]**2) for pose in poses]),
-             np.array([np.sum(block.pose == pose) for pose in poses], float)) for p in pair]
+             np.array([block.known[block.pose == pose].size for pose in poses], float)) for p in pair]
     rms = [float(np.sqrt(squares.sum() / number.sum())) for squares, number in sums]
     return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))
 
@@ -221,20 +222,13 @@ def _extended(baseline, data, named, gravity_sd, settings, tolerances, constants
 
 def _assembled(baseline, hand, inquiry, named, held_out, not_testable):
     before, after = as_solution(baseline), as_solution(hand)
-    findings = tuple(_finding(inquiry, named, place, held_out, after) for place in range(len(named)))
-    sensors = [q.sensor for q in named] or ['accelerometer']
-    gain = _gain(inquiry, held_out, [], named, sensors[0]) if named else None
+
+    def gain_of(place):
+        return _gain(inquiry, held_out, named[:place], named[:place + 1], named[place].sensor)
+
+    findings = tuple(finding(inquiry.search, named, place, after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
+                     for place in range(len(named)))
+    gain = _gain(inquiry, held_out, [], named, named[0].sensor) if named else None
     count = len(baseline.poses.start)
     return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, s) for s in SENSORS}, candidates_of(inquiry.search, named), tuple(not_testable), before, after,
                      gain, traces_of(baseline, hand), count, count if named else 0)
-
-
-def _finding(inquiry, named, place, held_out, solution):
-    question = named[place]
-    rest = [q for q in named if q is not question]
-    score = inquiry.search.score(rest, question)
-    mates = inquiry.search.class_mates(named, question)
-    parameters = parameters_of(solution, question.sensor, question.name)
-    gain = _gain(inquiry, held_out, named[:place], named[:place + 1], question.sensor)
-    return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
-                   inquiry.share(named, question), gain, tuple(mate.name for mate, _ in mates), motions_of(question, mates[0][0]) if mates else '')

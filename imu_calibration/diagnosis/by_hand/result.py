@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Rest, correlate, slow_explanations, where_most
-from imu_calibration.estimation.noise_model import WindowNoise
+from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 
 
@@ -20,7 +20,7 @@ def as_solution(hand):
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
     for sensor, key, scatter in (('accelerometer', 'force', 'pose'), ('gyroscope', 'rate', 'drift')):
         white = np.square(found[f'{key}_noise_sd'])
-        noise[sensor] = WindowNoise(white, np.square(found[f'{key}_noise_colour']), found[f'{scatter}_scatter_sd'])
+        noise[sensor] = NoiseModel(white, np.square(found[f'{key}_noise_colour']), found[f'{scatter}_scatter_sd'])
         rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
         chi2[sensor] = {'mean': None}
     return Solution(model, hand.values[order], hand.covariance[np.ix_(order, order)], held, noise, chi2, information, rms)
@@ -45,12 +45,12 @@ def traces_of(baseline, hand):
 
 def rest_of(hand, inquiry, named, sensor):
     """Return what stays unexplained of one sensor: its rows at rest and its turns against what noise leaves."""
-    used = inquiry.search.used(named)
+    used = list(inquiry.search.used(named))
     residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
     for block, residual in zip(inquiry.blocks, residuals):
         if block.sensor != sensor:
             continue
-        spare = len(residual) - np.linalg.matrix_rank(block.rows[:, list(used)])
+        spare = residual.size - np.linalg.matrix_rank(block.rows[:, :, used].reshape(residual.size, -1))
         if spare < 3:
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
@@ -60,8 +60,7 @@ def rest_of(hand, inquiry, named, sensor):
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
     count = len(hand.poses.start)
     first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
-    layers = residuals[first].reshape(count, -1)
-    noise_sd = np.sqrt(inquiry.blocks[first].floor).reshape(count, -1)
+    layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
     significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
     if not significant:
         return Rest(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)

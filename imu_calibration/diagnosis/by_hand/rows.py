@@ -7,10 +7,10 @@ import numpy as np
 from imu_calibration.by_hand.equations import tangent
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
-from imu_calibration.diagnosis.wander_search import NATURAL_WANDER
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel, prior_sds
 from imu_calibration.reference.reference_motion import skew
+from imu_calibration.selection.bias_process_search import NATURAL
 
 BASE = ('bias', 'matrix')
 
@@ -24,22 +24,19 @@ class Block:
     sensor: str
     """'accelerometer' or 'gyroscope'."""
     rows: np.ndarray
-    """``[columns | residual]`` at the baseline, shape (m, q + 1)."""
+    """``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have independent errors."""
     known: np.ndarray
-    """Variance by the noise of the samples, shape (m,)."""
+    """Variance by the noise of the samples, shape (m, n_axes)."""
     floor: np.ndarray
-    """The same with the wander that every bias has, shape (m,)."""
+    """The same with the way in which every bias moves, shape (m, n_axes)."""
     pose: np.ndarray
     """Pose of each row, that before it for a turn, shape (m,)."""
     time: np.ndarray
     """Seconds since the first sample, shape (m,)."""
-    axis: np.ndarray
-    """Rows of different axes have independent errors, shape (m,)."""
 
-    def select(self, keep):
+    def select(self, keep: np.ndarray) -> 'Block':
         """Return the rows at a mask."""
-        names = ('rows', 'known', 'floor', 'pose', 'time', 'axis')
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        return replace(self, **{name: getattr(self, name)[keep] for name in ('rows', 'known', 'floor', 'pose', 'time')})
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +101,8 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
 
 
 def _natural(noise, key):
-    """Return the variance of the wander that every bias has, shape (3,)."""
-    return NATURAL_WANDER**2 * np.square(noise[key]) * noise['period']
+    """Return the variance by which every bias moves, shape (3,)."""
+    return NATURAL**2 * np.square(noise[key]) * noise['period']
 
 
 def _norm_block(hand, noise, space, at_rest, sensor_of):
@@ -120,7 +117,7 @@ def _norm_block(hand, noise, space, at_rest, sensor_of):
             rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
     known = np.sum((back * poses.force_sem)**2, axis=1)
     floor = known + back**2 @ _natural(noise, 'force_noise_sd')
-    return Block('poses', 'accelerometer', rows, known, floor, np.arange(count), poses.time, np.zeros(count, int))
+    return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
 
 
 def _rest_block(hand, noise, space, at_rest, sensor_of):
@@ -137,15 +134,14 @@ def _rest_block(hand, noise, space, at_rest, sensor_of):
             rows[:, :, space.parts[label]] = columns
     known = poses.rate_sem**2
     floor = known + _natural(noise, 'rate_noise_sd')
-    return Block('poses', 'gyroscope', rows.reshape(3 * count, -1), known.ravel(), floor.ravel(), np.repeat(np.arange(count), 3),
-                 np.repeat(poses.time, 3), np.tile(np.arange(3), count))
+    return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)
 
 
 def _turn_block(hand, turns, space, at_rest, moving):
     """
     Two rows per turn: the direction after it against that carried there by the rates, over the turn's duration.
 
-    The bias in a turn is the mean of the rates at rest before and after it, so that its wander does not enter; with it goes what
+    The bias in a turn is the mean of the rates at rest before and after it, so that its movement does not enter; with it goes what
     further effects add at rest.
     """
     bias_f, matrix_f = hand.accelerometer
@@ -169,8 +165,6 @@ def _turn_block(hand, turns, space, at_rest, moving):
             place += effect.size
         row[:, -1] = -across[j].T @ carried / found.duration
         rows.append(row)
-        known.append(turn.noise_variance / found.duration**2)
-    known = np.repeat(known, 2)
-    pose = np.repeat([turn.first for turn in turns], 2)
-    return Block('turns', 'gyroscope', np.concatenate(rows), known, known, pose, np.repeat([t.time.mean() for t in turns], 2),
-                 np.arange(len(known)))
+        known.append(np.full(2, turn.noise_variance / found.duration**2))
+    return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
+                 np.array([turn.time.mean() for turn in turns]))

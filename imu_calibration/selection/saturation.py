@@ -1,14 +1,19 @@
 """Saturation: a limit that outputs pile up at, and the samples that it spoils."""
 
 from dataclasses import dataclass, replace
+from typing import Sequence
 
 import numpy as np
 from scipy.stats import norm
 
-from imu_calibration.diagnosis.reduced_recording import joined_motion
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import columns
+from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.estimation.window_statistics import joined_motion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 MARGIN = 4.0
 """Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
@@ -46,23 +51,21 @@ class Saturation:
         return float(np.exp(-self.n_expected))
 
 
-def predictions(windows, table, model, values):
+def predictions(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
-    found = []
-    for window in windows:
-        temperature = window.temperature_c
-        if window.kind == 'static' and temperature is not None:
-            temperature = np.array([temperature.mean()])
-        found.append(tuple(columns(model, s, table, window.motion, temperature) @ coefficients(model, s, values) for s in SENSORS))
-    return found
+    motion, temperature = joined_motion(windows)
+    references = References(model, table, motion, temperature)
+    edges = np.cumsum([len(window.motion) for window in windows])[:-1]
+    outputs = [columns(model, s, table, motion, temperature, references) @ coefficients(model, s, values) for s in SENSORS]
+    return list(zip(*(np.split(output, edges) for output in outputs)))
 
 
-def measured(window, sensor):
+def measured(window: Window, sensor: str) -> np.ndarray:
     """Return the measured output of a sensor in a window, shape (n, 3)."""
     return window.force_s if sensor == 'accelerometer' else window.rate_s
 
 
-def noise_at_rest(windows, sensor):
+def noise_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     """Return the standard deviation of single samples in static windows (of second differences without any), shape (3,)."""
     rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
     if rest:
@@ -70,26 +73,24 @@ def noise_at_rest(windows, sensor):
     return np.median([np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6) for w in windows if len(w.time) > 8], axis=0)
 
 
-def simple_fit(windows, table, model):
+def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> np.ndarray:
     """Return the parameters of a model by least squares on thinned samples, all weighted alike."""
     values = np.where(np.isfinite(model.start()), model.start(), 0.0)
     prior, sd = model.prior()
     picked = [_thinned(window) for window in windows]
-    index, total, right = np.arange(len(values)), np.diag(1 / sd**2), (prior - values) / sd**2
+    normal = np.zeros((len(values) + 1,) * 2)
+    motion, temperature = joined_motion(picked)
+    references = References(model, table, motion, temperature)
     for sensor in SENSORS:
-        motion, temperature = joined_motion(picked)
-        design = columns(model, sensor, table, motion, temperature)
+        design = columns(model, sensor, table, motion, temperature, references)
         outputs = [measured(w, sensor) for w in picked]
         output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
         base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
         weight = 1 / noise_at_rest(windows, sensor)**2
         for axis in range(3):
-            rows, residual = design @ slope[:, axis], output[:, axis] - design @ base[:, axis]
-            total = total + weight[axis] * rows.T @ rows
-            right = right + weight[axis] * rows.T @ residual
-    scale = 1 / np.sqrt(np.diag(total))
-    step = scale * np.linalg.solve(total * np.outer(scale, scale) + 1e-13 * np.eye(len(index)), scale * right)
-    return values + step
+            rows = np.column_stack([design @ slope[:, axis], output[:, axis] - design @ base[:, axis]])
+            normal += weight[axis] * rows.T @ rows
+    return values + solve_normal(normal, np.arange(len(values)), sd, prior - values)[0]
 
 
 def _thinned(window, most=50):
@@ -98,7 +99,7 @@ def _thinned(window, most=50):
     return _selected(window, np.arange(0, len(window.time), len(window.time) // most))
 
 
-def may_be_clipped(windows, sensor):
+def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     """Return whether several samples share the largest output exactly, more than share any of the next smaller outputs."""
     size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
     level = size.max(initial=0.0)
@@ -111,7 +112,7 @@ def may_be_clipped(windows, sensor):
     return bool(at > 3 * (repeats[-5:].mean() if len(repeats) else 1.0))
 
 
-def find_saturation(windows, predicted, noise_sd, sensor):
+def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, sensor: str) -> Saturation | None:
     """
     Return the `Saturation` of a sensor, or None.
 
@@ -140,7 +141,7 @@ def find_saturation(windows, predicted, noise_sd, sensor):
     return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms)
 
 
-def without_clipped(windows, predicted, levels, noise_sd):
+def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str, float], noise_sd: dict[str, np.ndarray]) -> list[Window]:
     """
     Return the windows without samples that a limit spoils: those at it, and those predicted within a few standard deviations of it.
 

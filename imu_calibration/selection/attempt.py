@@ -1,16 +1,24 @@
 """The recording reduced around a point of linearisation, the search on it, and the decision whether to linearise anew."""
 
+from dataclasses import replace
 from functools import cached_property
+from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.diagnosis.evidence import Evidence, folds_of, locked_windows, quadratic
-from imu_calibration.diagnosis.noise import first_noise, normal_matrix, saturated_noise, solve_normal
-from imu_calibration.diagnosis.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
-from imu_calibration.diagnosis.questions import extended_model, time_constants
-from imu_calibration.diagnosis.reduced_recording import lift, rebased
-from imu_calibration.diagnosis.search import Search
-from imu_calibration.diagnosis.trusted_band import in_trusted_band
+from imu_calibration.effects.base import Effect
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.scaled_solve import quadratic, solve_normal
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.evidence import WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
+from imu_calibration.selection.normal_matrices import normal_matrix
+from imu_calibration.selection.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
+from imu_calibration.selection.questions import Question, extended_model, time_constants
+from imu_calibration.selection.reduced_recording import ReducedRecording, arms_of, reduce_recording
+from imu_calibration.selection.search import Search
+from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
@@ -19,41 +27,60 @@ BILINEAR = 2e-3
 
 
 class Attempt:
-    """One linearisation: the reduced recording, its noise, the evidence and the search."""
+    """
+    One linearisation: the reduced recording, its noise, the evidence and the search.
 
-    def __init__(self, windows, table, baseline, effects, point=None, progress=None):
+    Parameters
+    ----------
+    windows : sequence of Window
+        Of one recording, without clipped samples.
+    table : Table
+    baseline : SensorModel
+        The model that is asked what it lacks.
+    effects : sequence of Effect
+        That are asked about.
+    point : (SensorModel, array), optional
+        Where the columns are taken; at the baseline's own solution where not given.
+    progress : callable, optional
+        Called with the share that is done.
+
+    """
+
+    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, effects: Sequence[Effect], *,
+                 point: tuple[SensorModel, np.ndarray] | None = None, progress: Callable | None = None):
         self.baseline, self.effects = baseline, effects
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
-        lifted = lift(windows, table, model, values, self.constants, progress)
+        model = replace(model, folded_arms=arms_of(model, values))
+        recording = reduce_recording(windows, table, model, values, self.constants, progress)
         used = baseline_parameters(baseline, model)
         if point is None:
-            lifted = _at_baseline(lifted, baseline, used)
-        self.all_samples = parameter_space(lifted, baseline)
+            recording = _at_baseline(recording, baseline, used)
+        self.all_samples = parameter_space(recording, baseline)
         self.space = in_trusted_band(self.all_samples)
         self.questions = questions(self.space, effects)
-        self.noise = saturated_noise(self.space, smooth_parameters(self.questions))
-        self.locked = locked_windows(lifted.kind)
-        self.evidence = Evidence(self.space, self.noise, folds_of(lifted.kind, self.locked))
+        self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions))
+        self.locked = locked_windows(recording.kind)
+        self.evidence = WindowEvidence(self.space, self.noise, folds_of(recording.kind, self.locked))
         self.search = Search(self.evidence, used, self.questions, encoder_step(windows))
 
     @property
-    def lifted(self):
+    def recording(self) -> ReducedRecording:
         """The reduced recording."""
-        return self.space.lifted
+        return self.space.recording
 
-    def values(self, chosen):
+    def values(self, chosen: Sequence[Question]) -> np.ndarray:
         """Return the parameters of the whole space for a choice, fitted to the chosen windows, baseline in full, shape (q,)."""
         used = self.search.used(chosen)
         values = np.zeros(self.space.size)
         values[list(used)] = self.evidence.fit(used)[0]
-        change = counted_from_values(self.lifted.model, self.baseline)
-        values[:len(change)] += np.where(change, self.lifted.values, 0.0)
+        change = counted_from_values(self.recording.model, self.baseline)
+        values[:len(change)] += np.where(change, self.recording.values, 0.0)
         return values
 
-    def needs_another(self, chosen):
+    def needs_another(self, chosen: Sequence[Question]) -> bool:
         """Return whether the linearisation is too coarse for what was chosen: curvature times evidence."""
-        values, model = self.values(chosen), self.lifted.model
+        values, model = self.values(chosen), self.recording.model
         full = self.evidence.loss(self.search.used(chosen))
         if any('@' in question.label for question in chosen):
             return True
@@ -67,19 +94,19 @@ class Attempt:
     def _locked_normal(self):
         return normal_matrix(self.space, self.noise, self.locked)
 
-    def locked_gain(self, chosen, question):
+    def locked_gain(self, chosen: Sequence[Question], question: Question) -> float:
         """Return by how much an effect of a choice raises the log likelihood of the locked windows, fitted to the others, nats."""
         rest = [q for q in chosen if q is not question]
         losses = [quadratic(self._locked_normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
         return 0.5 * (losses[0] - losses[1])
 
-    def acts_beside(self, chosen):
+    def acts_beside(self, chosen: Sequence[Question]) -> bool:
         """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
-        model = self.lifted.model
+        model = self.recording.model
         return any(e.warp is not None and (e.sensor, e.name) not in kept and np.any(model.warp_point(e)) for e in model.effects)
 
-    def point(self, chosen):
+    def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
         """Return (model, values) at which the columns should be taken for this choice."""
         values = self.values(chosen)
         model = extended_model(self.baseline, self.effects)
@@ -88,7 +115,7 @@ class Attempt:
                 model = model.with_effect(question.sensor, question.name)
         start = model.start()
         for effect in model.effects:
-            known = self.lifted.model.slices.get((effect.sensor, effect.name))
+            known = self.recording.model.slices.get((effect.sensor, effect.name))
             if known is not None:
                 start[model.slices[effect.sensor, effect.name]] = values[known]
         for question in chosen:
@@ -117,12 +144,12 @@ class Attempt:
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
 
 
-def encoder_step(windows):
+def encoder_step(windows: Sequence[Window]) -> float:
     """Return the largest step of the encoders that shows in the readings, rad; 0 where none does."""
     return max((float(np.max(w.joint_step)) for w in windows if w.joint_step is not None), default=0.0)
 
 
-def baseline_parameters(baseline, model):
+def baseline_parameters(baseline: SensorModel, model: SensorModel) -> tuple[int, ...]:
     """Return the indices of the baseline's parameters in an extended model."""
     return tuple(k for e in baseline.effects for k in range(model.slices[e.sensor, e.name].start, model.slices[e.sensor, e.name].stop))
 
@@ -133,13 +160,14 @@ def _start(baseline, effects):
     return model, np.where(np.isfinite(values), values, 0.0)
 
 
-def _at_baseline(lifted, baseline, used):
+def _at_baseline(recording, baseline, used):
     """Move the residual to the baseline's own solution."""
     for _ in range(2 if baseline.has_arms else 1):
-        space = in_trusted_band(parameter_space(lifted, baseline))
-        change = solve_normal(normal_matrix(space, first_noise(space)), space.prior_sd, space.prior_mean, np.array(used))
-        lifted = rebased(lifted, lifted.values + change[:len(lifted.values)])
-    return lifted
+        space = in_trusted_band(parameter_space(recording, baseline))
+        values = recording.values.copy()
+        values[list(used)] += solve_normal(normal_matrix(space, first_noise(space)), used, space.prior_sd, space.prior_mean)[0]
+        recording = recording.rebased(values)
+    return recording
 
 
 def _curvature(question, values, model):
@@ -152,8 +180,3 @@ def _curvature(question, values, model):
     if effect.name.endswith('_bias_drift'):
         return abs(np.log(max(value[3], 1e-3) / model.full_point()[effect.name][3]))
     return BILINEAR
-
-
-def without_saturation(effects):
-    """Return the effects that are asked about by columns."""
-    return [effect for effect in effects if not effect.name.endswith('_saturation')]

@@ -1,11 +1,15 @@
 """Which effects can be asked about in this recording, and which cannot, and why."""
 
 from dataclasses import dataclass, replace
+from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
@@ -17,12 +21,12 @@ N_TIME_CONSTANTS = 12
 class Question:
     """One effect that is asked about; a warm-up is asked for at each time constant of a bank."""
 
-    effect: object
-    """The Effect."""
-    parameters: tuple
-    """Indices in the parameter space of the diagnosis."""
-    price: int
-    """Number of parameters that it costs."""
+    effect: Effect
+    """What is asked about."""
+    parameters: tuple[int, ...]
+    """Indices in the parameter space."""
+    penalty: int
+    """Number of parameters that it is charged for."""
     label: str
     """Effect name, for a warm-up with the number of the time constant."""
 
@@ -37,7 +41,7 @@ class Question:
         return self.effect.sensor
 
 
-def testable_effects(model, table, windows):
+def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]) -> tuple[list[Effect], list[dict]]:
     """
     Return (effects that can be asked about, list of {'effect', 'why', 'needs'} for the others).
 
@@ -57,7 +61,7 @@ def testable_effects(model, table, windows):
     return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span))
 
 
-def sort_effects(model, why_not):
+def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
     """
     Return (effects that can be asked about, list of {'effect', 'why', 'needs'}) of the catalogue's that the model lacks.
 
@@ -101,18 +105,23 @@ def _why_not(effect, have, table, kinds, span):
     return None
 
 
-def time_constants(duration):
+def time_constants(duration: float) -> np.ndarray:
     """Return the time constants at which warm-ups are asked for, s."""
     return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, N_TIME_CONSTANTS)
 
 
-def extended_model(model, effects):
+def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
     """Return the model with all these effects, but for those that are asked otherwise (warm-ups, saturation)."""
     kept = [e for e in effects if e.warp is not None or not special(e)]
     added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SENSORS + ('reference',)}
     return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
 
 
-def special(effect):
+def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
+    """Return the effects that are asked about by columns."""
+    return [effect for effect in effects if not effect.name.endswith('_saturation')]
+
+
+def special(effect: Effect) -> bool:
     """Return whether an effect has no columns of its own here: saturation is censoring, a warm-up has a bank of time constants."""
     return effect.name.endswith('_saturation') or effect.name.endswith('_bias_drift')

@@ -1,10 +1,15 @@
 """How much better the extended model predicts windows that took no part in choosing it."""
 
 from dataclasses import dataclass
+from typing import Sequence
 
 import numpy as np
 
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.questions import Question
+
 RESAMPLES = 1000
+"""Of whole windows, for an interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +24,7 @@ class Gain:
     """Rms residual of the model without the finding, m/s^2 or rad/s."""
     heldout_rms_after: float
     """The same with it."""
-    ci95: tuple
+    ci95: tuple[float, float]
     """95 % interval of the reduction, by resampling whole windows."""
     windows: int
     """Windows that were held out."""
@@ -30,7 +35,7 @@ class Gain:
         return 1.0 - self.heldout_rms_after / self.heldout_rms_before if self.heldout_rms_before > 0 else 0.0
 
 
-def heldout_gain(attempt, before, after, sensors):
+def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], sensors: Sequence[str]) -> Gain:
     """
     Return the Gain of the choice `after` over the choice `before`.
 
@@ -60,25 +65,25 @@ def heldout_gain(attempt, before, after, sensors):
 
 def _squares(attempt, choice, sensor):
     """Return sums of squares of samples and of window means, and the numbers of each, per window, four arrays (k,)."""
-    space, lifted = attempt.all_samples, attempt.lifted
+    space, recording = attempt.all_samples, attempt.recording
     used = attempt.search.used(choice)
-    values = np.zeros(space.size + 1)
-    values[list(used)], values[-1] = -attempt.evidence.fit(used)[0], 1.0
-    means, within = np.zeros(len(lifted.kind)), np.zeros(len(lifted.kind))
+    values = space.reduced(used, attempt.evidence.fit(used)[0])
+    means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
     for axis in range(3):
-        weights = values[np.r_[space.index[sensor][axis], space.size]]
+        weights = values[space.places(sensor, axis)]
         means += (space.mean[sensor][axis] @ weights)**2
-        within += np.maximum(np.einsum('kij,i,j->k', space.within[sensor][axis], weights, weights, optimize=True), 0.0)
-    rest = lifted.kind == 'static'
-    within[rest] = (lifted.noise[sensor][0][rest].sum(axis=1) * (lifted.count[rest] - 1))
-    return within + lifted.count * means, means, 3 * lifted.count, np.full(len(means), 3.0)
+        within += space.squares_within(sensor, axis, weights)
+    rest = ~recording.moving
+    at_rest = np.array([window.sensors[sensor].noise_variance.sum() for window in recording.windows])
+    within[rest] = at_rest[rest] * (recording.count[rest] - 1)
+    return within + recording.count * means, means, 3 * recording.count, np.full(len(means), 3.0)
 
 
 def _rms(squares, number):
     return float(np.sqrt(squares.sum() / max(number.sum(), 1)))
 
 
-def reduction_interval(pair):
+def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
     """Return the 95 % interval of the reduction over resamples of whole windows, from (sums of squares, numbers) per window before and after."""
     n_windows = len(pair[0][0])
     if n_windows < 3:

@@ -1,15 +1,19 @@
 """Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
 
 from dataclasses import dataclass
+from typing import Sequence
 
 import numpy as np
+
+from imu_calibration.selection.evidence import Evidence
+from imu_calibration.selection.questions import Question
 
 FAMILY_WISE = 0.01
 """Chance of a finding in a recording whose model is right."""
 LEAST_GAIN = 4.0
 """Least gain of held-out log likelihood, nats."""
-PRICE = 1.0
-"""Price of a parameter beside what held-out prediction charges, nats."""
+PENALTY = 1.0
+"""Penalty for a parameter beside what held-out prediction charges, nats."""
 TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
 ABSURD = 50.0
@@ -28,8 +32,8 @@ CONTAINS = {'lever_arm': 'accel_size_effect'}
 class Score:
     """Evidence for one effect beside the model so far."""
 
-    question: object
-    """The Question."""
+    question: Question
+    """What was asked about."""
     gain: float
     """Gain of held-out log likelihood, nats."""
     p_value: float
@@ -39,8 +43,8 @@ class Score:
 
     @property
     def net(self):
-        """Gain less the price of the parameters."""
-        return self.gain - PRICE * self.question.price
+        """Gain less the penalty for the parameters."""
+        return self.gain - PENALTY * self.question.penalty
 
     @property
     def significant(self):
@@ -51,37 +55,37 @@ class Score:
 class Search:
     """Forward selection with reconsideration over a fixed set of questions."""
 
-    def __init__(self, evidence, baseline, questions, encoder_step=0.0):
+    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], encoder_step: float = 0.0):
         self.evidence, self.baseline, self.questions, self.encoder_step = evidence, tuple(baseline), questions, encoder_step
         self.n_effects = max(len({q.name for q in questions}), 1)
         self.history = []
 
-    def used(self, chosen):
+    def used(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the parameters of the baseline and of the chosen effects."""
         return self.baseline + tuple(k for q in chosen for k in q.parameters)
 
-    def others(self, chosen):
+    def others(self, chosen: Sequence[Question]) -> list[Question]:
         """Return the questions about effects that are not chosen."""
         names = {q.name for q in chosen}
         return [q for q in self.questions if q.name not in names]
 
-    def cost(self, chosen):
-        """Return the held-out cost of a choice, nats, price included."""
-        return 0.5 * self.evidence.heldout(self.used(chosen)) + PRICE * sum(q.price for q in chosen)
+    def cost(self, chosen: Sequence[Question]) -> float:
+        """Return the held-out cost of a choice, nats, penalties included."""
+        return 0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
 
-    def score(self, chosen, question):
+    def score(self, chosen: list[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
         smaller, larger = self.used(chosen), self.used(chosen + [question])
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
         return Score(question, gain, p_value, self.allowed(chosen + [question], question))
 
-    def allowed(self, chosen, question):
+    def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
         """Return whether the effect's estimate is possible: a lag is not negative, no size is absurd, no angle within half an encoder step."""
         used = self.used(chosen)
-        values, inverse = self.evidence.fit(used)
+        values, covariance = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
-        value, sd = values[places], np.sqrt(np.diag(inverse)[places])
+        value, sd = values[places], np.sqrt(np.diag(covariance)[places])
         if question.effect.name.endswith('_bandwidth') and value[0] < 0:
             return False
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
@@ -90,7 +94,7 @@ class Search:
         largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
         return bool(np.all(np.abs(value) - 3 * sd < KNOWN.get(question.name, ABSURD) * largest))
 
-    def run(self):
+    def run(self) -> list[Question]:
         """Return the chosen questions in the order in which they were found."""
         chosen = []
         for _ in range(2 * MOST_FINDINGS):
@@ -106,7 +110,7 @@ class Search:
                 break
         return chosen
 
-    def reconsidered(self, chosen):
+    def reconsidered(self, chosen: list[Question]) -> list[Question]:
         """Return the choice after dropping what is no longer needed and replacing what a better explanation replaces."""
         for _ in range(6):
             smaller = self._dropped(chosen)
@@ -122,7 +126,7 @@ class Search:
     def _dropped(self, chosen):
         if len(chosen) < 2:
             return None
-        for question in sorted(chosen, key=lambda q: -q.price):
+        for question in sorted(chosen, key=lambda q: -q.penalty):
             rest = [q for q in chosen if q is not question]
             if not self.score(rest, question).significant:
                 return rest
@@ -141,7 +145,7 @@ class Search:
                     best, cost = trial, value
         return best
 
-    def class_mates(self, chosen, question):
+    def class_mates(self, chosen: list[Question], question: Question) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most two."""
         place, cost = chosen.index(question), self.cost(chosen)
         found = {}

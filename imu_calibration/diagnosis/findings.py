@@ -1,0 +1,38 @@
+"""One chosen effect as a finding, the same on a table and by hand."""
+
+from typing import Callable
+
+from imu_calibration.diagnosis.result import Finding, parameters_of
+from imu_calibration.diagnosis.sentences import sentence
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import Search
+
+
+def finding(search: Search, named: list[Question], place: int, solution: Solution, *, share: Callable, gain_of: Callable,
+            motion_of: Callable) -> Finding:
+    """
+    Return the Finding of the effect at `place` among those named.
+
+    Parameters
+    ----------
+    search : Search
+        On which they were chosen.
+    named : list of Question
+        In the order found.
+    solution : Solution
+        Of the extended model.
+    share : callable
+        ``share(named, question)``: share of the unexplained that the effect removes.
+    gain_of : callable
+        ``gain_of(place)``: the Gain of this effect on top of those before it.
+    motion_of : callable
+        ``motion_of(question, mate)``: the motion that would tell two effects apart.
+
+    """
+    question = named[place]
+    score = search.score([q for q in named if q is not question], question)
+    mates = [mate for mate, _ in search.class_mates(named, question)]
+    parameters, gain = parameters_of(solution, question.sensor, question.name), gain_of(place)
+    return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
+                   share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '')

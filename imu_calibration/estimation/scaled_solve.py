@@ -1,0 +1,82 @@
+"""Solving with columns scaled to unit norm, from rows or from a normal matrix, and the covariance where parameters are held."""
+
+import numpy as np
+import scipy.linalg
+
+JITTER = 1e-12
+"""Added to the diagonal of a scaled normal matrix: above its rounding, below anything that data say."""
+
+
+def scaled_lstsq(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the least-squares solution of ``matrix @ x = right``, its columns scaled to unit norm first."""
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
+    diagonal = np.abs(np.diag(r))
+    rank = int((diagonal > 1e-15 * diagonal[0]).sum()) if len(diagonal) else 0
+    solved = np.zeros((matrix.shape[1],) + right.shape[1:])
+    solved[order[:rank]] = scipy.linalg.solve_triangular(r[:rank, :rank], (q.T @ right)[:rank])
+    return (solved.T / scale).T
+
+
+def inverse_gram(matrix: np.ndarray) -> np.ndarray:
+    """Return ``(matrix' matrix)^-1`` through the triangular factor of the scaled columns."""
+    scale = np.linalg.norm(matrix, axis=0)
+    r = scipy.linalg.qr(matrix / scale, mode='r')[0][:matrix.shape[1]]
+    inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
+    return (inverse @ inverse.T) / np.outer(scale, scale)
+
+
+def inverse_normal(information: np.ndarray) -> np.ndarray:
+    """Return the inverse of an information matrix, scaled to a unit diagonal first."""
+    scale = 1 / np.sqrt(np.diag(information))
+    scaled = information * np.outer(scale, scale)
+    scaled.flat[::len(scaled) + 1] += JITTER
+    return np.linalg.inv(scaled) * np.outer(scale, scale)
+
+
+def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, prior_mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (values, covariance) of the parameters `used` that minimise the quadratic form of a normal matrix plus a prior.
+
+    Parameters
+    ----------
+    normal : ndarray, shape (q + 1, q + 1)
+        Products of ``[design | output]``, weighted.
+    used : array of int
+        Parameters to solve for; the others are zero.
+    prior_sd, prior_mean : ndarray, shape (q,)
+
+    """
+    used = np.asarray(used)
+    information = normal[np.ix_(used, used)] + np.diag(1 / prior_sd[used]**2)
+    covariance = inverse_normal(information)
+    return covariance @ (normal[used, -1] + prior_mean[used] / prior_sd[used]**2), covariance
+
+
+def quadratic(normal: np.ndarray, used: np.ndarray, values: np.ndarray) -> float:
+    """Return the sum of squares that `values` of the parameters `used` leave under a normal matrix."""
+    used = np.asarray(used)
+    return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)
+
+
+def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
+    """
+    Return the covariance of all parameters where some are held at their prior, which enters everybody else's.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (m, n)
+        Weighted design, with the prior's rows where the prior of the free parameters counts.
+    free, held : ndarray of bool, shape (n,)
+        Solved for, and held at the prior; parameters that are neither are certain.
+    prior_sd : ndarray, shape (n,)
+
+    """
+    influence = np.zeros((len(prior_sd), int(held.sum())))
+    influence[held] = np.eye(int(held.sum()))
+    if held.any() and free.any():
+        influence[free] = -scaled_lstsq(rows[:, free], rows[:, held])
+    total = influence @ np.diag(prior_sd[held]**2) @ influence.T
+    total[np.ix_(free, free)] += inverse_gram(rows[:, free])
+    return total

@@ -1,0 +1,131 @@
+"""The rows of one solve: accumulated windows with the columns of a model, weighed with a noise, and the prior."""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
+from imu_calibration.estimation.prior import Prior
+from imu_calibration.estimation.triangular import triangular
+from imu_calibration.estimation.whitening import Whitening
+
+
+class WeightedSystem:
+    """
+    Accumulated windows as rows ``[columns | output]``, and what follows from them for values of the parameters and a noise.
+
+    Parameters
+    ----------
+    accumulator : Accumulator
+    model : SensorModel
+    prior : Prior
+
+    """
+
+    def __init__(self, accumulator: Accumulator, model: SensorModel, prior: Prior):
+        self.model, self.prior, self.accumulator = model, prior, accumulator
+        self.dof_within = {k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples}
+        self.means = {s: np.array([row.sensors[s].mean for row in accumulator.rows]) for s in SENSORS}
+        """Sensor -> mean rows, shape (n_windows, p + 3)."""
+        self.within = {s: {k: f for (sensor, k), f in sorted(accumulator.within.items()) if sensor == s and len(f)} for s in SENSORS}
+        """Sensor -> kind -> factor of the centred rows."""
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Middle of each window, s."""
+        return np.array([row.time for row in self.accumulator.rows])
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Samples of each window."""
+        return np.array([row.count for row in self.accumulator.rows], float)
+
+    @cached_property
+    def kinds(self) -> list[str]:
+        """Kind of each window."""
+        return [row.kind for row in self.accumulator.rows]
+
+    @cached_property
+    def sessions(self) -> list[np.ndarray]:
+        """Indices of each recording's windows in order of time."""
+        return sessions_of(self.accumulator.rows)
+
+    def misfit(self, sensor: str, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
+        return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
+
+    def mean_variance(self, noise: NoiseModel) -> np.ndarray:
+        """Return the variance of the window means by the noise within, shape (n_windows, 3)."""
+        return noise.mean_variance(self.kinds, self.counts)
+
+    def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
+        variance = self.mean_variance(noise) + noise.offset_sd**2
+        return Whitening(variance, self.times, self.sessions, noise.bias_processes, noise.session_variance)(rows)
+
+    def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
+        """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
+        p = self.means[sensor].shape[1] - 3
+        picked = [list(range(p)) + [p + axis] for axis in range(3)]
+        white = self.whitened(np.stack([self.means[sensor][:, at] for at in picked], axis=1), noise)
+        weighed = list(self.weighed_rows(sensor, noise))
+        return [triangular(np.concatenate([white[:, axis], *(rows[:, picked[axis]] * weight[axis] for rows, weight in weighed)]))
+                for axis in range(3)]
+
+    def weighed_rows(self, sensor: str, noise: NoiseModel):
+        """Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more."""
+        for kind, factor in self.within[sensor].items():
+            yield factor, 1 / np.sqrt(noise.row_variance(kind))
+            extra = noise.slow_weight(kind)
+            if extra.any():
+                yield self.accumulator.slow[sensor, kind], extra
+
+    def residuals(self, values: np.ndarray, factors: dict) -> np.ndarray:
+        """Return the residual rows of both sensors and all axes, those of the prior last."""
+        parts = []
+        for sensor in SENSORS:
+            c = coefficients(self.model, sensor, values)
+            parts += [factor[:, :-1] @ c[:, axis] - factor[:, -1] for axis, factor in enumerate(factors[sensor])]
+        return np.concatenate(parts + [self.prior.root @ (values - self.prior.mean)])
+
+    def jacobian(self, values: np.ndarray, factors: dict) -> np.ndarray:
+        """Return the derivative of the residual rows without the prior's."""
+        parts = []
+        for sensor in SENSORS:
+            dc = coefficient_jacobian(self.model, sensor, values)
+            parts += [factor[:, :-1] @ dc[:, axis] for axis, factor in enumerate(factors[sensor])]
+        return np.concatenate(parts)
+
+    def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return mean rows in coordinates of the parameters of one sensor, and what else is known of them.
+
+        Directions that the gauge fixes are no coordinates: beside their weight in a normal matrix nothing else would be seen.
+
+        Returns
+        -------
+        tuple
+            ``[design | residual]``, shape (n_windows, 3, q + 1), and the normal matrix of centred rows and prior, shape (q + 1, q + 1).
+
+        """
+        dc = coefficient_jacobian(self.model, sensor, values)
+        own = np.flatnonzero(np.any(dc != 0, axis=(0, 1)))
+        gauge = self.prior.gauge[:, own]
+        basis = scipy.linalg.null_space(gauge) if gauge.any() else np.eye(len(own))
+        dc, root = dc[:, :, own] @ basis, self.prior.root[:-len(gauge) or None, own]
+        means = self.means[sensor]
+        design = np.einsum('kp,paq->kaq', means[:, :-3], dc)
+        rows = np.concatenate([design, self.misfit(sensor, means, values)[:, :, None]], axis=2)
+        used = np.flatnonzero(np.any(root != 0, axis=1))
+        offset = self.prior.root[used] @ (self.prior.mean - values)
+        parts = [np.concatenate([root[used] @ basis, offset[:, None]], axis=1)]
+        for factor, weight in self.weighed_rows(sensor, noise):
+            rest = self.misfit(sensor, factor, values)
+            parts += [np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis:axis + 1]], axis=1) * weight[axis] for axis in range(3)]
+        stacked = np.concatenate(parts)
+        return rows, stacked.T @ stacked

@@ -1,0 +1,71 @@
+"""The likeliest offsets and bias process of a sensor beside some of the effects that are asked about."""
+
+from typing import Callable, Sequence
+
+from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.noise_search import NoiseLikelihood
+
+TIMES = (100.0, 300.0)
+"""Correlation times that are tried, s."""
+NATURAL = 0.5
+"""Every bias is taken to move by at least this many times the white noise of one second, with the first of these correlation times."""
+RATIOS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+"""Standard deviations that are tried, in units of the typical noise of a window mean."""
+
+
+class BiasProcessSearch:
+    """
+    The best shape of the noise ``(offset sd, sd of the bias process, its correlation time)`` beside a choice of parameters.
+
+    Parameters
+    ----------
+    likelihood : NoiseLikelihood
+    least : float
+        Least standard deviation of the bias process.
+
+    """
+
+    def __init__(self, likelihood: NoiseLikelihood, least: float = 0.0):
+        self.likelihood, self.least = likelihood, least / likelihood.typical
+
+    def best(self, used: Sequence[int], restricted: bool = True) -> tuple[tuple, float]:
+        """Return (shape, loss) of the best noise beside the parameters `used`, standard deviations in units of the typical noise."""
+        def loss(shape):
+            return self.likelihood.loss(shape, used, restricted)
+
+        offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
+        shapes = [(offset, self.least, TIMES[0])]
+        grid = (self.least,) + tuple(ratio for ratio in RATIOS if ratio > 1.2 * self.least)
+        if self.likelihood.many:
+            for time in TIMES:
+                bias = _descend(lambda x: loss((0.0, x, time)), grid)
+                shapes += [(_near(share * offset), bias, time) for share in (0.0, 0.25, 0.5, 1.0)]
+        shape = min(shapes, key=loss)
+        return shape, loss(shape)
+
+    def polished(self, shape: tuple, used: Sequence[int]) -> dict:
+        """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
+        offset, bias, time = shape
+        offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
+        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used), bias), self.least)
+        unit = self.likelihood.typical
+        return {'offset_sd': offset * unit, 'bias_processes': (BiasProcess(bias * unit, time),)}
+
+
+def _near(ratio):
+    """Return the tried ratio that is nearest, so that shapes are met again."""
+    return min(RATIOS, key=lambda known: abs(known - ratio))
+
+
+def _descend(loss: Callable, grid):
+    """Return the grid value of least loss, going up until the loss has risen twice."""
+    losses = []
+    for value in grid:
+        losses.append(loss(value))
+        if len(losses) > 4 and losses[-1] > losses[-2] > losses[-3]:
+            break
+    return grid[losses.index(min(losses))]
+
+
+def _polish(loss: Callable, value):
+    return value if value == 0.0 else min([value * factor for factor in (0.7, 0.85, 1.0, 1.2, 1.4)], key=loss)

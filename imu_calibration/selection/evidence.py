@@ -1,0 +1,126 @@
+"""How well a choice of parameters predicts windows that it was not fitted to: small problems on normal matrices."""
+
+from abc import ABC, abstractmethod
+from typing import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.scaled_solve import quadratic, solve_normal
+from imu_calibration.selection.normal_matrices import mean_matrix, white_means, within_matrix
+from imu_calibration.selection.parameter_space import ParameterSpace
+
+FOLDS = 6
+"""Parts that are held out in turn."""
+LOCKED_EVERY = 4
+"""Every so many windows of each kind take no part in choosing."""
+
+
+def locked_windows(kind: np.ndarray) -> np.ndarray:
+    """Return a mask of the windows that take no part in choosing: every fourth of each kind, spread through the session."""
+    return _turn_of(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
+
+
+def folds_of(kind: np.ndarray, locked: np.ndarray) -> np.ndarray:
+    """Return the fold of each window, -1 where locked; windows of each kind are dealt out in turn."""
+    fold = np.full(len(kind), -1)
+    fold[~locked] = _turn_of(kind[~locked], FOLDS)
+    return fold
+
+
+def _turn_of(kind, modulus):
+    turn = np.zeros(len(kind), int)
+    for offset, name in enumerate(np.unique(kind)):
+        turn[kind == name] = (np.arange((kind == name).sum()) + offset) % modulus
+    return turn
+
+
+class Evidence(ABC):
+    """
+    What a search asks about choices of parameters, each a sequence of indices.
+
+    Losses are minus twice log likelihoods, up to a constant.
+
+    Parameters
+    ----------
+    prior_sd, prior_mean : array, shape (q,)
+        What is known of the parameters before.
+
+    """
+
+    def __init__(self, prior_sd: np.ndarray, prior_mean: np.ndarray):
+        self._prior, self._fits = (prior_sd, prior_mean), {}
+
+    @abstractmethod
+    def normal(self, number: int | None = None) -> np.ndarray:
+        """Return the normal matrix of everything that may be chosen from, or of all but fold `number`, shape (q + 1, q + 1)."""
+
+    @abstractmethod
+    def loss(self, used: Sequence[int]) -> float:
+        """Return the loss of the best fit."""
+
+    @abstractmethod
+    def heldout(self, used: Sequence[int]) -> float:
+        """Return the loss on held-out data, all folds."""
+
+    @abstractmethod
+    def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
+        """Return the p-value of the choice `larger` against `smaller`."""
+
+    def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""
+        key = (tuple(used), number)
+        if key not in self._fits:
+            self._fits[key] = solve_normal(self.normal(number), np.asarray(used), *self._prior)
+        return self._fits[key]
+
+
+class WindowEvidence(Evidence):
+    """
+    Evidence of the windows of a reduced recording, whose noise is known.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+    noise : dict
+        Sensor -> NoiseModel.
+    fold : array, shape (k,)
+        Fold of each window, -1 where it is locked.
+
+    """
+
+    def __init__(self, space: ParameterSpace, noise: dict[str, NoiseModel], fold: np.ndarray):
+        super().__init__(space.prior_sd, space.prior_mean)
+        self.space, self.noise, self.fold = space, noise, fold
+        white = {sensor: white_means(space, noise, sensor) for sensor in SENSORS}
+        numbers = range(fold.max() + 1)
+        self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
+        self._within = {s: [within_matrix(space, noise, fold == number, (s,)) for number in numbers] for s in SENSORS}
+        self._parts = [sum(part[s][number] for part in (self._means, self._within) for s in SENSORS) for number in numbers]
+        self.total = sum(self._parts)
+
+    def normal(self, number: int | None = None) -> np.ndarray:
+        """Return the normal matrix of the chosen windows, or of all but fold `number`."""
+        return self.total if number is None else self.total - self._parts[number]
+
+    def loss(self, used: Sequence[int]) -> float:
+        """Return the loss of the best fit on all chosen windows."""
+        return quadratic(self.total, used, self.fit(used)[0])
+
+    def heldout(self, used: Sequence[int]) -> float:
+        """Return the loss of each fold under the fit to the other folds, summed."""
+        return self._heldout(self._parts, used)
+
+    def heldout_parts(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
+        """Return the same loss by sensor: (of the windows' means, within the windows)."""
+        return {s: (self._heldout(self._means[s], used), self._heldout(self._within[s], used)) for s in SENSORS}
+
+    def _heldout(self, parts, used):
+        return sum(quadratic(part, used, self.fit(used, number)[0]) for number, part in enumerate(parts))
+
+    def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
+        """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
+        fall = self.loss(smaller) - self.loss(larger)
+        return float(chi2.sf(max(fall, 0.0), len(larger) - len(smaller)))

@@ -1,0 +1,147 @@
+"""The search from windows to named effects: clipped samples out, linearise, choose, prove, linearise anew."""
+
+from dataclasses import dataclass, replace
+from typing import Callable, Sequence
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import NotObservableError
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
+from imu_calibration.selection.gain import heldout_gain
+from imu_calibration.selection.questions import Question, testable_effects, without_saturation
+from imu_calibration.selection.saturation import (
+    Saturation,
+    find_saturation,
+    may_be_clipped,
+    measured,
+    noise_at_rest,
+    predictions,
+    simple_fit,
+    without_clipped,
+)
+
+LINEARISATIONS = 3
+"""Times that the columns are taken anew, at most."""
+LEAST_WINDOWS = 8
+"""Fewer windows leave none to hold out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Investigation:
+    """What a search found, before it is put into words."""
+
+    used: list[Window]
+    """Windows that were fitted to, without clipped samples."""
+    attempt: Attempt
+    """The last linearisation with its evidence."""
+    explained: Explained
+    """What noise leaves and what the choices leave."""
+    named: list[Question]
+    """Questions that became findings, in the order found."""
+    limits: list[Saturation]
+    """Saturations."""
+    not_testable: list[dict]
+    """Effects that could not be asked about."""
+
+
+def investigate(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None) -> Investigation:
+    """
+    Ask every effect that a model lacks on held-out windows.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        One recording in order; windows of kind 'unused' take no part.
+    table : Table
+        The reference.
+    model : SensorModel
+        The model that is asked what it lacks.
+    progress : callable, optional
+        Called with the share that is done, in [0, 1].
+
+    Raises
+    ------
+    NotObservableError
+        When there are too few windows to hold any out.
+
+    """
+    used = [window for window in windows if window.kind != 'unused']
+    if len(used) < LEAST_WINDOWS:
+        raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
+                                 f'{len(used)} were found; rest in more poses, or spin and swing the table')
+    report = progress or (lambda share: None)
+    model = with_joints_of(model, table)
+    used, limits = _without_clipping(used, table, model)
+    effects, not_testable = testable_effects(model, table, used)
+    asked = without_saturation(effects)
+    attempt = Attempt(used, table, model, asked, progress=lambda share: report(0.5 * share))
+    chosen = attempt.search.run()
+    for _ in range(LINEARISATIONS - 1):
+        if not attempt.needs_another(chosen):
+            break
+        attempt = Attempt(used, table, model, asked, point=attempt.point(chosen), progress=lambda share: report(0.5 + 0.2 * share))
+        chosen = attempt.search.run()
+    # A warm-up of the bank that appears this late has no columns of its own for the final solution.
+    chosen = [question for question in chosen if '@' not in question.label]
+    report(0.75)
+    explained = Explained(attempt.evidence, attempt.search)
+    named = _that_help(attempt, pruned(chosen, explained.share))
+    for _ in range(LINEARISATIONS - 1):
+        if not attempt.acts_beside(named):
+            break
+        attempt = Attempt(used, table, model, asked, point=attempt.point(named))
+        explained = Explained(attempt.evidence, attempt.search)
+        again = [next(q for q in attempt.questions if q.label == question.label) for question in named]
+        named = _that_help(attempt, pruned(again, explained.share))
+    return Investigation(used, attempt, explained, named, limits, not_testable)
+
+
+def _that_help(attempt, named):
+    """
+    Return the findings that are possible and predict the locked windows better, one at a time the least helpful taken out.
+
+    Without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes evidence of anything that
+    goes with it: there the plain residual of the locked windows must fall.
+    """
+    kept = [question for question in named if attempt.search.allowed(named, question)]
+    while kept:
+        helps = [attempt.locked_gain(kept, question) for question in kept]
+        if min(helps) >= 0.0:
+            break
+        del kept[int(np.argmin(helps))]
+    if not attempt.recording.moving.all():
+        return kept
+    while kept:
+        least = [heldout_gain(attempt, [q for q in kept if q is not each], kept, sensors_of(each.effect)).ci95[0] for each in kept]
+        if not np.min(least) <= 0.0:
+            break
+        del kept[int(np.argmin(least))]
+    return kept
+
+
+def with_joints_of(model: SensorModel, table: Table) -> SensorModel:
+    """Return the model with the joints of the table."""
+    return model if model.joint_names == table.joint_names else replace(model, joint_names=table.joint_names)
+
+
+def _without_clipping(windows, table, model):
+    """Return (windows without samples that a limit spoils, the limits found)."""
+    suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
+    if not suspects:
+        return windows, []
+    limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
+    noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
+    kept = windows
+    for _ in range(2):
+        predicted = predictions(windows, table, model, simple_fit(kept, table, model))
+        kept = without_clipped(windows, predicted, limits, noise_sd)
+    predicted = predictions(windows, table, model, simple_fit(kept, table, model))
+    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
+    if not found:
+        return windows, []
+    return without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found

@@ -1,0 +1,118 @@
+"""Noise of the recording as the richest model sees it, so that no hidden effect passes for noise and no noise for an effect."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, white_noise
+from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasProcessSearch
+from imu_calibration.selection.normal_matrices import normal_matrix, within_matrix
+from imu_calibration.selection.parameter_space import ParameterSpace
+
+SMOOTH_PENALTY = 7.0
+"""Fall of minus twice the log likelihood per parameter that an effect smooth in time must win over a bias process."""
+LEAST_FACTOR = 0.9
+"""Moving windows scatter no less than this share of the noise at rest."""
+
+
+def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int, ...]]]) -> dict[str, NoiseModel]:
+    """
+    Return sensor -> NoiseModel, estimated beside a model with every effect that is asked about.
+
+    Windows' offsets and the bias process come from restricted maximum likelihood on the means of the windows; the variance within moving
+    windows from the residual, and its serial correlation from the misfit of each window along its columns.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+    smooth : dict
+        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, stays
+        in the model beside which the bias process is estimated.
+
+    """
+    noise, every = first_noise(space), np.arange(space.size)
+    for look_along in (False, True):
+        values = solve_normal(normal_matrix(space, noise), every, space.prior_sd, space.prior_mean)[0]
+        noise = {sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along) for sensor in SENSORS}
+    return {sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
+
+
+def natural_process(noise: NoiseModel, period: float) -> BiasProcess:
+    """Return how a bias moves at least, by the white noise of the sensor and the time between samples, s."""
+    return BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0])
+
+
+def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
+    """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
+    found = {}
+    for sensor in SENSORS:
+        white = white_noise(space.recording.windows, sensor)
+        found[sensor] = NoiseModel(*(white or (_white_without_rest(space, sensor), np.ones(3))))
+    return found
+
+
+def _white_without_rest(space, sensor):
+    moving = space.recording.moving
+    dof = max((space.recording.count[moving] - 1).sum(), 1)
+    return np.array([max(least_misfit(space.within_sum(sensor, axis, moving))[0] / dof, 1e-30) for axis in range(3)])
+
+
+def _with_moving_factors(space, sensor, noise, values, look_along):
+    """Return the noise with what moving windows scatter: the residual's variance, and more where it lies along the columns."""
+    found = {}
+    for kind in np.unique(space.recording.kind[space.recording.moving]):
+        rows = space.recording.kind == kind
+        dof = (space.recording.count[rows] - 1).sum()
+        variances, along = np.zeros(3), np.zeros(3)
+        for axis in range(3):
+            reduced = np.append(-values[space.index[sensor][axis]], 1.0)
+            if look_along:
+                products = space.within_each(sensor, axis, rows)
+                products[:, :, -1] = products @ reduced
+                variances[axis] = (reduced @ products[:, :, -1].T).sum() / dof
+                squares, rank = misfit_along(products)
+                along[axis] = squares / max(rank, 1)
+            else:
+                variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof
+        share = float(np.clip(np.mean(along / variances), 1.0, None)) if look_along else 1.0
+        every = np.maximum(variances / noise.white_variance, LEAST_FACTOR) * share / noise.inflation
+        found[str(kind)] = MovingFactors(every, every, np.maximum(every, 1.0), share)
+    return replace(noise, moving=found)
+
+
+def _with_bias_process(space, sensor, noise, smooth):
+    """Return the noise of a sensor with window offsets and bias process, estimated beside all effects but the superfluous smooth ones."""
+    own, recording = np.unique(np.concatenate(space.index[sensor])), space.recording
+    place = {parameter: k for k, parameter in enumerate(own)}
+    rows = np.zeros((len(recording.windows), 3, len(own) + 1))
+    for axis in range(3):
+        rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
+    white = noise[sensor].mean_variance(recording.kind, recording.count)
+    likelihood = NoiseLikelihood(rows, white, recording.time, recording.sessions, _known_otherwise(space, sensor, noise, own))
+    search = BiasProcessSearch(likelihood, natural_process(noise[sensor], recording.period).sd)
+    options = [[place[k] for k in parameters] for parameters in smooth]
+    structural = [k for k in range(len(own)) if not any(k in option for option in options)]
+    used = structural + _needed_smooth(search, structural, options)
+    return replace(noise[sensor], **search.polished(search.best(used)[0], used))
+
+
+def _needed_smooth(search, structural, options):
+    """Return the parameters of the smooth effect that beats the bias process in likelihood, each with the noise estimated beside it."""
+    losses = [search.best(structural, restricted=False)[1]]
+    losses += [search.best(structural + option, restricted=False)[1] + SMOOTH_PENALTY * len(option) for option in options]
+    return ([[]] + options)[int(np.argmin(losses))]
+
+
+def _known_otherwise(space, sensor, noise, own):
+    """Return the normal matrix of what priors and the inside of windows tell about the parameters `own`."""
+    at = np.append(own, space.size)
+    information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
+    prior = 1 / space.prior_sd[own]**2
+    information[:-1, :-1] += np.diag(prior)
+    information[:-1, -1] += space.prior_mean[own] * prior
+    information[-1, :-1] = information[:-1, -1]
+    return information

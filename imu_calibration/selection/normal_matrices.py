@@ -1,0 +1,47 @@
+"""Normal matrices ``[design | residual]' V^-1 [design | residual]`` of windows of a reduced recording, weighed with a noise."""
+
+from typing import Sequence
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.selection.parameter_space import ParameterSpace
+
+
+def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None) -> np.ndarray:
+    """Return the normal matrix of the windows `select` (mask; all where not given), shape (q + 1, q + 1)."""
+    return within_matrix(space, noise, select) + mean_matrix(space, {sensor: white_means(space, noise, sensor) for sensor in SENSORS}, select)
+
+
+def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None,
+                  sensors: Sequence[str] = SENSORS) -> np.ndarray:
+    """Return the part of the normal matrix that comes from within the windows."""
+    total, kind = np.zeros((space.size + 1, space.size + 1)), space.recording.kind
+    chosen = space.recording.moving if select is None else select & space.recording.moving
+    for name in np.unique(kind[chosen]):
+        rows = chosen & (kind == name)
+        for sensor in sensors:
+            for axis, variance in enumerate(noise[sensor].row_variance(name)):
+                at = space.places(sensor, axis)
+                total[np.ix_(at, at)] += space.within_sum(sensor, axis, rows) / variance
+    return total
+
+
+def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], select: np.ndarray | None = None) -> np.ndarray:
+    """Return the part that comes from the means of the windows, from sensor -> `white_means`."""
+    total = np.zeros((space.size + 1, space.size + 1))
+    for sensor, axes in white.items():
+        for axis, rows in enumerate(axes):
+            rows, at = rows if select is None else rows[select], space.places(sensor, axis)
+            total[np.ix_(at, at)] += rows.T @ rows
+    return total
+
+
+def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str) -> list[np.ndarray]:
+    """Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1)."""
+    recording, own = space.recording, noise[sensor]
+    variance = own.mean_variance(recording.kind, recording.count) + own.offset_sd**2
+    return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, own.bias_processes)(rows[:, None])[:, 0]
+            for axis, rows in enumerate(space.mean[sensor])]

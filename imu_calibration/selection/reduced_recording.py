@@ -1,0 +1,183 @@
+"""A recording reduced with the columns of every effect that is asked about: all that candidates, folds and resamples need."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Callable, Sequence
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import References, columns
+from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
+from imu_calibration.estimation.noise_model import sessions_of
+from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+
+CHUNK = 16384
+"""Samples whose columns are held at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedRecording:
+    """Windows of one recording as statistics of ``[columns of the model | bank of warm-ups | output]``, and a point to take residuals at."""
+
+    model: SensorModel
+    """Every effect that is asked about, linearised at its point."""
+    values: np.ndarray
+    """Parameters that residuals belong to."""
+    constants: np.ndarray
+    """Time constants of the bank of warm-ups, s, shape (n_constants,)."""
+    windows: tuple[WindowStatistics, ...]
+    """Reduced as for a calibration, kept one by one."""
+    describe: dict[str, np.ndarray]
+    """Window means of what a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
+
+    @cached_property
+    def kind(self) -> np.ndarray:
+        """Kind of each window, shape (k,)."""
+        return np.array([window.kind for window in self.windows])
+
+    @cached_property
+    def moving(self) -> np.ndarray:
+        """Whether each window has centred rows, shape (k,)."""
+        return self.kind != 'static'
+
+    @cached_property
+    def time(self) -> np.ndarray:
+        """Middle of each window, s, shape (k,)."""
+        return np.array([window.time for window in self.windows])
+
+    @cached_property
+    def count(self) -> np.ndarray:
+        """Samples of each window, shape (k,)."""
+        return np.array([window.count for window in self.windows], float)
+
+    @cached_property
+    def slow_rows(self) -> np.ndarray:
+        """Short pieces of each window, shape (k,)."""
+        return np.array([window.sensors['accelerometer'].slow_rows for window in self.windows])
+
+    @property
+    def period(self) -> float:
+        """Typical time from sample to sample, s."""
+        return float(np.median([max(window.duration, 1e-3) / window.count for window in self.windows]))
+
+    def mean(self, sensor: str) -> np.ndarray:
+        """Return the mean rows ``[columns | residual]``, shape (k, p + 3)."""
+        return self._with_residual(sensor, np.array([window.sensors[sensor].mean for window in self.windows]))
+
+    @cached_property
+    def products(self) -> dict[tuple[str, str], np.ndarray]:
+        """(sensor, 'within' or 'slow') -> products of the windows' centred rows ``[columns | residual]``, or of their slow part, (k, p + 3, p + 3)."""
+        found = {}
+        for (sensor, part), factors in self._factors.items():
+            rows = self._with_residual(sensor, factors[self.moving])
+            found[sensor, part] = np.zeros_like(factors)
+            found[sensor, part][self.moving] = rows.transpose(0, 2, 1) @ rows
+        return found
+
+    @cached_property
+    def sessions(self) -> list[np.ndarray]:
+        """Indices of each session's windows in order of time."""
+        return sessions_of(self.windows)
+
+    @cached_property
+    def _factors(self):
+        """(sensor, part) -> the windows' triangular factors, filled up with zeros, shape (k, p + 3, p + 3)."""
+        found = {}
+        for sensor in SENSORS:
+            width = len(self.windows[0].sensors[sensor].mean)
+            for part in ('within', 'slow'):
+                found[sensor, part] = np.zeros((len(self.windows), width, width))
+                for filled, window in zip(found[sensor, part], self.windows):
+                    factor = getattr(window.sensors[sensor], part)
+                    if factor is not None:
+                        filled[:len(factor)] = factor
+        return found
+
+    def _with_residual(self, sensor, rows):
+        own = coefficients(self.model, sensor, self.values)
+        rows = rows.copy()
+        rows[..., -3:] -= rows[..., :len(own)] @ own
+        return rows
+
+    def rebased(self, values: np.ndarray) -> 'ReducedRecording':
+        """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
+        moved = replace(self, values=values)
+        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions', '_factors') if name in self.__dict__})
+        return moved
+
+    def accumulated(self, model: SensorModel) -> Accumulator:
+        """Return the Accumulator of a model whose columns are among those of this recording's."""
+        chosen = selected_columns(self.model, model)
+        accumulator = Accumulator()
+        for window in self.windows:
+            accumulator.add(restricted_window(window, chosen))
+        return accumulator
+
+
+def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, constants: np.ndarray,
+                     progress: Callable | None = None) -> ReducedRecording:
+    """
+    Reduce windows with the columns of a model and a bank of warm-ups.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Static, spin and dynamic windows of one recording.
+    table : Table
+    model : SensorModel
+    values : array, shape (n_params,)
+        Parameters that residuals belong to.
+    constants : array, shape (n_constants,)
+        Time constants of the bank, s.
+    progress : callable, optional
+        Called with the share that is done, in [0, 1].
+
+    """
+    def with_bank(model, sensor, table, motion, temperature_c=None, references: References | None = None):
+        bank = -np.expm1(-motion.time[:, None] / np.asarray(constants)[None, :])
+        return np.concatenate([columns(model, sensor, table, motion, temperature_c, references), bank], axis=1)
+
+    reduced = []
+    for part in _pieces(windows):
+        reduced += reduce_windows(part, model, table, column_function=with_bank)
+        if progress:
+            progress(len(reduced) / len(windows))
+    descriptions = [_describe(window) for window in windows]
+    return ReducedRecording(model, values, np.asarray(constants), tuple(reduced), {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
+
+
+def _pieces(windows):
+    part, size = [], 0
+    for window in windows:
+        part.append(window)
+        size += len(window.motion)
+        if size > CHUNK:
+            yield part
+            part, size = [], 0
+    if part:
+        yield part
+
+
+def _describe(window):
+    motion = window.motion
+    found = {'time': float(window.time.mean()), 'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
+             'temperature': np.nan if window.temperature_c is None else float(window.temperature_c.mean()),
+             'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean()))}
+    for joint in range(motion.position.shape[1]):
+        found[f'angle{joint}'] = float(motion.position[:, joint].mean())
+        found[f'span{joint}'] = float(np.ptp(motion.position[:, joint]))
+    return found
+
+
+def arms_of(model: SensorModel, values: np.ndarray) -> np.ndarray:
+    """Return the lever arms of the three accelerometers in a model, zero where it has none, shape (3, 3)."""
+    arms = np.zeros((3, 3))
+    for name in ('lever_arm', 'accel_size_effect'):
+        if ('accelerometer', name) in model.slices:
+            arms = arms + values[model.slices['accelerometer', name]].reshape(-1, 3)
+    return arms

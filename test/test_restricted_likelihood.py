@@ -1,0 +1,124 @@
+"""Whitening, its adjoint and the restricted likelihood in linear time against the dense covariance."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
+from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood, profile
+from imu_calibration.estimation.whitening import Whitening, predict_session_offsets
+
+STEP = 1.3
+"""Standard deviation of the bias from recording to recording."""
+
+
+@pytest.fixture(params=[1, 2, 3], ids='{} processes'.format)
+def processes(request):
+    """Return bias processes that are far from and close to one another."""
+    return (BiasProcess(0.7, 60.0), BiasProcess(1.1, 15.0), BiasProcess(0.4, 1000.0))[:request.param]
+
+
+@pytest.fixture
+def rows():
+    """Return rows of twenty windows in three recordings with their times, variances and recordings."""
+    rng = np.random.default_rng(5)
+    numbers = np.repeat([0, 1, 2], [9, 7, 4])
+    times, variance = np.sort(rng.uniform(0, 500, 20)), rng.uniform(0.5, 2, (20, 3))
+    return rng.normal(size=(20, 3, 4)), times, variance, [np.flatnonzero(numbers == k) for k in range(3)]
+
+
+def dense(times, variance, sessions, processes):
+    """Return the covariance of each axis."""
+    number = np.zeros(len(times))
+    for k, index in enumerate(sessions):
+        number[index] = k
+    steps = np.abs(times[:, None] - times)
+    kernel = (number[:, None] == number) * (sum(p.sd**2 * np.exp(-steps / p.time) for p in processes) + STEP**2)
+    return [kernel + np.diag(variance[:, axis]) for axis in range(3)]
+
+
+def test_whitening_inverts_the_covariance(rows, processes):
+    """Products of whitened rows are products weighted with the inverse covariance (to rounding)."""
+    values, times, variance, sessions = rows
+    white = Whitening(variance, times, sessions, processes, STEP**2)(values)
+    for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
+        expected = values[:, axis].T @ np.linalg.solve(covariance, values[:, axis])
+        np.testing.assert_allclose(white[:, axis].T @ white[:, axis], expected, rtol=1e-10)
+
+
+def test_a_row_is_whitened_with_earlier_rows_only(rows, processes):
+    """What is locked away later in time cannot reach what was whitened before it."""
+    values, times, variance, _ = rows
+    whitening, spoilt = Whitening(variance, times, [np.arange(20)], processes), values.copy()
+    spoilt[12:] += 100.0
+    np.testing.assert_array_equal(whitening(spoilt)[:12], whitening(values)[:12])
+    assert np.all(np.abs(whitening(spoilt)[12:] - whitening(values)[12:]).max(axis=(1, 2)) > 1.0)
+
+
+def test_weighing_is_the_inverse_covariance_itself(rows, processes):
+    values, times, variance, sessions = rows
+    found = Whitening(variance, times, sessions, processes, STEP**2).weigh(values)
+    for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
+        np.testing.assert_allclose(found[:, axis], np.linalg.solve(covariance, values[:, axis]), rtol=1e-9, atol=1e-11)
+
+
+def test_one_process_in_two_halves_is_the_same_process(rows):
+    values, times, variance, sessions = rows
+    one, two = (BiasProcess(0.7, 60.0),), (BiasProcess(0.7 * 0.6, 60.0), BiasProcess(0.7 * 0.8, 60.0))
+    np.testing.assert_allclose(Whitening(variance, times, sessions, one)(values), Whitening(variance, times, sessions, two)(values), rtol=1e-9)
+
+
+def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
+    """Log determinant and normal matrix in linear time equal the dense ones."""
+    values, times, variance, sessions = rows
+    logs, normal = RestrictedLikelihood(values, times, sessions).whitened(variance, processes, STEP**2)
+    matrices = dense(times, variance, sessions, processes)
+    np.testing.assert_allclose(logs, sum(np.linalg.slogdet(matrix)[1] for matrix in matrices), rtol=1e-10)
+    np.testing.assert_allclose(normal, sum(values[:, a].T @ np.linalg.solve(matrix, values[:, a]) for a, matrix in enumerate(matrices)), rtol=1e-9)
+
+
+def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(rows, processes):
+    """Two noises differ as in the likelihood of all contrasts that no parameter reaches (Harville 1974)."""
+    values, times, variance, sessions = rows
+    likelihood, found, expected = RestrictedLikelihood(values, times, sessions), [], []
+    design = values[:, :, :-1].transpose(1, 0, 2).reshape(60, 3)
+    contrasts = np.linalg.svd(design)[0][:, 3:]
+    for factor in (1.0, 3.0):
+        found.append(likelihood(factor * variance, processes, STEP**2))
+        whole = np.zeros((60, 60))
+        for axis, matrix in enumerate(dense(times, factor * variance, sessions, processes)):
+            whole[20 * axis:20 * axis + 20, 20 * axis:20 * axis + 20] = matrix
+        inner, rest = contrasts.T @ whole @ contrasts, contrasts.T @ values[:, :, -1].T.ravel()
+        expected.append(np.linalg.slogdet(inner)[1] + rest @ np.linalg.solve(inner, rest))
+    np.testing.assert_allclose(found[1] - found[0], expected[1] - expected[0], rtol=1e-8)
+
+
+def test_offsets_of_sessions_are_conditional_means(rows, processes):
+    """The prediction equals the regression of the offsets on the residuals."""
+    values, times, variance, sessions = rows
+    misfit = values[:, :, 0]
+    noise = NoiseModel(np.ones(3), np.ones(3), bias_processes=processes, session_sd=STEP, session_variance=STEP**2)
+    found = predict_session_offsets(misfit, variance, times, sessions, noise)
+    for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
+        weighted = np.linalg.solve(covariance, misfit[:, axis])
+        np.testing.assert_allclose(found[:, axis], [STEP**2 * weighted[index].sum() for index in sessions], rtol=1e-9)
+
+
+def test_fewer_parameters_are_fewer_columns_of_the_same_normal_matrix(rows):
+    values, times, variance, sessions = rows
+    shape = (0.3, 0.5, 60.0)
+    few, all_columns = (NoiseLikelihood(v, variance, times, sessions) for v in (values[:, :, [0, 2, 3]], values))
+    np.testing.assert_allclose(all_columns.loss(shape, np.array([0, 2])), few.loss(shape), rtol=1e-9)
+    assert all_columns.loss(shape) < all_columns.loss(shape, np.array([0, 2])) + 20
+
+
+def test_the_profile_is_what_least_squares_leaves(rows):
+    values = rows[0][:, 0]
+    left = np.linalg.lstsq(values[:, :-1], values[:, -1], rcond=None)[1][0]
+    np.testing.assert_allclose(profile(values.T @ values, restricted=False), left, rtol=1e-9)
+
+
+def test_a_variance_from_few_data_is_taken_larger():
+    assert dof_factor(1e9) == pytest.approx(1.0)
+    assert dof_factor(6) == pytest.approx(1.5)
+    assert dof_factor(2) == dof_factor(1) == 3.0
