@@ -6,16 +6,13 @@ Run: ``python examples/demo.py --output demo`` (or ``make demo``).
 
 import argparse
 import shutil
-from argparse import Namespace
 from pathlib import Path
 
 from imu_calibration import files
-from imu_calibration.cli import recordings
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
 from imu_calibration.compensation import evaluation
-
-NO_TOPICS = Namespace(imu_topic=None, joint_topic=None, temperature_topic=None)
+from imu_calibration.use_cases.recordings import source_of
 
 
 def verb(*arguments):
@@ -35,7 +32,7 @@ def run(folder):
     verb('simulate', '--profile', 'navigation', '--seed', 2, '--imu-seed', 5, '--output', second)
     verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
-    truth = evaluation.session_truth(recordings.source_of(second, NO_TOPICS, table.joint_names)(), table)
+    truth = evaluation.session_truth(source_of(second, joint_names=table.joint_names)(), table)
     show(evaluation.before_and_after(truth, calibration))
     lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'nothing; every parameter is within its tolerance'))

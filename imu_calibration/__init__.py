@@ -27,6 +27,58 @@ integer header stamp; ``time`` is float seconds since the session's first sample
 Shapes
 ------
 Time first: ``(n, 3)``, stacks ``(n, 3, 3)``. A parameter vector or covariance travels with its ``param_names``.
+
+In a notebook
+-------------
+::
+
+    import imu_calibration as imu
+    found = imu.calibrate('session.bag', 'table.yaml')      # without a table: by hand
+
+`load`, `calibrate`, `compensate`, `diagnose` and `simulate` are all that is needed; what they return prints, draws and saves itself.
+
+Contents
+--------
+From the ground up; each package imports only what stands above it. The words are explained in docs/glossary.md.
+
+================  ======================================================================================================
+`samples`         arrays of samples as they come from a bag or a topic; beside them constants, units, settings, errors
+`reference`       where the IMU truly was: table and joints become attitude, rate, angular acceleration, specific force
+`navigation`      strapdown integration: what errors become in use
+`segmentation`    a stream becomes windows: static poses, spins, dynamic stretches
+`effects`         the catalogue of what makes a sensor's output, and the sensor model made of it
+`estimation`      windows become a solution: noise, likelihood, least squares, observability
+`preflight`       what looks wrong with a recording before anything is estimated
+`simulation`      the model run: profiles of motion, noise, sessions
+`compensation`    the model inverted: corrected samples with their covariance
+`selection`       which windows take part in choosing a model, and which judge it
+`calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
+`papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
+`by_hand`         calibration without a table; the arm between two IMUs
+`report`          pages that people look at
+`diagnosis`       what the model gets wrong, and why
+`files`           files written whole or not at all; `resources` finds those that are installed
+`use_cases`       from files to files: what the command line and notebooks call
+`cli`, `nodes`    the command line and the ROS 2 nodes; `msg_adapters` beside this package knows messages and bags
+================  ======================================================================================================
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.notebook import calibrate, compensate, diagnose, load, simulate
+
+__all__ = ['calibrate', 'compensate', 'diagnose', 'load', 'simulate']
 __version__ = '0.1.0'
+
+
+def __getattr__(name: str) -> object:
+    """Import the names of `__all__` when they are asked for (PEP 562): the package itself stays light and free of ROS."""
+    if name not in __all__:
+        raise AttributeError(f"module 'imu_calibration' has no attribute '{name}'")
+    from imu_calibration.use_cases import notebook
+    return getattr(notebook, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

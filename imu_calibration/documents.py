@@ -1,5 +1,7 @@
 """Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
 
+from enum import StrEnum
+
 from imu_calibration.errors import InputError
 
 LARGEST = 2_000_000
@@ -36,6 +38,7 @@ def to_text(document):
 
     Dumper.add_representer(list, sequence)
     Dumper.add_representer(tuple, sequence)
+    Dumper.add_multi_representer(StrEnum, lambda dumper, word: dumper.represent_str(word.value))
     return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=100_000, allow_unicode=True)
 
 

@@ -194,7 +194,7 @@ def _open_source(path):
                          'check the path, or record again') from error
 
 
-def topics_of(path):
+def list_topics(path):
     """Return the topics of a recording in order of name; raises as `open_recording`."""
     source = _open_source(Path(path))
     try:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.comparison import LEVEL, compare
-from imu_calibration.calibration.document import DETERMINED, HELD, Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.status import DETERMINED, HELD
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document import DETERMINED, Calibration
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.installation_angles import PAIRS, angles_of, derive, in_paper_units, split
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.constants import STANDARD_GRAVITY as G
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.papers import zhang2017 as zhang

@@ -9,17 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_calibration import documents
-from imu_calibration.calibration.document import (
-    DETERMINED,
-    HELD,
-    WEAK,
-    Calibration,
-    calibration_from_text,
-    calibration_to_text,
-    from_mapping,
-    implausible,
-    to_mapping,
-)
+from imu_calibration.calibration.document import Calibration, calibration_from_text, calibration_to_text, from_mapping, to_mapping
+from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.status import DETERMINED, HELD, WEAK
 from imu_calibration.effects.catalogue import catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-EDGE = {'cli', 'nodes', 'resources', '__main__'}
+EDGE = {'cli', 'nodes', 'resources', 'use_cases', '__main__'}
 ROS = {'rclpy', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
 LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
 
@@ -112,7 +112,7 @@ def test_adapters_know_no_node_and_no_command_line(path):
 
 ORDER = (('constants', 'errors', 'samples'), ('settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
          ('estimation', 'preflight', 'simulation', 'compensation'), ('selection',), ('calibration', 'papers'), ('by_hand', 'report'), ('diagnosis',),
-         ('files', 'resources'), ('cli', 'nodes'), ('__main__',))
+         ('files', 'resources'), ('use_cases',), ('cli', 'nodes'), ('__main__',))
 """Packages and root modules from the ground up: each may import what stands in an earlier row."""
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.document import HELD, calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.status import HELD
 from imu_calibration.cli.main import main
 from imu_calibration.errors import DocumentError
 from imu_calibration.samples import ImuSamples, SampleBlock

@@ -6,11 +6,12 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.calibration.document import Calibration, statuses, tolerances_of
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.status import HELD, statuses, tolerances_of
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
@@ -119,9 +120,9 @@ def document_of_hand(hand, gathered, n_samples, tolerances=None, provenance=None
     model = hand.model.model
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
-    sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == 'held' for k in order])
+    sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == HELD for k in order])
     limits = tolerances_of(model, tolerances)
-    calibration = Calibration(model, hand.values[order], covariance, statuses(model, sd, held, limits), gathered.frame_id, dict(hand.gauge),
+    calibration = Calibration(model, hand.values[order], covariance, statuses(sd, held, limits), gathered.frame_id, dict(hand.gauge),
                               tuple(dict(item) for item in hand.advice), _statistics(hand, gathered.counts, n_samples), {}, {
                                   'software': imu_calibration.__version__, **(provenance or {})})
     return calibration, limits

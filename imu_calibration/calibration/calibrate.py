@@ -2,12 +2,12 @@
 
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.document import tolerances_of
 from imu_calibration.calibration.from_solution import document
 from imu_calibration.calibration.gathered import join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.solver import solve

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from imu_calibration.calibration.document import HELD
+from imu_calibration.calibration.status import HELD
 from imu_calibration.errors import InputError
 
 LEVEL = 0.01

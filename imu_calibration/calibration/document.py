@@ -4,15 +4,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_calibration.calibration import shown
 from imu_calibration.calibration.document_checks import check_numbers, check_parts
-from imu_calibration.calibration.document_parts import IN_REFERENCE, SECTIONS, STATUSES, parts_of
+from imu_calibration.calibration.document_parts import IN_REFERENCE, SECTIONS, parts_of
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.documents import from_text, to_text
 from imu_calibration.effects.catalogue import catalogue, find_effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
 
 FORMAT = 'imu_calibration/1'
-DETERMINED, WEAK, HELD = STATUSES
 _WHERE_KNOWN = ('verdict', 'verdict_reasons', 'proof')
 """Parts of a document that are left out while nobody knows them."""
 
@@ -77,32 +78,38 @@ class Calibration:
         """Return whether every parameter is determined."""
         return all(status == DETERMINED for status in self.status)
 
+    def compensate(self, samples, rate_s=None, *, time=None, temperature_c=None):
+        """
+        Return readings with the calibrated errors taken out; see `compensation.arrays.compensate_readings`.
 
-def statuses(model, sd, held, tolerances):
-    """
-    Return the status of each parameter.
+        Parameters
+        ----------
+        samples : ImuSamples, or array_like, shape (n, 3)
+            Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
+        rate_s : array_like, shape (n, 3), optional
+            Measured angular rate beside the specific force, rad/s.
+        time : array_like, shape (n,), optional
+            When the arrays were measured, s; needed where the sensitive points have lever arms.
+        temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
+            Needed when the calibration has thermal effects.
 
-    Parameters
-    ----------
-    tolerances : ndarray, shape (n_params,)
-        Largest standard deviation of a determined parameter.
+        Returns
+        -------
+        ImuSamples, or (ndarray, ndarray)
+            Specific force and rate as they were given; NaN where a reading cannot be corrected.
 
-    """
-    return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances))
+        """
+        from imu_calibration.compensation.arrays import compensate_readings
+        return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
+    def __repr__(self):
+        return shown.summary(self)
 
-def tolerances_of(model, overrides=None):
-    """
-    Return the tolerance of each parameter of a model, shape (n_params,).
+    def __str__(self):
+        return shown.as_text(self)
 
-    Parameters
-    ----------
-    overrides : dict, optional
-        {section: {effect: tolerance}} in SI, as in config/tolerances.yaml.
-
-    """
-    overrides = overrides or {}
-    return np.concatenate([np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance))) for e in model.effects])
+    def _repr_html_(self):
+        return shown.as_html(self)
 
 
 def checked_tolerances(mapping):
@@ -207,21 +214,6 @@ def _check_format(found):
         raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; give a file written by 'imu_calibration calibrate'")
     if int(number) > int(FORMAT.partition('/')[2]):
         raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; update imu_calibration")
-
-
-def implausible(calibration):
-    """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
-    lines = []
-    for effect in calibration.model.effects:
-        if not effect.plausible:
-            continue
-        grade, largest, source = effect.plausible[-1]
-        values = calibration.values[calibration.model.slices[effect.sensor, effect.name]]
-        size = np.max(np.abs(values if effect.components[-1] != 'time_constant' or effect.size == 1 else values[:-1]))
-        if size > 10 * largest:
-            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
-                         f'({largest:.3g}; {source}): check units and axes')
-    return lines
 
 
 def calibration_to_text(calibration):

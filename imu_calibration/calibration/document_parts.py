@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_calibration.calibration.status import Status
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, shortened
@@ -10,7 +11,6 @@ from imu_calibration.reference.joint import JointNames
 SECTIONS = SENSORS + ('reference',)
 IN_REFERENCE = {'lever_arm': 'accelerometer', 'accel_bandwidth': 'accelerometer', 'gyro_bandwidth': 'gyroscope'}
 """Effects of a sensor that a document lists under `reference`, since they belong to the table and the session -> that sensor."""
-STATUSES = ('determined', 'weak', 'held')
 
 
 def parts_of(document):
@@ -63,9 +63,9 @@ def _shaped(value, effect):
 
 def _statuses(value, effect):
     words = np.array(value, dtype=object).reshape(effect.size).tolist()
-    if any(word not in STATUSES for word in words):
-        raise DocumentError(f"the status of '{effect.name}' must be {', '.join(STATUSES)}; correct the calibration file")
-    return words
+    if any(word not in tuple(Status) for word in words):
+        raise DocumentError(f"the status of '{effect.name}' must be {', '.join(Status)}; correct the calibration file")
+    return map(Status, words)
 
 
 def _check_unit(found, effect):

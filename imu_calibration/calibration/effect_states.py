@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.document import HELD, WEAK
+from imu_calibration.calibration.status import HELD, WEAK
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS

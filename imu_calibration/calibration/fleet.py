@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.document import HELD, calibration_to_text
+from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import exit_code, summary
+from imu_calibration.calibration.status import HELD
 from imu_calibration.errors import ImuCalibrationError, InputError
 
 

@@ -5,7 +5,8 @@ from datetime import datetime, timezone
 import numpy as np
 
 import imu_calibration
-from imu_calibration.calibration.document import Calibration, statuses
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.status import statuses
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation import observability
@@ -20,7 +21,7 @@ def document(solution, tolerances, table, gathered, provenance=None):
     covariance = with_gravity_uncertainty(solution, table)
     sd = np.sqrt(np.diag(covariance))
     prior = make_prior(model)
-    status = statuses(model, sd, solution.held, tolerances)
+    status = statuses(sd, solution.held, tolerances)
     needed = observability.needed_motions(solution, tolerances, table.gravity_value, prior.sd)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)

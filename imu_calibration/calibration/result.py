@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.document import DETERMINED, Calibration
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import judge, requested
 from imu_calibration.effects.sensor_model import SensorModel
 

@@ -1,6 +1,7 @@
 """May a calibration be used? What its document says against it, and what whoever uses it should know."""
 
-from imu_calibration.calibration.document import DETERMINED, implausible
+from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import BAD, GOOD, listed
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.document import DETERMINED, HELD, WEAK, implausible
+from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.status import DETERMINED, HELD, WEAK
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import with_hint

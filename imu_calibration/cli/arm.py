@@ -1,11 +1,11 @@
 """``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
 
 from imu_calibration.by_hand.workflow import read_imu
-from imu_calibration.cli import recordings
 from imu_calibration.cli.show import console, warn
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight, warnings
 from imu_calibration.units import with_sd
+from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
 
 NAME = 'arm'
 HELP = 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.'
@@ -23,12 +23,12 @@ def run(options):
     if len(options.imu_topic) != 2:
         raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
     imus = []
-    for topic in options.imu_topic:
-        recordings.open_bag(options.bag, options, want_joints=False, imu_topic=topic).close()
-        blocks = recordings.source_of(options.bag, options, want_joints=False, imu_topic=topic)()
+    for topic in map(Topics, options.imu_topic):
+        open_bag(options.bag, topic, want_joints=False).close()
+        blocks = source_of(options.bag, topic, want_joints=False)()
         preflight = Preflight()
         imus.append(read_imu(preflight.watch(blocks))[0])
-        warn({'text': f'{topic}: {finding.text}'} for finding in warnings(preflight.findings))
+        warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
     result = estimate_arm(*imus)
     out = console()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

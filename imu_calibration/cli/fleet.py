@@ -1,7 +1,8 @@
 """``imu_calibration fleet``: many units, one result each, a summary table."""
 
 from imu_calibration import files
-from imu_calibration.cli import recordings
+from imu_calibration.cli.arguments import add_model_arguments, add_topic_arguments, choices_of
+from imu_calibration.use_cases.choices import calibration_options
 
 NAME = 'fleet'
 HELP = 'Calibrate a folder of many units: one result each, and a summary table with the spread of each parameter.'
@@ -15,11 +16,11 @@ def add_arguments(parser):
     parser.add_argument('--jobs', type=int, help='units calibrated side by side, default one per processor')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
     parser.add_argument('--no-report', action='store_true', help='no report.html per unit')
-    recordings.add_topic_arguments(parser)
-    recordings.add_model_arguments(parser)
+    add_topic_arguments(parser)
+    add_model_arguments(parser)
 
 
 def run(options):
     """Calibrate all units, continuing past a bad bag."""
     from imu_calibration.cli.fleet_run import run_fleet
-    return run_fleet(options, files.read_table(options.table), recordings.calibration_options(options))
+    return run_fleet(options, files.read_table(options.table), calibration_options(choices_of(options)))

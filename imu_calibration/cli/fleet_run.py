@@ -3,19 +3,19 @@
 import csv
 import io
 import math
-from argparse import Namespace
 
 from imu_calibration import files
 from imu_calibration.calibration.fleet import FleetStep, fleet_exit_code, summarise
+from imu_calibration.cli.arguments import choices_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.pool import cluster_mapper, jobs_for, process_mapper
-from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, warn
 from imu_calibration.errors import with_hint
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
+from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
+from imu_calibration.use_cases.progress import progress_bar
 
 HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest', 'highest_unit')
 
@@ -23,8 +23,7 @@ HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical
 def run_fleet(options, table, settings):
     """Calibrate every unit of a folder; return the exit code."""
     found = find_units(options.folder, options.output)
-    plain = Namespace(**{name: value for name, value in vars(options).items() if name != 'run'})
-    units = [unit_of(name, paths, plain, table.joint_names) for name, paths in found]
+    units = [unit_of(name, paths, choices_of(options), table.joint_names) for name, paths in found]
     folder = files.make_folder(options.output)
     with progress_bar('units', len(units), 'units') as advance:
         mapper = _mapper(options, len(units), lambda result: advance(1))

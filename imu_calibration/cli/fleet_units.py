@@ -4,8 +4,9 @@ from functools import partial
 from pathlib import Path
 
 from imu_calibration.calibration.fleet import Unit
-from imu_calibration.cli import recordings
 from imu_calibration.errors import InputError
+from imu_calibration.use_cases.choices import kept, topics_of
+from imu_calibration.use_cases.recordings import provenance_of, source_of
 
 STORAGE = ('.db3', '.mcap', '.bag')
 
@@ -52,7 +53,8 @@ def is_bag(path):
     return (path / 'metadata.yaml').exists() or any(inner.suffix in STORAGE[:2] for inner in path.iterdir())
 
 
-def unit_of(name, paths, options, joint_names):
+def unit_of(name, paths, choices, joint_names):
     """Return the Unit whose sources read the bags, without progress bars of their own."""
-    sources = tuple(recordings.source_of(path.resolve(), options, joint_names, quiet=True) for path in paths)
-    return Unit(name, sources, tuple(path.name for path in paths), partial(recordings.provenance_of, [path.resolve() for path in paths], options))
+    paths = [path.resolve() for path in paths]
+    sources = tuple(source_of(path, topics_of(choices), joint_names, quiet=True) for path in paths)
+    return Unit(name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, kept(choices)))

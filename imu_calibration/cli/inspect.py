@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from imu_calibration import files
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.result import exit_code
-from imu_calibration.cli import recordings
+from imu_calibration.cli.arguments import add_model_arguments, add_topic_arguments, choices_of
 from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.progress import progress_bar
 from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError, with_hint
 from imu_calibration.preflight.checks import Preflight, unusable
 from imu_calibration.preflight.finding import REFUSE
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
-from msg_adapters.bag import KEYS, Recording, imu_topics, topics_of
+from imu_calibration.use_cases.choices import calibration_options, topics_of
+from imu_calibration.use_cases.progress import progress_bar
+from imu_calibration.use_cases.recordings import existing, open_bag, source_of
+from msg_adapters.bag import KEYS, Recording, imu_topics, list_topics
 
 NAME = 'inspect'
 HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions found, and which parameters the recording can determine.'
@@ -26,8 +28,8 @@ def add_arguments(parser):
     parser.add_argument('bag', metavar='BAG')
     parser.add_argument('--table', metavar='TABLE', help='table description (YAML); with it axes and units are compared with the joints, '
                         'and the motions are found and judged')
-    recordings.add_topic_arguments(parser)
-    recordings.add_model_arguments(parser)
+    add_topic_arguments(parser)
+    add_model_arguments(parser)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class Look:
 def run(options):
     """Read each Imu topic once for streams and checks, and once more with the table for the motions."""
     table = files.read_table(options.table) if options.table else None
-    settings = recordings.calibration_options(options)
+    settings = calibration_options(choices_of(options))
     looks = [_look(options, table, settings.nominal, topic) for topic in _topics(options)]
     out = console()
     _show_topics(out, looks)
@@ -79,14 +81,15 @@ def run(options):
 def _topics(options):
     """Return the Imu topics to look at: the one that was asked for, or all."""
     if options.imu_topic is None:
-        return imu_topics(topics_of(recordings.existing(options.bag))) or [None]
+        return imu_topics(list_topics(existing(options.bag))) or [None]
     return [options.imu_topic]
 
 
 def _look(options, table, nominal, topic):
     """Read one Imu topic through."""
     preflight, checks, lost = Preflight(table and table.gravity_value, nominal), {name: StreamCheck() for _, name in TOPICS}, Counter()
-    with recordings.open_bag(options.bag, options, want_joints='optional', want_temperature='optional', imu_topic=topic) as recording:
+    topics = topics_of(choices_of(options))._replace(imu=topic)
+    with open_bag(options.bag, topics, want_joints='optional', want_temperature='optional') as recording:
         with progress_bar('inspect', recording.message_counts.get(recording.imu_topic, 0)) as advance:
             for block in preflight.watch(recording.blocks(), strict=False):
                 lost.update(block.dropped or {})
@@ -137,7 +140,7 @@ def _step(step_ns):
 
 def _judge(options, settings, table, out, topic):
     """Print which motions were found and which parameters they determine; return the exit code."""
-    source = recordings.source_of(options.bag, options, table.joint_names, imu_topic=topic)
+    source = source_of(options.bag, topics_of(choices_of(options))._replace(imu=topic), table.joint_names)
     try:
         result = calibrate([source], table, settings)
     except ImuCalibrationError as error:

@@ -1,9 +1,8 @@
 """What the verbs print: short tables on standard output."""
 
-from imu_calibration.calibration.result import summary
+from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.errors import with_hint
 from imu_calibration.preflight.finding import SEVERITIES
-from imu_calibration.units import for_people, with_sd
 
 
 def console():
@@ -38,23 +37,17 @@ def show_findings(out, findings, hints):
     out.print(table)
 
 
-def show_calibration(result, folder, hints, report=True):
-    """Print the parameters, the verdict and where the files are."""
+def show_calibration(found, folder, hints, report=True):
+    """Print the parameters of a `Calibrated`, the verdict and where the files are."""
     from rich.table import Table
-    out, calibration = console(), result.calibration
-    verdict, lines = summary(result, hints)
-    table = Table(title=None, box=None, pad_edge=False)
-    for heading in ('parameter', 'value', 'sd', 'unit', 'status'):
-        table.add_column(heading, justify='right' if heading in ('value', 'sd') else 'left')
-    for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
-        for k, index in enumerate(range(part.start, part.stop)):
-            factor, unit = for_people(effect.unit_of(k))
-            value, sd = calibration.values[index] * factor, calibration.sd[index] * factor
-            table.add_row(calibration.param_names[index], *with_sd(value, sd), unit, calibration.status[index])
+    out, table = console(), Table(title=None, box=None, pad_edge=False)
+    for heading in HEADINGS:
+        table.add_column(heading, justify='right' if heading in NUMBERS else 'left')
+    for row in parameter_rows(found.calibration):
+        table.add_row(*row)
     out.print(table)
-    out.print(f'verdict: {verdict}')
-    for line in lines:
+    out.print(f'verdict: {found.verdict.word}')
+    for line in found.verdict.lines(hints):
         out.print('  ' + line, soft_wrap=True)
     files = 'calibration.yaml' + (' and report.html' if report else '')
     out.print(f'written: {files} in {folder}', soft_wrap=True)

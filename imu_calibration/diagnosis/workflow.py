@@ -7,9 +7,10 @@ import numpy as np
 from imu_calibration.by_hand.calibrate import gather_by_hand
 from imu_calibration.by_hand.workflow import document_of_hand, read_by_hand, reference_gravity, result_by_hand
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.document import Calibration, tolerances_of
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import document, preflight_statistics
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping

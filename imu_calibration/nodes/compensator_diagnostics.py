@@ -6,7 +6,7 @@ from time import monotonic
 
 import numpy as np
 
-from imu_calibration.calibration.document import DETERMINED
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 

@@ -9,7 +9,8 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from imu_calibration.calibration.document import calibration_from_text, implausible
+from imu_calibration.calibration.document import calibration_from_text
+from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.compensation.stream import refuse_corrected, requested_transfer
 from imu_calibration.documents import version_of
 from imu_calibration.errors import DocumentError, ImuCalibrationError, InputError

@@ -14,7 +14,8 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration import files
-from imu_calibration.calibration.document import DETERMINED, Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.hints import HINTS

@@ -1,6 +1,6 @@
 """The report of a calibration: the verdict first, then everything that supports it."""
 
-from imu_calibration.calibration.document import DETERMINED
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import judge, requested
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section

@@ -33,7 +33,7 @@ def diagnosis_report(result):
     word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
     return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests), lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
-                  traces=draw('traces', (8.6, 4.2), _OverTime(diagnosis.traces, 'of each pose' if by_hand else 'over 0.25 s'), 'Residuals over time before and after the extension'),
+                  traces=draw_over_time(result),
                   candidates=[_candidate(row) for row in diagnosis.candidates], rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
                   not_testable=list(diagnosis.not_testable), groups=parameter_groups(result), by_hand=by_hand, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
@@ -85,7 +85,19 @@ def _finding(diagnosis, finding, number):
     return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows, 'p': chance(finding.p_value),
             'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain),
             'sensor': gain.sensor, 'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from], 'motion': finding.separating_motion,
-            'figure': draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), f'Residual against the cause, before and after: {finding.effect}')}
+            'figure': draw_finding(diagnosis, finding, number)}
+
+
+def draw_finding(diagnosis, finding, number):
+    """Return the residual against the cause of a finding, before and after, as SVG."""
+    label = f'Residual against the cause, before and after: {finding.effect}'
+    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), label)
+
+
+def draw_over_time(result):
+    """Return the size of the residuals over time, before and after the extension, as SVG."""
+    over = 'of each pose' if result.table is None else 'over 0.25 s'
+    return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, over), 'Residuals over time before and after the extension')
 
 
 CAUSES = (('thermal', ('temperature',)), ('drift', ('time',)), ('g_sensitivity', ('force',)), ('rate_product', ('rate',)), ('encoder', ('angle',)),

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.calibration.document import DETERMINED, HELD, IN_REFERENCE
+from imu_calibration.calibration.document import IN_REFERENCE
+from imu_calibration.calibration.status import DETERMINED, HELD
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.numbers import in_unit, pair, people, text

@@ -17,11 +17,16 @@ KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins
 
 def residual_section(result, errors):
     """Return figures and tables of the residuals."""
-    figures = {sensor: draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor),
-                            f'Errors of the {sensor} in every window, before and after calibration') for sensor in SENSORS}
+    figures = {sensor: draw_windows(errors, sensor) for sensor in SENSORS}
     traces = autocorrelation(result) if result.table is not None else {}
     return {'windows': figures, 'autocorrelation': draw('autocorrelation', (8.6, 2.7), _Lags(traces), 'Autocorrelation of the residuals within moving windows') if traces else None,
             'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration), 'errors': error_rows(errors)}
+
+
+def draw_windows(errors, sensor):
+    """Return the errors of one sensor in every window, before and after, as SVG."""
+    label = f'Errors of the {sensor} in every window, before and after calibration'
+    return draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor), label)
 
 
 class _Windows:

@@ -10,7 +10,7 @@ from imu_calibration.errors import InputError
 def jobs_for(asked, n_items):
     """Return the number of processes: what was asked for, else one per processor; never more than there are items."""
     if asked is not None and asked < 1:
-        raise InputError(f'--jobs must be at least 1, got {asked}; leave it out to use every processor')
+        raise InputError(f'at least one process must work, got {asked}; leave the number out to use every processor', key='jobs')
     return max(1, min(asked or os.cpu_count() or 1, n_items))
 
 
@@ -64,14 +64,15 @@ def cluster_mapper(address, done=lambda item: None):
     try:
         from dask import distributed
     except ImportError as error:
-        raise InputError('--scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or leave the option out') from error
+        raise InputError('a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or leave it out',
+                         key='scheduler') from error
 
     def mapped(function, items):
         try:
             client = distributed.Client(address, timeout='10s', set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f'--scheduler must be the address of a dask scheduler that answers, got {address}: '
-                             f'{" ".join(str(error).split())}; start one with dask scheduler') from error
+            raise InputError(f'there must be a dask scheduler that answers at {address}: {" ".join(str(error).split())}; '
+                             'start one with dask scheduler', key='scheduler') from error
         with client, client.as_current():
             futures = client.map(function, list(items), pure=False)
             for future in distributed.as_completed(futures):

@@ -1,0 +1,18 @@
+"""Values that no instrument is known to have: what the catalogue knows of grades, held against a calibration."""
+
+import numpy as np
+
+
+def implausible(calibration):
+    """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
+    lines = []
+    for effect in calibration.model.effects:
+        if not effect.plausible:
+            continue
+        grade, largest, source = effect.plausible[-1]
+        values = calibration.values[calibration.model.slices[effect.sensor, effect.name]]
+        size = np.max(np.abs(values if effect.components[-1] != 'time_constant' or effect.size == 1 else values[:-1]))
+        if size > 10 * largest:
+            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
+                         f'({largest:.3g}; {source}): check units and axes')
+    return lines

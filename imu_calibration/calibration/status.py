@@ -1,0 +1,51 @@
+"""How well a recording knows a parameter, and how well it must."""
+
+from collections.abc import Iterable
+from enum import StrEnum
+
+import numpy as np
+
+
+class Status(StrEnum):
+    """Status of a parameter; a document holds the word."""
+
+    DETERMINED = 'determined'
+    """Its standard deviation is within the tolerance."""
+    WEAK = 'weak'
+    """It is not, but value and standard deviation are honest."""
+    HELD = 'held'
+    """The recording says next to nothing: both are the prior's."""
+
+
+DETERMINED, WEAK, HELD = Status
+
+
+def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[float]) -> tuple[Status, ...]:
+    """
+    Return the status of each parameter.
+
+    Parameters
+    ----------
+    sd : array_like, shape (n_params,)
+        Standard deviations, SI.
+    held : array_like of bool, shape (n_params,)
+        Whether the prior stands.
+    tolerances : array_like, shape (n_params,)
+        Largest standard deviation of a determined parameter, SI.
+
+    """
+    return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
+
+
+def tolerances_of(model, overrides=None):
+    """
+    Return the tolerance of each parameter of a model, shape (n_params,).
+
+    Parameters
+    ----------
+    overrides : dict, optional
+        {section: {effect: tolerance}} in SI, as in config/tolerances.yaml.
+
+    """
+    overrides = overrides or {}
+    return np.concatenate([np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance))) for e in model.effects])

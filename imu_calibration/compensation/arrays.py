@@ -1,0 +1,73 @@
+"""Compensation of whole arrays at once: for notebooks and other programs."""
+
+import numpy as np
+
+from imu_calibration.compensation.compensate import arms_of
+from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, TemperatureSamples
+
+
+def compensate_readings(calibration, samples, rate_s=None, *, time=None, temperature_c=None):
+    """
+    Return readings with the calibrated errors taken out.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    samples : ImuSamples, or array_like, shape (n, 3)
+        Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
+    rate_s : array_like, shape (n, 3), optional
+        Measured angular rate beside the specific force, rad/s.
+    time : array_like, shape (n,), optional
+        When the arrays were measured, s: angular acceleration is taken from the rates as they come, by a causal filter.
+    temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
+        Needed when the calibration has thermal effects, degrees Celsius.
+
+    Returns
+    -------
+    ImuSamples, or (ndarray, ndarray)
+        Specific force and rate as they were given; NaN where a reading cannot be corrected.
+
+    Raises
+    ------
+    InputError
+        When shapes do not fit, or times or temperatures are missing that the calibration needs.
+
+    """
+    whole = isinstance(samples, ImuSamples)
+    imu = samples if whole else _as_samples(calibration, samples, rate_s, time)
+    stream = CompensationStream(calibration, temperature=_as_temperatures(temperature_c, imu.stamp_ns))
+    corrected = stream.correct(imu)
+    if whole:
+        return ImuSamples(imu.stamp_ns, corrected.force, corrected.rate, imu.frame_id)
+    return corrected.force, corrected.rate
+
+
+def _as_samples(calibration, force_s, rate_s, time):
+    """Return arrays as ImuSamples; where no arm asks for angular acceleration, times may be missing."""
+    force, rate = (_vectors(values, name) for values, name in ((force_s, 'specific force'), (rate_s, 'angular rate')))
+    if len(force) != len(rate):
+        raise InputError(f'specific force and angular rate must be of the same instants, got {len(force)} and {len(rate)}; give both')
+    if time is None:
+        if np.any(arms_of(calibration)):
+            raise InputError('the calibration has lever arms and needs the time of each reading, none came; give `time` in seconds')
+        time = np.arange(len(force)) * 0.01
+    seconds = np.asarray(time, float)
+    if seconds.shape != (len(force),):
+        raise InputError(f'there must be one time for each reading, shape ({len(force)},), got {seconds.shape}; correct `time`')
+    start = seconds[0] if len(seconds) else 0.0
+    return ImuSamples(np.round((seconds - start) * 1e9).astype(np.int64), force, rate, calibration.frame_id)
+
+
+def _vectors(values, name):
+    array = np.asarray(values, float) if values is not None else np.empty(0)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f'the {name} must be an array of shape (n, 3), got {array.shape if values is not None else "none"}; correct it')
+    return array
+
+
+def _as_temperatures(temperature_c, stamp_ns):
+    if temperature_c is None or isinstance(temperature_c, TemperatureSamples):
+        return temperature_c
+    return TemperatureSamples(stamp_ns, np.broadcast_to(np.asarray(temperature_c, float), stamp_ns.shape))

@@ -1,0 +1,6 @@
+"""
+What people do, from files to files: the command line, notebooks and scripts call the same functions.
+
+In: paths of recordings and tables, choices by name. Out: results that print, draw and save themselves.
+Read `calibrate` first.
+"""

@@ -1,0 +1,127 @@
+"""From recordings to a calibration that prints, draws and saves itself."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Unpack
+
+from imu_calibration import files
+from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.calibrate import calibrate as calibrate_on_table
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.verdict import Verdict, judge
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
+from imu_calibration.use_cases.drawing import Drawing
+from imu_calibration.use_cases.pool import jobs_for, process_mapper
+from imu_calibration.use_cases.progress import progress_bar
+from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What calibrating gave: prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html."""
+
+    result: CalibrationResult
+    """The calibration with everything that a report needs."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration: compensates arrays, and is what `save` writes."""
+        return self.result.calibration
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """'good', 'weak' or 'bad' with reasons and next steps."""
+        return judge(self.calibration, self.result.tolerances)
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every requested parameter is determined and nothing was lost, else 3."""
+        return exit_code(self.result)
+
+    def plot(self, sensor: str = 'accelerometer') -> Drawing:
+        """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
+        from imu_calibration.report.residuals import draw_windows
+        from imu_calibration.report.window_errors import window_errors
+        return Drawing(draw_windows(window_errors(self.result), sensor))
+
+    @cached_property
+    def report(self) -> str:
+        """The report as one HTML page."""
+        from imu_calibration.report.calibration_page import calibration_report
+        return calibration_report(self.result)
+
+    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
+        """Write calibration.yaml and, when wanted, report.html into a folder."""
+        text, folder = calibration_to_text(self.calibration), files.make_folder(folder)
+        if report:
+            files.write_text(folder / 'report.html', self.report)
+        files.write_text(folder / 'calibration.yaml', text)
+
+    def __repr__(self):
+        return repr(self.calibration)
+
+    def __str__(self):
+        return '\n'.join([str(self.calibration), f'verdict: {self.verdict.word}', *(f'  {line}' for line in self.verdict.lines())])
+
+    def _repr_html_(self):
+        from markupsafe import escape
+        lines = ''.join(f'<li>{escape(line)}</li>' for line in self.verdict.lines())
+        return f'<p><b>{self.verdict.word}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
+
+
+def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: str | PathLike | Table | None = None, *, jobs: int | None = 1,
+              **choices: Unpack[Choices]) -> Calibrated:
+    """
+    Calibrate from one or several recordings of the same IMU.
+
+    Parameters
+    ----------
+    recordings : path-like, SampleBlock, or a sequence of them
+        Bags, or samples in memory.
+    table : path-like or Table, optional
+        The reference; without it gravity is: poses held still and the turns between them.
+    jobs : int or None
+        Recordings that are read side by side, in processes; None: one per processor.
+    choices
+        See `Choices`.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When a recording cannot be used, or nothing can be determined from it.
+
+    """
+    check_names(choices)
+    options, topics = calibration_options(choices), topics_of(choices)
+    recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
+    table = files.read_table(table) if isinstance(table, (str, PathLike)) else table
+    for path in recordings:
+        if not isinstance(path, SampleBlock):
+            open_bag(path, topics, want_joints=table is not None).close()
+    jobs = jobs_for(jobs, len(recordings))
+    names = None if table is None else table.joint_names
+    sources = [source_of(item, topics, names, want_joints=table is not None, quiet=jobs > 1) for item in recordings]
+    with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
+        provenance = hashing.submit(provenance_of, recordings, kept(choices))
+        if table is None:
+            result = calibrate_without_table(sources, options, choices.get('gravity'))
+        else:
+            result = _side_by_side(sources, table, options, recordings, jobs)
+        calibration = result.calibration
+        return Calibrated(replace(result, calibration=replace(calibration, provenance=calibration.provenance | provenance.result())))
+
+
+def _side_by_side(sources, table, options, recordings, jobs):
+    """Calibrate with the table, recordings side by side; with several processes one bar counts the recordings."""
+    names = [name_of(recording) for recording in recordings]
+    names = [name if names.count(name) == 1 else str(Path(recording)) for name, recording in zip(names, recordings, strict=True)]
+    with progress_bar('recordings', len(recordings) if jobs > 1 else 0, 'recordings') as advance:
+        mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
+        return calibrate_on_table(sources, table, options, mapper=mapper, names=names)

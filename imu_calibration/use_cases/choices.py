@@ -1,0 +1,98 @@
+"""What somebody may choose when a recording is calibrated or diagnosed: by name, each with a default."""
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any, TypedDict
+
+from imu_calibration import files
+from imu_calibration.calibration.document import checked_tolerances
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.errors import InputError
+from imu_calibration.resources import config_file
+from imu_calibration.samples import NominalScaling
+from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.settings import override
+from imu_calibration.use_cases.recordings import Topics
+
+
+class Choices(TypedDict, total=False):
+    """Everything has a default."""
+
+    imu_topic: str | None
+    """sensor_msgs/Imu; default /imu/data_raw, else the only one."""
+    joint_topic: str | None
+    """sensor_msgs/JointState; default /joint_states, else the only one."""
+    temperature_topic: str | None
+    """sensor_msgs/Temperature; default /imu/temperature, else the only one."""
+    accelerometer_model: str | None
+    """A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the rotation shows it."""
+    gyroscope_model: str | None
+    """The same for the gyroscope; default bias+matrix."""
+    reference_model: str | None
+    """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when latitude or azimuth is unknown."""
+    gravity: float | None
+    """Local gravity for work by hand, m/s^2; default the standard gravity with its uncertainty."""
+    tolerances: str | PathLike | Mapping | None
+    """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
+    nominal: str | PathLike | NominalScaling | None
+    """File or scaling of recordings in volts or counts."""
+    setting: Sequence[str] | Mapping[str, float]
+    """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
+
+
+IN_DOCUMENT = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'imu_topic', 'joint_topic', 'temperature_topic', 'setting')
+"""Choices that a document names where they were made."""
+
+
+def check_names(choices: Mapping[str, Any]) -> None:
+    """Refuse choices that there are not."""
+    strange = sorted(set(choices) - set(Choices.__annotations__))
+    if strange:
+        raise InputError(f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}')
+
+
+def topics_of(choices: Mapping[str, Any]) -> Topics:
+    """Return the topics that were chosen."""
+    return Topics(*(choices.get(name) for name in ('imu_topic', 'joint_topic', 'temperature_topic')))
+
+
+def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
+    """Return what to estimate and how to judge it."""
+    tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
+    tolerances = checked_tolerances(tolerances) if isinstance(tolerances, Mapping) else files.read_tolerances(tolerances)
+    models = (choices.get(name) for name in ('accelerometer_model', 'gyroscope_model', 'reference_model'))
+    return CalibrationOptions(*models, tolerances, window_settings(choices.get('setting') or ()), nominal_of(choices.get('nominal')))
+
+
+def kept(choices: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the choices that a document names, in order of name."""
+    made = {name: choices[name] for name in sorted(IN_DOCUMENT) if choices.get(name)}
+    if isinstance(made.get('setting'), Mapping):
+        made['setting'] = [f'{name}={value}' for name, value in made['setting'].items()]
+    return made
+
+
+def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettings:
+    """Return the window settings with those that were chosen."""
+    if isinstance(chosen, Mapping):
+        return override(WindowSettings(), chosen)
+    values = {}
+    for pair in chosen:
+        name, _, text = pair.partition('=')
+        try:
+            values[name] = float(text)
+        except ValueError as error:
+            raise InputError(f"a setting must be NAME=NUMBER, got '{pair}'; write for example settling=1.0", key='setting') from error
+    return override(WindowSettings(), values)
+
+
+def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling | None:
+    """Return the nominal scaling, read where it is a file."""
+    if chosen is None or isinstance(chosen, NominalScaling):
+        return chosen
+    mapping = files.read_mapping(chosen, 'nominal scaling')
+    known = NominalScaling.__dataclass_fields__
+    strange = sorted(set(mapping) - set(known))
+    if strange:
+        raise InputError(f"{chosen} may name {', '.join(known)}; it names {', '.join(strange)}; correct it")
+    return NominalScaling(**{name: float(value) for name, value in mapping.items()})

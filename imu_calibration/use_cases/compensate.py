@@ -1,0 +1,109 @@
+"""From a recording and a calibration to corrected samples, in memory or in a new bag."""
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from imu_calibration import files
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.trust import caveats, objections, refuse_untrusted
+from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.use_cases.progress import progress_bar
+from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
+
+CORRECTED_TOPIC = '/imu/data_corrected'
+
+
+@dataclass(frozen=True, eq=False)
+class Compensated:
+    """What compensating gave."""
+
+    imu: ImuSamples | None
+    """The corrected samples, NaN where a reading cannot be corrected; None when they were written into a bag."""
+    count: int
+    """Samples that passed."""
+    warnings: list[str]
+    """What speaks against the calibration, was outside its conditions, or could not be corrected, a line each."""
+    lost: dict[str, int]
+    """Reason -> messages that could not be read."""
+
+    def __repr__(self):
+        return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])
+
+
+def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration: Calibration | str | PathLike, *,
+               output: str | PathLike | None = None, corrected_topic: str = CORRECTED_TOPIC, target_frame: str = '',
+               target_xyz=(0.0, 0.0, 0.0), target_rpy=(0.0, 0.0, 0.0), correct_stamps: bool = False, anyway: bool = False,
+               imu_topic: str | None = None, temperature_topic: str | None = None) -> Compensated:
+    """
+    Take the calibrated errors out of a recording.
+
+    Parameters
+    ----------
+    recording : path-like, ImuSamples or SampleBlock
+        A bag, or samples in memory (a block may bring temperatures).
+    calibration : Calibration or path-like
+    output : path-like, optional
+        A rosbag2 folder to make: all topics of the recording, and the corrected one beside them. Without it the corrected samples are
+        returned.
+    corrected_topic : str
+        Name of the topic to add.
+    target_frame : str
+        Another frame of the same rigid body to move the readings to, in which the sensor sits at `target_xyz` (m), turned by
+        `target_rpy` (roll, pitch, yaw, rad).
+    correct_stamps : bool
+        Move the stamps back by the calibration's time_offset.
+    anyway : bool
+        Also with a calibration whose verdict is bad or whose proof failed.
+    imu_topic, temperature_topic : str, optional
+        Topics to read.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When nobody should be corrected with the calibration, the recording is corrected already, lacks temperatures that are needed, or the output exists.
+
+    """
+    calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    if not anyway:
+        refuse_untrusted(calibration)
+    transfer = requested_transfer(target_frame, target_xyz, target_rpy)
+    late = late_ns(calibration, correct_stamps)
+    if isinstance(recording, (ImuSamples, SampleBlock)):
+        return _in_memory(recording, calibration, transfer, late)
+    if output is not None and Path(output).exists():
+        raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it')
+    topics = Topics(imu_topic, None, temperature_topic)
+    bag = open_bag(recording, topics, want_joints=False)
+    with bag, progress_bar('compensate', bag.message_counts.get(bag.imu_topic, 0)) as advance:
+        refuse_corrected(bag.imu_topic)
+        stream = CompensationStream(calibration, temperature=temperatures(recording, topics), transfer=transfer)
+
+        def correct(imu):
+            advance(len(imu))
+            return stream.correct(imu)
+        if output is None:
+            parts = [_corrected(block.imu, correct(block.imu), transfer, late) for block in bag.blocks() if block.imu is not None]
+            return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost)
+        from msg_adapters.write import copy_with_corrected
+        lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic, correct, stream.propagate, target_frame or None,
+                                   None if transfer is None else transfer.mat_ts, late)
+        return _outcome(None, stream, lost)
+
+
+def _in_memory(recording, calibration, transfer, late):
+    block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
+    stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
+    return _outcome(_corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {})
+
+
+def _outcome(imu, stream, lost):
+    warnings = objections(stream.calibration) + caveats(stream.calibration) + stream.warnings()
+    return Compensated(imu, stream.count, warnings, lost)
+
+
+def _corrected(imu, corrected, transfer, late):
+    frame_id = imu.frame_id if transfer is None else transfer.frame_id
+    return ImuSamples(imu.stamp_ns - late, corrected.force, corrected.rate, frame_id)

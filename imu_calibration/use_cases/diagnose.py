@@ -1,0 +1,105 @@
+"""From a recording to what the model gets wrong, why, and the extended model."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from typing import Unpack
+
+from imu_calibration import files
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.result import exit_code
+from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
+from imu_calibration.use_cases.drawing import Drawing
+from imu_calibration.use_cases.progress import progress_bar
+from imu_calibration.use_cases.recordings import provenance_of, source_of
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosed:
+    """What diagnosing gave: prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and report.html."""
+
+    result: DiagnosisResult
+    """The diagnosis with everything that a report needs."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """The extended calibration; the baseline's when nothing was found."""
+        return self.result.calibration
+
+    @property
+    def findings(self) -> tuple:
+        """What the model lacked, the strongest first."""
+        return self.result.diagnosis.findings
+
+    @property
+    def document(self) -> dict:
+        """The content of diagnosis.json."""
+        return self.result.document
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every requested parameter is determined and nothing was lost, else 3."""
+        return exit_code(self.result)
+
+    def plot(self, number: int = 1) -> Drawing:
+        """Return the residual against the cause of a finding, before and after; 0, or without findings: residuals over time."""
+        from imu_calibration.report.diagnosis_page import draw_finding, draw_over_time
+        if not number or not self.findings:
+            return Drawing(draw_over_time(self.result))
+        return Drawing(draw_finding(self.result.diagnosis, self.findings[number - 1], number))
+
+    @cached_property
+    def report(self) -> str:
+        """The report as one HTML page."""
+        from imu_calibration.report.diagnosis_page import diagnosis_report
+        return diagnosis_report(self.result)
+
+    def save(self, folder: str | PathLike) -> None:
+        """Write diagnosis.json, report.html and the extended calibration.yaml into a folder."""
+        page, folder = self.report, files.make_folder(folder)
+        files.write_text(folder / 'diagnosis.json', json.dumps(self.document, indent=1) + '\n')
+        files.write_text(folder / 'report.html', page)
+        files.write_text(folder / 'calibration.yaml', calibration_to_text(self.calibration))
+
+    def __str__(self):
+        return '\n'.join(self.result.lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self):
+        from markupsafe import escape
+        return ''.join(f'<p>{escape(line)}</p>' for line in self.result.lines)
+
+
+def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Table | None = None, **choices: Unpack[Choices]) -> Diagnosed:
+    """
+    Say what the model gets wrong on a recording and why, and extend it.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+        A bag, or samples in memory.
+    table : path-like or Table, optional
+        The reference; without it gravity is.
+    choices
+        See `Choices`; the models are what the diagnosis starts from, by default bias and matrix alone.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When the recording cannot be used, or nothing can be determined from it.
+
+    """
+    check_names(choices)
+    options = calibration_options(choices)
+    table = files.read_table(table) if isinstance(table, (str, PathLike)) else table
+    source = source_of(recording, topics_of(choices), table and table.joint_names, want_joints=table is not None)
+    provenance = provenance_of([recording], kept(choices))
+    with progress_bar('diagnose', 100, '%') as advance:
+        if table is None:
+            return Diagnosed(diagnose_without_table(source, options, choices.get('gravity'), provenance, advance))
+        return Diagnosed(diagnose_recording(source, table, options, provenance, advance))

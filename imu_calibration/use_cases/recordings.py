@@ -1,0 +1,90 @@
+"""Recordings as sources of samples: opened with the topics that were chosen, read ahead, and named in documents."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from functools import partial
+from hashlib import sha256
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+from imu_calibration import files
+from imu_calibration.errors import InputError
+from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.use_cases.progress import progress_bar
+from msg_adapters.bag import Recording, open_recording
+from msg_adapters.read_ahead import read_ahead
+
+Source = Callable[[], Iterator[SampleBlock]]
+"""Yields the blocks of a recording, each time anew."""
+
+
+class Topics(NamedTuple):
+    """Names of the topics to read; None: the default name, else the only topic of the type."""
+
+    imu: str | None = None
+    """sensor_msgs/Imu, default /imu/data_raw."""
+    joints: str | None = None
+    """sensor_msgs/JointState, default /joint_states."""
+    temperature: str | None = None
+    """sensor_msgs/Temperature, default /imu/temperature."""
+
+
+def existing(path: str | PathLike) -> Path:
+    """Return the path of a bag that is there."""
+    if not Path(path).exists():
+        raise InputError(f'the bag {path} must exist, there is nothing there; correct the path')
+    return Path(path)
+
+
+def open_bag(path: str | PathLike, topics: Topics, *, want_joints: bool | str = True, want_temperature: bool | str = True) -> Recording:
+    """Open a recording with the topics that were chosen; the rest as for `msg_adapters.bag.open_recording`."""
+    return open_recording(existing(path), *topics, want_joints=want_joints, want_temperature=want_temperature)
+
+
+def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, want_joints: bool, quiet: bool) -> Iterator[SampleBlock]:
+    """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
+    recording = open_recording(path, *topics, want_joints=want_joints)
+    total = 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)
+    with recording, progress_bar(Path(path).name, total) as advance:
+        with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
+            for block in blocks:
+                if block.imu is not None:
+                    advance(len(block.imu))
+                yield block
+        if recording.lost:
+            yield SampleBlock(dropped=recording.lost)
+
+
+def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics(), joint_names: Iterable[str] | None = None, *,
+              want_joints: bool = True, quiet: bool = False) -> Source:
+    """Return a callable that yields the blocks of a recording, each time anew; samples in memory are a recording of one block."""
+    if isinstance(recording, SampleBlock):
+        return partial(iter, (recording if want_joints else SampleBlock(recording.imu, None, recording.temperature),))
+    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints, quiet)
+
+
+def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:
+    """Return names and hashes of recordings and the options for a document: nothing that changes from run to run."""
+    return {'bags': [{'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings], 'options': options}
+
+
+def name_of(recording: str | PathLike | SampleBlock) -> str:
+    """Return what a recording is called in documents."""
+    return 'samples in memory' if isinstance(recording, SampleBlock) else Path(recording).name
+
+
+def _hash_of(recording):
+    if not isinstance(recording, SampleBlock):
+        return files.hash_of(recording)
+    imu = recording.imu
+    return sha256(imu.stamp_ns.tobytes() + imu.force_s.tobytes() + imu.rate_s.tobytes()).hexdigest()[:16]
+
+
+def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | None:
+    """Return all temperatures of a recording, or None."""
+    parts = []
+    with open_bag(path, topics, want_joints=False) as recording:
+        if recording.temperature_topic:
+            parts = [block.temperature for block in recording.blocks() if block.temperature is not None and len(block.temperature)]
+    return TemperatureSamples.concatenate(parts) if parts else None

@@ -1,0 +1,122 @@
+"""From a profile of motions to a session of a simulated IMU: in memory, or as a bag with the truth beside its data."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from imu_calibration import documents, files
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import InputError
+from imu_calibration.reference.table import Table
+from imu_calibration.resources import config_file
+from imu_calibration.samples import SampleBlock
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
+from imu_calibration.simulation.session import simulate as run_session
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A session of a simulated IMU on a table."""
+
+    samples: SampleBlock
+    """What an IMU, the joints and perhaps a thermometer gave: can be calibrated, compensated and diagnosed as it is."""
+    table: Table
+    """The table as its description says."""
+    truth: Calibration
+    """The true parameters."""
+    duration: float
+    """Length, s."""
+
+    def save(self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none') -> None:
+        """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
+        from msg_adapters.write import write_session
+        samples, packed = self.samples, {} if compression == 'none' else {'compression': compression}
+        write_session(path, samples.imu, samples.joints, samples.temperature, storage=storage, **packed)
+        files.write_text(Path(path) / 'truth.yaml', calibration_to_text(self.truth))
+        files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
+
+    def __repr__(self):
+        return f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu, {len(self.samples.joints)} JointState>'
+
+
+def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | None = None, calibration: str | PathLike | Calibration | None = None,
+             effects: Sequence[str] = (), size: float = 0.3, grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None,
+             duration: float | None = None, imu_rate: float = 100.0, joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0,
+             stamp_jitter_us: float = 0.0, temperature: bool = False) -> Simulated:
+    """
+    Simulate a session on a turntable.
+
+    Parameters
+    ----------
+    profile : str
+        Motion, see `simulation.profiles`.
+    table : path-like or Table, optional
+        Default a table with three axes.
+    calibration : path-like or Calibration, optional
+        The true IMU, table and clock; default a random IMU of the grade.
+    effects : sequence of str
+        Effects of the catalogue to add, at `size` as a share of the largest plausible one.
+    grade : str
+        Grade of noise and of the random IMU.
+    seed, imu_seed : int
+        Of noise and motion, and of the IMU itself: two sessions of one IMU share it.
+    duration : float, optional
+        Wanted length, s.
+    imu_rate, joint_rate : float
+        Samples per second.
+    encoder_resolution_deg, stamp_jitter_us : float
+        Step of the joint positions, deg; standard deviation of the IMU stamps, microseconds.
+    temperature : bool
+        Whether there is a temperature, which warms up from 25 C; thermal effects bring it too.
+
+    Raises
+    ------
+    InputError
+        When a name is unknown, or table, profile and calibration do not fit together.
+
+    """
+    if isinstance(table, (str, PathLike)) or table is None:
+        table = files.read_table(table or config_file('table_three_axis.yaml'))
+    motion = make_profile(profile, seed, table, duration)
+    table = table if motion.table is None else Table.from_mapping(motion.table)
+    model, values = _truth(table, calibration, grade, seed if imu_seed is None else imu_seed)
+    for name in effects:
+        model, values = _with_effect(model, values, name, *hidden_effect(name, table.joint_names, seed, size))
+    warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
+    noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
+    options = SimulationOptions(imu_rate, joint_rate, noise, temperature_start_c=25.0 if warm else None)
+    samples = SampleBlock(*run_session(model, values, table, motion, options, seed))
+    truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), options.frame_id,
+                        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': seed, 'profile': profile}})
+    return Simulated(samples, table, truth, motion.duration)
+
+
+def _truth(table, calibration, grade, seed):
+    """Return (model, values) of the true IMU."""
+    names = table.joint_names
+    if calibration is None:
+        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=names)
+        return model, random_values(model, grade, seed)
+    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    if known.model.reference and set(known.model.joint_names) != set(names):
+        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {', '.join(known.model.joint_names)}; "
+                         'give the table it was made with', key='table')
+    return known.model, known.values
+
+
+def _with_effect(model, values, name, sensor, hidden):
+    """Return (model, values) with one more effect, whose values are `hidden`."""
+    wider = model.with_effect(sensor, name)
+    extended = wider.start()
+    for effect in model.effects:
+        extended[wider.slices[effect.sensor, effect.name]] = values[model.slices[effect.sensor, effect.name]]
+    extended[wider.slices[sensor, name]] = hidden
+    return replace(wider, point={}), extended
