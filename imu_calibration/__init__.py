@@ -51,7 +51,7 @@ From the ground up; each package imports only what stands above it. The words ar
 `preflight`       what looks wrong with a recording before anything is estimated
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
-`selection`       which windows take part in choosing a model, and which judge it
+`selection`       which effects the evidence of a recording asks for, proven on windows that are held out
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
 `by_hand`         calibration without a table; the arm between two IMUs
