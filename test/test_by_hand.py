@@ -10,7 +10,7 @@ from imu_calibration.by_hand.model import unpack
 from imu_calibration.by_hand.poses import g_sensitivity_evidence
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.variance_components import estimate_scatter
+from imu_calibration.estimation.variance_components import estimate_group_variances
 from imu_calibration.samples import ImuSamples, NominalScaling
 from imu_calibration.segmentation.static_detector import find_still
 
@@ -112,7 +112,7 @@ def test_scatter_is_found_beside_the_noise():
     noise, group = rng.uniform(0.5, 1.5, 4000), np.repeat([0, 1, -1, 0], 1000)
     design = rng.normal(size=(4000, 5))
     error = rng.normal(size=4000) * np.sqrt(noise + np.array([2.0, 0.0, 0.0])[group])
-    found = estimate_scatter(design, design @ np.ones(5) + error, noise, group, np.array([1.0, 1.0]), np.array([9.0, 9.0]))
+    found = estimate_group_variances(design, design @ np.ones(5) + error, noise, group, start=np.array([1.0, 1.0]), fallback=np.array([9.0, 9.0]))
     assert abs(found.variance[0] - 2.0) < 4 * 3.0 * np.sqrt(2 / 2000)
     assert found.variance[1] < 0.2
     assert 1900 < found.dof[0] < 2100

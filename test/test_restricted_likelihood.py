@@ -122,3 +122,25 @@ def test_a_variance_from_few_data_is_taken_larger():
     assert dof_factor(1e9) == pytest.approx(1.0)
     assert dof_factor(6) == pytest.approx(1.5)
     assert dof_factor(2) == dof_factor(1) == 3.0
+
+
+def test_scoring_is_the_derivative_of_the_likelihood(rows):
+    """The score against central differences, its covariance over many draws against the information (to the scatter of 4000 draws)."""
+    values, times, _, sessions = rows
+    group = np.arange(60) % 3
+    members, noise = np.array([group == k for k in range(3)], float), np.full(60, 0.3)
+    likelihood = RestrictedLikelihood(values, times, sessions)
+
+    def variance(extra):
+        return (noise + extra[group]).reshape(20, 3)
+
+    at, step = np.array([0.5, 1.0, 2.0]), 1e-5 * np.eye(3)
+    score, information = likelihood.scoring(variance(at), members)
+    slopes = [-0.5 * (likelihood(variance(at + h)) - likelihood(variance(at - h))) / 2e-5 for h in step]
+    np.testing.assert_allclose(score, slopes, rtol=1e-5)
+    rng, scores = np.random.default_rng(1), []
+    for _ in range(4000):
+        drawn = values.copy()
+        drawn[:, :, -1] = rng.normal(size=(20, 3)) * np.sqrt(variance(at))
+        scores.append(RestrictedLikelihood(drawn, times, sessions).scoring(variance(at), members)[0])
+    np.testing.assert_allclose(np.cov(np.array(scores).T), information, rtol=0.12, atol=0.03 * information.max())

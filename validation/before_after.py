@@ -96,6 +96,8 @@ def run(root, chosen, results):
                 options.run(options)
         except ImuCalibrationError as error:
             said = str(error)
+        except Exception as error:   # noqa: B902 - one broken case must not cost the others
+            said = f'BROKEN {error!r}'
         finally:
             sys.stdout = shown
         (folder / 'said').write_text(said)

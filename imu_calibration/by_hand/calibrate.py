@@ -7,7 +7,14 @@ import numpy as np
 from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
-from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes, g_sensitivity_evidence, known_turn_data
+from imu_calibration.by_hand.poses import (
+    average_poses,
+    collect_turns,
+    distinct_attitudes,
+    g_sensitivity_evidence,
+    known_turn_data,
+    noise_statistics,
+)
 from imu_calibration.by_hand.solver import solve_joint
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import SensorModel
@@ -193,15 +200,15 @@ class HandData:
 def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), temperature_c=None):
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
-    poses, noise = average_poses(imu, _as_ranges(imu, stills), temperature_c)
+    poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
-    turns, dropped = collect_turns(time, imu, poses, noise, settings, temperature_c)
-    turns += [known_turn_data(time, imu, turn, noise, settings, temperature_c) for turn in known_turns]
-    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise})
+    turns, dropped = collect_turns(time, imu, poses, settings, temperature_c)
+    turns += [known_turn_data(time, imu, turn, poses, settings, temperature_c) for turn in known_turns]
+    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
 
 
 def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None,
@@ -213,7 +220,7 @@ def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, toler
     model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c, point=point or {}), gravity)
     _check_temperature(model, poses)
     for _ in range(PASSES):
-        found = solve_joint(model, poses, turns, gravity_sd, fallback)
+        found = solve_joint(model, poses, turns, gravity_sd=gravity_sd, fallback=fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
         if settled:
             break

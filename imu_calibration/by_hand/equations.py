@@ -1,11 +1,12 @@
 """The equations of a calibration by hand: poses at rest, turns between them, and full turns of known angle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, LOWER, unpack
 from imu_calibration.by_hand.preintegration import integrate_turn, small_rotation
+from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.reference.reference_motion import skew
 
 COMPONENTS = ('pose', 'drift', 'turn')
@@ -38,6 +39,10 @@ class Poses:
     """Middle of each interval, seconds since the first sample, shape (k,)."""
     temperature_c: np.ndarray | None = None
     """Mean temperature, shape (k,), when it was recorded."""
+    noise: dict[str, NoiseModel] = field(default_factory=dict)
+    """Sensor -> noise within the intervals."""
+    period: float = 0.0
+    """Time from sample to sample, s."""
 
 
 @dataclass(frozen=True, eq=False)

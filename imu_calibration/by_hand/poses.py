@@ -1,35 +1,46 @@
 """From samples to the data of a calibration by hand: means over the poses held still, and the turns between them."""
 
+from typing import Sequence
+
 import numpy as np
 from scipy.special import fdtrc
 
 from imu_calibration.by_hand.equations import Poses, TurnData
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.samples import ImuSamples
 
 
-def average_poses(imu, ranges, temperature_c=None):
+def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None) -> Poses:
     """
-    Return (Poses, noise): means over the intervals, with the sd that the noise within them leaves.
+    Return the means over the intervals, with the sd that the noise within them leaves.
 
     `temperature_c` is that of the samples, shape (n,), when it was recorded.
 
     The noise need not be white: means of pieces of half a second or more say by how much sums of samples scatter beyond it.
     """
-    force = [imu.force_s[a:b] for a, b in ranges]
-    rate = [imu.rate_s[a:b] for a, b in ranges]
-    count = np.array([len(f) for f in force], float)[:, None]
-    force_sd, force_colour = _pooled_noise(force)
-    rate_sd, rate_colour = _pooled_noise(rate)
+    parts = {'accelerometer': [imu.force_s[a:b] for a, b in ranges], 'gyroscope': [imu.rate_s[a:b] for a, b in ranges]}
+    noise = {sensor: _pooled_noise(part) for sensor, part in parts.items()}
+    count, kinds = np.array([b - a for a, b in ranges]), ['static'] * len(ranges)
+    means = [np.array([part.mean(0) for part in parts[sensor]]) for sensor in SENSORS]
+    sems = [np.sqrt(noise[sensor].mean_variance(kinds, count)) for sensor in SENSORS]
     start, stop = np.array(ranges).T
-    poses = Poses(np.array([f.mean(0) for f in force]), np.array([w.mean(0) for w in rate]), force_sd * force_colour / np.sqrt(count),
-                  rate_sd * rate_colour / np.sqrt(count), start, stop, 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0]),
-                  None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges]))
-    period = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
-    return poses, {'force_noise_sd': force_sd.tolist(), 'rate_noise_sd': rate_sd.tolist(), 'force_noise_colour': force_colour.tolist(),
-                   'rate_noise_colour': rate_colour.tolist(), 'period': period}
+    time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
+    warm = None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
+    return Poses(*means, *sems, start, stop, time, warm, noise, float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+
+
+def noise_statistics(poses: Poses) -> dict:
+    """Return the noise within the intervals as plain numbers."""
+    found = {}
+    for sensor, name in zip(SENSORS, ('force', 'rate')):
+        noise = poses.noise[sensor]
+        found |= {f'{name}_noise_sd': noise.white_sd.tolist(), f'{name}_noise_colour': np.sqrt(noise.inflation).tolist()}
+    return found | {'period': poses.period}
 
 
 def _pooled_noise(parts, pieces=8):
-    """Return (sd of single samples, factor by which means of pieces scatter more than white noise), each shape (3,)."""
+    """Return the NoiseModel of samples, from the median of the intervals and from how much means of pieces scatter more than white noise."""
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
     within = np.sqrt(np.median([p.var(0, ddof=1) for p in parts], axis=0)) + floor
     ratios = []
@@ -40,9 +51,9 @@ def _pooled_noise(parts, pieces=8):
             # differences of neighbours: a slow drift belongs to the scatter between poses, not here
             ratios.append(0.5 * np.mean(np.diff(means, axis=0)**2, axis=0) * length / within**2)
     if not ratios:
-        return within, np.ones(3)
+        return NoiseModel(within**2, np.ones(3))
     ratio, margin = np.mean(ratios, axis=0), 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
-    return within, np.sqrt(np.where(ratio > 1 + margin, ratio, 1.0))
+    return NoiseModel(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
 def distinct_attitudes(force, apart):
@@ -54,10 +65,10 @@ def distinct_attitudes(force, apart):
     return len(kept)
 
 
-def collect_turns(time, imu, poses, noise, settings, temperature_c=None):
+def collect_turns(time, imu, poses, settings, temperature_c=None):
     """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
-    limit = max(settings.gap, 5 * noise['period'])
+    limit = max(settings.gap, 5 * poses.period)
     extreme = np.max(np.abs(rate), axis=0)
     for first in range(len(poses.start) - 1):
         piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
@@ -65,7 +76,7 @@ def collect_turns(time, imu, poses, noise, settings, temperature_c=None):
         if reason:
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
-        density = np.mean((np.array(noise['rate_noise_sd']) * noise['rate_noise_colour'])**2) * noise['period']
+        density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
         turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
                               temperature_c=None if temperature_c is None else temperature_c[piece]))
     return turns, dropped
@@ -82,13 +93,13 @@ def _unusable(time, rate, extreme, gap, longest):
     return ''
 
 
-def known_turn_data(time, imu, turn, noise, settings, temperature_c=None):
+def known_turn_data(time, imu, turn, poses, settings, temperature_c=None):
     """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
     cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
     piece = slice(turn.start, turn.stop)
-    density = np.mean(np.square(noise['rate_noise_sd'])) * noise['period']
+    density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
     noise_variance = density * (time[piece][-1] - time[piece][0])
     return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
                     rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.by_hand.equations import State, build_system, moved
-from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, unpack
-from imu_calibration.estimation.variance_components import Scatter, estimate_scatter
+from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, HandModel, unpack
+from imu_calibration.estimation.scaled_solve import covariance_with_held
+from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
 
 ITERATIONS = 15
 """Gauss-Newton steps at most; four to six are usual."""
@@ -25,7 +26,7 @@ class Solution:
     """Covariance of the parameters, shape (n, n)."""
     held: np.ndarray
     """True where the prior's value was kept, shape (n,)."""
-    scatter: Scatter
+    scatter: GroupVariances
     """Scatter of poses, drifts and turns beyond the noise."""
     factor: np.ndarray
     """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (n, n)."""
@@ -33,7 +34,7 @@ class Solution:
     """Gauss-Newton steps taken."""
 
 
-def solve_joint(model, poses, turns, gravity_sd, fallback):
+def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float, fallback: np.ndarray) -> Solution:
     """
     Estimate all parameters from poses and turns.
 
@@ -62,11 +63,11 @@ def solve_joint(model, poses, turns, gravity_sd, fallback):
     start = np.maximum(scatter.variance, 0.01 * fallback)
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
-    cov = _covariance(factor, ~held, held, priors, state.values, gravity_sd / model.gravity)
+    cov = covariance_with_held(factor, ~held, held, priors) + _of_gravity(state.values, gravity_sd / model.gravity)
     return Solution(state, cov, held, scatter, factor, steps + more)
 
 
-def choose_held(factor, priors):
+def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:
     """
     Return which parameters the data say next to nothing about, shape (n,).
 
@@ -112,7 +113,7 @@ def _first_state(model, poses):
 def _iterate(model, state, poses, turns, free, priors, variance, fallback, memory):
     """Repeat steps and scatter estimates until neither moves."""
     count = len(poses.start)
-    scatter = Scatter(np.array(variance, float), np.full(len(fallback), np.inf), np.full(len(fallback), np.nan))
+    scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf))
     for number in range(1, ITERATIONS + 1):
         system = build_system(model, state, poses, turns, memory)
         design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),
@@ -122,7 +123,7 @@ def _iterate(model, state, poses, turns, free, priors, variance, fallback, memor
         group = np.concatenate([system.component, np.full(free.sum(), -1)])
         before = scatter.variance
         if number > 2:  # the first steps leave errors of linearisation that are not scatter
-            scatter = estimate_scatter(design, residual, noise, group, scatter.variance, fallback)
+            scatter = estimate_group_variances(design, residual, noise, group, start=scatter.variance, fallback=fallback)
         root = np.sqrt(scatter.total(noise, group))
         orthogonal, factor = np.linalg.qr(design / root[:, None])
         reduced = scipy.linalg.solve_triangular(factor, orthogonal.T @ (residual / root))
@@ -143,16 +144,8 @@ def _factor(model, state, poses, turns, scatter, memory):
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]
 
 
-def _covariance(factor, free, held, priors, values, gravity_ratio):
-    """Covariance of all parameters; those held bring their prior into the others."""
-    cov = np.zeros((len(priors), len(priors)))
-    root = np.linalg.qr(factor[:, free], mode='r')
-    inverse = scipy.linalg.solve_triangular(root, np.eye(len(root)))
-    influence = np.zeros((len(priors), held.sum()))
-    influence[held] = np.eye(held.sum())
-    influence[free] = -np.linalg.lstsq(factor[:, free], factor[:, held], rcond=None)[0]
-    cov[np.ix_(free, free)] = inverse @ inverse.T
-    cov += influence @ np.diag(priors[held]**2) @ influence.T
-    common = np.zeros(len(priors))
-    common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]  # matrix / gravity is all that poses at rest see
-    return cov + gravity_ratio**2 * np.outer(common, common)
+def _of_gravity(values, relative_sd):
+    """Return what a wrong gravity adds to the covariance: matrix / gravity is all that poses at rest see."""
+    common = np.zeros(len(values))
+    common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]
+    return relative_sd**2 * np.outer(common, common)

@@ -55,8 +55,8 @@ def look_for_poses(imu, windows):
     if not rests:
         return NOTHING
     settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
-    poses, noise = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
-    turns, dropped = collect_turns(seconds, imu, poses, noise, settings)
+    poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
+    turns, dropped = collect_turns(seconds, imu, poses, settings)
     goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
     resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
     return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)

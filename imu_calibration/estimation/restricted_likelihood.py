@@ -42,6 +42,30 @@ class RestrictedLikelihood:
         white = whitening(self._rows).reshape(-1, self._rows.shape[2])
         return whitening.log_determinant, self._information + white.T @ white
 
+    def scoring(self, variance: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return what Fisher scoring asks for about variances that groups of independent rows share.
+
+        Parameters
+        ----------
+        variance : ndarray, shape (n, n_axes)
+            Independent variances of the rows.
+        members : ndarray, shape (n_groups, n n_axes)
+            Which rows belong to each group, as ones and zeros.
+
+        Returns
+        -------
+        tuple
+            First derivative of the log likelihood by the variances, shape (n_groups,), and minus the expected second one, (n_groups, n_groups).
+
+        """
+        white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(-1, self._rows.shape[2])
+        left = np.linalg.qr(white[:, :-1])[0]
+        rest = white[:, -1] - left @ (left.T @ white[:, -1])
+        redundancy = 1 - np.einsum('ij,ij->i', left, left)
+        weighted = members / variance.ravel()
+        return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
+
 
 def profile(normal: np.ndarray, restricted: bool = True) -> float:
     """Return ``y'y - b' A^-1 b``, for the restricted likelihood with ``log|A|``, of the normal matrix ``[[A, b], [b', y'y]]``."""

@@ -106,7 +106,7 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
     baseline = solve_by_hand(poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
     effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
     constants = time_constants(float(poses.time[-1]))
-    blocks, space = build_rows(baseline, data.turns, data.statistics, effects, constants)
+    blocks, space = build_rows(baseline, data.turns, effects, constants)
     report(0.1)
     base = tuple(np.flatnonzero(~_held(baseline)))
     questions = _questions(effects, blocks, space, base, not_testable)

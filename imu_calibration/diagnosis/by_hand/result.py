@@ -1,10 +1,11 @@
 """What a diagnosis by hand hands back besides its findings: solutions, residuals of the poses, and what stays unexplained."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Rest, correlate, slow_explanations, where_most
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 
 
@@ -16,11 +17,10 @@ def as_solution(hand):
     information = np.zeros((len(order), len(order)))
     own = [model.param_names.index(name) for name in hand.model.param_names]
     information[np.ix_(own, own)] = hand.information
-    found, noise, rms, chi2 = hand.statistics, {}, {}, {}
+    noise, rms, chi2 = {}, {}, {}
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
-    for sensor, key, scatter in (('accelerometer', 'force', 'pose'), ('gyroscope', 'rate', 'drift')):
-        white = np.square(found[f'{key}_noise_sd'])
-        noise[sensor] = NoiseModel(white, np.square(found[f'{key}_noise_colour']), found[f'{scatter}_scatter_sd'])
+    for sensor, scatter in (('accelerometer', 'pose'), ('gyroscope', 'drift')):
+        noise[sensor] = replace(hand.poses.noise[sensor], offset_sd=hand.statistics[f'{scatter}_scatter_sd'])
         rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
         chi2[sensor] = {'mean': None}
     return Solution(model, hand.values[order], hand.covariance[np.ix_(order, order)], held, noise, chi2, information, rms)

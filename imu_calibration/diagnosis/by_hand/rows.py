@@ -53,7 +53,7 @@ class HandSpace:
     """Number of parameters."""
 
 
-def build_rows(hand, turns, noise, effects, constants):
+def build_rows(hand, turns, effects, constants):
     """
     Return (blocks, HandSpace).
 
@@ -63,8 +63,6 @@ def build_rows(hand, turns, noise, effects, constants):
         Of the baseline.
     turns : list of TurnData
         Between consecutive poses.
-    noise : dict
-        From `average_poses`.
     effects : sequence of Effect
         That are asked about.
     constants : array
@@ -82,7 +80,7 @@ def build_rows(hand, turns, noise, effects, constants):
                                hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label, tau in sets}
     sensor_of = {label: effect.sensor for effect, label, _ in sets}
     moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
-    blocks = [_norm_block(hand, noise, space, at_rest, sensor_of), _rest_block(hand, noise, space, at_rest, sensor_of)]
+    blocks = [_norm_block(hand, space, at_rest, sensor_of), _rest_block(hand, space, at_rest, sensor_of)]
     gravity_turns = [turn for turn in turns if turn.rotation is None]
     if gravity_turns:
         blocks.append(_turn_block(hand, gravity_turns, space, at_rest, moving))
@@ -100,12 +98,12 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]
 
 
-def _natural(noise, key):
+def _natural(poses, sensor):
     """Return the variance by which every bias moves, shape (3,)."""
-    return NATURAL**2 * np.square(noise[key]) * noise['period']
+    return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
 
 
-def _norm_block(hand, noise, space, at_rest, sensor_of):
+def _norm_block(hand, space, at_rest, sensor_of):
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
     residual, base = hand.model.norm_rows(hand.state.values, poses.force, poses.time, poses.temperature_c)
@@ -116,11 +114,11 @@ def _norm_block(hand, noise, space, at_rest, sensor_of):
         if sensor_of[label] == 'accelerometer':
             rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
     known = np.sum((back * poses.force_sem)**2, axis=1)
-    floor = known + back**2 @ _natural(noise, 'force_noise_sd')
+    floor = known + back**2 @ _natural(poses, 'accelerometer')
     return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
 
 
-def _rest_block(hand, noise, space, at_rest, sensor_of):
+def _rest_block(hand, space, at_rest, sensor_of):
     """Three rows per pose: the rate at rest."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
@@ -133,7 +131,7 @@ def _rest_block(hand, noise, space, at_rest, sensor_of):
         if sensor_of[label] == 'gyroscope':
             rows[:, :, space.parts[label]] = columns
     known = poses.rate_sem**2
-    floor = known + _natural(noise, 'rate_noise_sd')
+    floor = known + _natural(poses, 'gyroscope')
     return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)
 
 

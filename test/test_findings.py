@@ -1,0 +1,70 @@
+"""A chosen effect as a finding: the same words, mates and candidates whether the search ran on a table or by hand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from imu_calibration.diagnosis import diagnose as on_a_table
+from imu_calibration.diagnosis.by_hand import diagnose as by_hand
+from imu_calibration.diagnosis.findings import finding
+from imu_calibration.diagnosis.sentences import candidates_of
+from imu_calibration.effects.catalogue import find_effect
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import Score
+
+FIRST, SECOND, MATE, OTHER = (Question(find_effect('accelerometer', name), (k,), 3, name)
+                              for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product')))
+GAIN = Gain('accelerometer', 'samples', 2.0, 1.0, (0.4, 0.6), 5)
+
+
+@dataclass
+class Search:
+    """What a search says of three questions: the mate would do in the place of both findings, a little better in the second's."""
+
+    questions: tuple = (FIRST, SECOND, MATE, OTHER)
+
+    def score(self, chosen, question):
+        size = {FIRST: 90.0, SECOND: 60.0, MATE: 50.0, OTHER: 1.0}[question] / (1 + len(chosen))
+        return Score(question, size, np.exp(-size), True)
+
+    def class_mates(self, chosen, question):
+        return {FIRST: [(MATE, 3.0)], SECOND: [(MATE, 1.0), (OTHER, 7.0)]}[question]
+
+
+@pytest.fixture(scope='module')
+def solution():
+    """Return the solution of a model with both findings."""
+    model = SensorModel(accelerometer=('bias', 'matrix', FIRST.name, SECOND.name))
+    size = len(model.param_names)
+    return Solution(model, np.linspace(0.1, 1.0, size), 1e-4 * np.eye(size), np.zeros(size, bool), {}, {}, np.eye(size), {})
+
+
+def test_an_effect_as_good_as_two_findings_belongs_to_the_first():
+    rows = {row.effect: row for row in candidates_of(Search(), [FIRST, SECOND])}
+    assert rows[MATE.name].verdict == f'as good as {FIRST.name}'
+    assert rows[OTHER.name].verdict == f'as good as {SECOND.name}'
+    assert [rows[q.name].verdict for q in (FIRST, SECOND)] == ['found', 'found']
+
+
+def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(solution):
+    asked = []
+
+    def motion_of(question, mate):
+        asked.append((question, mate))
+        return 'turn it over'
+
+    made = [finding(Search(), [FIRST, SECOND], place, solution, share=lambda named, q: 0.9, gain_of=lambda place: GAIN, motion_of=motion_of)
+            for place in (0, 1)]
+    assert [f.indistinguishable_from for f in made] == [(MATE.name,), (MATE.name, OTHER.name)]
+    assert asked == [(FIRST, MATE), (SECOND, MATE)]
+    assert made[1].heldout_gain == 30.0 and made[1].separating_motion == 'turn it over'
+    assert set(made[1].parameters) == {f'accelerometer.accel_cubic.{axis}' for axis in 'xyz'}
+
+
+def test_both_diagnoses_put_findings_together_in_one_place():
+    assert on_a_table.finding is by_hand.finding is finding
+    assert on_a_table.candidates_of is by_hand.candidates_of is candidates_of
