@@ -32,15 +32,15 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast oracles test-oldest validate config bench soak hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config bench soak hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, oracles, test-oldest, validate, config, bench, soak, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, bench, soak, hide-and-seek, clean'
 
 setup: $(STAMP)
 
-$(STAMP): $(filter-out constraints/validate.txt constraints/oracles.txt,$(wildcard constraints/*.txt)) setup.py setup.cfg
+$(STAMP): $(filter-out $(addprefix constraints/,validate.txt oracles.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -68,6 +68,15 @@ test-fast: $(STAMP)
 # Libraries that some tests compare with; without them these tests are skipped.
 oracles: $(STAMP)
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/oracles.txt
+
+# Unused names and arguments, line length, docstrings, annotations: seconds.
+lint: $(STAMP)-lint
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+
+$(STAMP)-lint: $(STAMP) constraints/lint.txt
+	@$(PIP) --prefer-binary --requirement constraints/lint.txt
+	@touch $@
 
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
 test-oldest:

@@ -10,6 +10,8 @@ MOST_PARTS = 60_000
 """Numbers, texts, lists and mappings in a document at most: reading so many takes half a second."""
 LONGEST = 5000
 """Characters of one text or number at most; a number in base sixty takes time with the square of its length."""
+NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
+"""What the parser raises for dates and numbers that are none."""
 DEEPEST = 20
 """Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
 
@@ -29,7 +31,7 @@ def to_text(document):
     class Dumper(yaml.SafeDumper):
         """Writes lists of scalars on one line and floats with all their digits."""
 
-        def ignore_aliases(self, data):
+        def ignore_aliases(self, _data):
             return True
 
     def sequence(dumper, items):
@@ -59,7 +61,7 @@ def from_text(text, what='document'):
     try:
         _look_through(yaml.parse(text, Loader=loader), what)
         document = yaml.load(text, Loader=loader)
-    except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError) as error:   # the last four: dates and numbers that are none
+    except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
         line = ' '.join(str(error).split())
         raise InputError(f'a {what} must be YAML, this is not: {line}; correct the file') from error
     if not isinstance(document, dict):

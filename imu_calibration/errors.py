@@ -9,7 +9,8 @@ KEYS = {
     'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document', 'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster', 'setting': 'how windows are found',
-    'table': 'the description of the table', 'target_frame': 'the frame to move readings to', 'temperature_topic': 'the topic of the temperature',
+    'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
+    'temperature_topic': 'the topic of the temperature',
 }
 """What an error may ask for."""
 

@@ -1,8 +1,8 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
@@ -12,6 +12,7 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.ros1_file import Ros1File
 from msg_adapters.rosbag2 import Rosbag2
+from msg_adapters.storages import suffixes
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
@@ -22,7 +23,8 @@ BLOCK_SAMPLES = 65536
 """IMU and joint samples per block, about."""
 
 
-class Topic(NamedTuple):
+@dataclass(frozen=True)
+class Topic:
     """One topic of a recording."""
 
     name: str
@@ -185,12 +187,13 @@ def _block(parts, decoders):
 
 def _open_source(path):
     if not path.exists():
-        raise InputError(f'a recording must be a rosbag2 folder, a .db3, .mcap or .bag file, got {path}, which does not exist; '
+        raise InputError(f'a recording must be a rosbag2 folder, a {", ".join(suffixes())} or .bag file, got {path}, which does not exist; '
                          'check the path')
     try:
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
-        raise InputError(f'{path} must be a readable bag (rosbag2 folder, .db3, .mcap or .bag file), got: {" ".join(str(error).split())}; '
+        came = ' '.join(str(error).split())
+        raise InputError(f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file), got: {came}; '
                          'check the path, or record again') from error
 
 

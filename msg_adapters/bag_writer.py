@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.errors import InputError
-from msg_adapters.mcap_writer import McapWriter
-from msg_adapters.sqlite_writer import SqliteWriter
+from msg_adapters.storages import STORAGES, identifiers
 
-STORAGES = {'sqlite3': SqliteWriter, 'mcap': McapWriter}
 ROS_DISTRO = 'jazzy'
 METADATA_VERSION = 9
 
@@ -25,22 +23,22 @@ class BagWriter:
     path : path-like
         The folder to make.
     storage : str
-        'sqlite3' or 'mcap'.
+        What rosbag2 calls one of `storages.STORAGES`.
     options : dict
         Passed to the storage (`compression` of the chunks of an mcap).
 
     """
 
     def __init__(self, path, storage='sqlite3', **options):
-        if storage not in STORAGES:
-            raise InputError(f'the storage of a bag must be {" or ".join(STORAGES)}, got {storage!r}; choose one of these')
+        if storage not in identifiers():
+            raise InputError(f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these')
         self.path = Path(path)
         self.topics, self.counts = {}, Counter()
         self.first_ns, self.last_ns = None, None
-        writer = STORAGES[storage]
-        self.file_name = f'{self.path.name}_0{writer.suffix}'
+        self.kind = STORAGES[identifiers().index(storage)]
+        self.file_name = f'{self.path.name}_0{self.kind.suffix}'
         self.partial = make_partial_folder(self.path)
-        self.storage = writer(self.partial / self.file_name, ROS_DISTRO, **options)
+        self.storage = self.kind.writer(self.partial / self.file_name, ROS_DISTRO, **options)
 
     def add_topic(self, name, definition, qos=()):
         """Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings); return its id."""
@@ -82,7 +80,7 @@ class BagWriter:
         topics = [{'topic_metadata': {'name': name, 'type': definition.type, 'serialization_format': 'cdr', 'offered_qos_profiles': qos,
                                       'type_description_hash': definition.digest},
                    'message_count': self.counts[topic_id]} for topic_id, (name, definition, qos) in self.topics.items()]
-        return {'version': METADATA_VERSION, 'storage_identifier': self.storage.identifier, **times, 'topics_with_message_count': topics,
+        return {'version': METADATA_VERSION, 'storage_identifier': self.kind.identifier, **times, 'topics_with_message_count': topics,
                 'compression_format': '', 'compression_mode': '', 'relative_file_paths': [self.file_name],
                 'files': [{'path': self.file_name, **times}], 'custom_data': None, 'ros_distro': ROS_DISTRO}
 

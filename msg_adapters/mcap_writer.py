@@ -28,10 +28,7 @@ def record(opcode, *parts):
 class McapWriter:
     """Writes one new file; `compression` of the chunks is '', 'zstd' or 'lz4'."""
 
-    identifier = 'mcap'
-    suffix = '.mcap'
-
-    def __init__(self, path, ros_distro, compression=''):
+    def __init__(self, path, _ros_distro, compression=''):
         self.file = open(path, 'xb')
         self.compression, self.compress = compression, compressor(compression)
         self.file.write(MAGIC + record(0x01, text('ros2'), text('imu_calibration')))
@@ -94,7 +91,7 @@ class McapWriter:
             self.counts[int(channel)] += len(entries)
         return places
 
-    def close(self, metadata_version, metadata):
+    def close(self, _metadata_version, metadata):
         """Write the metadata, the summary and the footer, and close."""
         if self.new_records:
             self.file.write(self.new_records)

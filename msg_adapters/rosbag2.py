@@ -7,11 +7,9 @@ from tempfile import mkdtemp
 
 from msg_adapters.compressed import decompress_file, decompress_message
 from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
-from msg_adapters.mcap_file import McapFile
 from msg_adapters.qos import spelled_out
-from msg_adapters.sqlite_file import SqliteFile
+from msg_adapters.storages import STORAGES, suffixes
 
-FILES = {'.db3': SqliteFile, '.mcap': McapFile}
 COMPRESSED = ('.zstd', '.zst')
 
 
@@ -41,7 +39,7 @@ class Rosbag2:
         try:
             errors = [self._open(path, decompress_message if by_message else None) for path in self._storage_paths()]
             if not self.files:
-                raise ValueError('; '.join(filter(None, errors)) or 'there is no .db3 or .mcap file')
+                raise ValueError('; '.join(filter(None, errors)) or f'there is no {" or ".join(suffixes())} file')
             self.types = {name: kind for file in self.files for name, kind in file.types.items()}
             self.definitions = {name: text for file in self.files for name, text in file.definitions.items()}
             self.counts = self._counts()
@@ -67,8 +65,8 @@ class Rosbag2:
 
     @property
     def storage(self):
-        """'sqlite3' or 'mcap'."""
-        return 'mcap' if isinstance(self.files[0], McapFile) else 'sqlite3'
+        """What rosbag2 calls the storage of the first file."""
+        return next(storage.identifier for storage in STORAGES if isinstance(self.files[0], storage.reader))
 
     def definition(self, topic):
         """Return the TypeDefinition of a topic; the standard one where the bag has none."""
@@ -119,16 +117,17 @@ class Rosbag2:
             return [self.path]
         if self.metadata.get('relative_file_paths'):
             return [self.path / PurePath(name).name for name in self.metadata['relative_file_paths']]
-        return sorted((path for path in self.path.iterdir() if _storage_suffix(path) in FILES), key=_natural)
+        return sorted((path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()), key=_natural)
 
     def _open(self, path, unpack):
         """Open one storage file; return the error when that fails."""
         try:
-            opened = FILES.get(_storage_suffix(path))
-            if opened is None:
-                raise ValueError(f'a storage file must end in {", ".join(FILES)}, with {" or ".join(COMPRESSED)} behind it when compressed')
+            reader = next((storage.reader for storage in STORAGES if storage.suffix == _storage_suffix(path)), None)
+            if reader is None:
+                raise ValueError(f'a storage file must end in {", ".join(suffixes())}, with {" or ".join(COMPRESSED)} behind it when '
+                                 'compressed')
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
-            self.files.append(opened(plain, unpack))
+            self.files.append(reader(plain, unpack))
             self._lost.update(self.files[-1].lost)
         except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not cost the others
             self._lost[f'file {path.name} that cannot be read ({error})'] = 1

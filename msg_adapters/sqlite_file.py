@@ -81,7 +81,7 @@ class SqliteFile(StorageFile):
         """Close the file."""
         self.connection.close()
 
-    def _stretches(self, topics):
+    def _stretches(self, _topics):
         root = self._root()
         if root is None:
             yield from self._rows_by_sql()

@@ -16,9 +16,6 @@ SCHEMA = (
 class SqliteWriter:
     """Writes one new file; nothing else may open it before `close`."""
 
-    identifier = 'sqlite3'
-    suffix = '.db3'
-
     def __init__(self, path, ros_distro):
         self.connection = sqlite3.connect(path, isolation_level=None)
         # The file is made under another name and thrown away on failure: a journal would protect nothing.

@@ -1,5 +1,6 @@
 """What the readers of storage files have in common: from stretches of rows to messages by topic."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,9 @@ class Stretch(NamedTuple):
 
     topic_ids: np.ndarray
     """The file's own numbers of topics, shape (n,)."""
-    pack: callable
+    pack: Callable
     """Index array -> (index array, Packed): rows that turn out unreadable are left out."""
-    received_ns: callable
+    received_ns: Callable
     """Index array -> receive times, int64."""
 
 

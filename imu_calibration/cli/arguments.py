@@ -1,6 +1,7 @@
 """Arguments that every verb on recordings shares, and the choices that they make."""
 
 from argparse import ArgumentParser, Namespace
+from typing import cast
 
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import describe
@@ -32,4 +33,4 @@ def add_model_arguments(parser: ArgumentParser) -> None:
 
 def choices_of(options: Namespace) -> Choices:
     """Return the choices that parsed arguments make."""
-    return {name: value for name, value in vars(options).items() if name in Choices.__annotations__}
+    return cast(Choices, {name: value for name, value in vars(options).items() if name in Choices.__annotations__})

@@ -26,7 +26,8 @@ def add_arguments(parser):
 
 def run(options):
     """Compensate into a new bag, print what was noticed, return the exit code."""
-    names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'correct_stamps', 'imu_topic', 'temperature_topic')
+    names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'correct_stamps', 'imu_topic',
+             'temperature_topic')
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:
         print(f'note: {line}')

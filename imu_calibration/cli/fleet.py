@@ -12,7 +12,8 @@ def add_arguments(parser):
     """Declare the arguments."""
     parser.add_argument('folder', metavar='FOLDER', help='folder that holds one bag, or one sub-folder with bags, per unit')
     parser.add_argument('--table', metavar='TABLE', required=True, help='table description (YAML)')
-    parser.add_argument('--output', metavar='DIR', required=True, help='folder for one result per unit, summary.csv, units.csv and summary.html')
+    parser.add_argument('--output', metavar='DIR', required=True,
+                        help='folder for one result per unit, summary.csv, units.csv and summary.html')
     parser.add_argument('--jobs', type=int, help='units calibrated side by side, default one per processor')
     parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
     parser.add_argument('--no-report', action='store_true', help='no report.html per unit')

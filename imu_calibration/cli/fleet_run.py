@@ -17,7 +17,8 @@ from imu_calibration.units import for_people, significant, with_sd
 from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.use_cases.progress import progress_bar
 
-HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest', 'highest_unit')
+HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
+            'highest_unit')
 
 
 def run_fleet(options, table, settings):
@@ -79,7 +80,8 @@ def shown(spread):
     mean, sd = with_sd(spread.mean * factor, spread.typical_sd * factor)
     if spread.count == 1:
         return spread.name, mean, '', sd, unit, '', spread.lowest[1]
-    return (spread.name, mean, significant(spread.spread * factor), sd, unit, significant(spread.ratio), f'{spread.lowest[1]} .. {spread.highest[1]}')
+    return (spread.name, mean, significant(spread.spread * factor), sd, unit, significant(spread.ratio),
+            f'{spread.lowest[1]} .. {spread.highest[1]}')
 
 
 COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')

@@ -7,8 +7,7 @@ from imu_calibration.calibration.fleet import Unit
 from imu_calibration.errors import InputError
 from imu_calibration.use_cases.choices import kept, topics_of
 from imu_calibration.use_cases.recordings import provenance_of, source_of
-
-STORAGE = ('.db3', '.mcap', '.bag')
+from msg_adapters.storages import suffixes
 
 
 def find_units(folder, output):
@@ -49,8 +48,8 @@ def bags_of(path):
 def is_bag(path):
     """Tell whether a path looks like a recording."""
     if not path.is_dir():
-        return path.suffix in STORAGE
-    return (path / 'metadata.yaml').exists() or any(inner.suffix in STORAGE[:2] for inner in path.iterdir())
+        return path.suffix in (*suffixes(), '.bag')
+    return (path / 'metadata.yaml').exists() or any(inner.suffix in suffixes() for inner in path.iterdir())
 
 
 def unit_of(name, paths, choices, joint_names):

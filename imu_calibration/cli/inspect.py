@@ -117,7 +117,8 @@ def _show_topics(out, looks):
             table.add_row(topic.name, topic.type, str(topic.count), style='dim')
         else:
             gaps = f'{found.n_gaps} ({found.gap_total:.2f} s)' if found.n_gaps else 'none'
-            table.add_row(topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps, _step(found.stamp_step_ns), 'read')
+            table.add_row(topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps,
+                          _step(found.stamp_step_ns), 'read')
     out.print(table)
 
 

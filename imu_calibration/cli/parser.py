@@ -21,7 +21,8 @@ class OneLineParser(argparse.ArgumentParser):
 
 def make_parser(verb=None):
     """Return the parser; each verb brings its own arguments. When `verb` is one, only its module is imported, which is faster."""
-    parser = OneLineParser(prog='imu_calibration', description='Calibrate, compensate and diagnose inertial measurement units from recordings.',
+    parser = OneLineParser(prog='imu_calibration',
+                           description='Calibrate, compensate and diagnose inertial measurement units from recordings.',
                            epilog='Exit codes: 0 done; 1 refused, nothing written; 3 written, but some parameters were not determined or '
                                   'part of the input was lost.')
     parser.add_argument('--version', action='version', version=f'imu_calibration {imu_calibration.__version__}')

@@ -3,11 +3,12 @@
 from imu_calibration.simulation.profiles import profile_names
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.simulate import simulate
+from msg_adapters.storages import identifiers
 
 NAME = 'simulate'
 HELP = 'Write a bag from a simulated session on a turntable, and truth.yaml beside its data.'
-NAMES = ('table', 'calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg', 'stamp_jitter_us',
-         'temperature')
+NAMES = ('table', 'calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
+         'stamp_jitter_us', 'temperature')
 """Options that are arguments of `simulate` by the same name."""
 
 
@@ -17,7 +18,8 @@ def add_arguments(parser):
     parser.add_argument('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
     parser.add_argument('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
     parser.add_argument('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
-    parser.add_argument('--size', type=float, default=0.3, help='size of added effects as a share of the largest plausible one, default 0.3')
+    parser.add_argument('--size', type=float, default=0.3,
+                        help='size of added effects as a share of the largest plausible one, default 0.3')
     parser.add_argument('--profile', metavar='NAME', default='calibration', help='motion: ' + ', '.join(profile_names()))
     parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     parser.add_argument('--seed', type=int, default=0, help='seed of noise and motion, default 0')
@@ -26,9 +28,10 @@ def add_arguments(parser):
     parser.add_argument('--imu-rate', type=float, default=100.0, help='Hz, default 100')
     parser.add_argument('--joint-rate', type=float, default=100.0, help='Hz, default 100')
     parser.add_argument('--encoder-resolution-deg', type=float, default=0.0, help='step of the joint positions, deg, default none')
-    parser.add_argument('--stamp-jitter-us', type=float, default=0.0, help='standard deviation of the IMU stamps, microseconds, default none')
+    parser.add_argument('--stamp-jitter-us', type=float, default=0.0,
+                        help='standard deviation of the IMU stamps, microseconds, default none')
     parser.add_argument('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
-    parser.add_argument('--storage', choices=('sqlite3', 'mcap'), default='sqlite3')
+    parser.add_argument('--storage', choices=identifiers(), default='sqlite3')
     parser.add_argument('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 

@@ -14,6 +14,7 @@ from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping
+from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import parse_effects
 from imu_calibration.preflight.checks import Preflight
@@ -25,8 +26,8 @@ from imu_calibration.units import for_people, significant
 class DiagnosisResult:
     """A diagnosis with everything that is written and shown."""
 
-    diagnosis: object
-    """The Diagnosis."""
+    diagnosis: Diagnosis
+    """What was found."""
     calibration: Calibration
     """The extended calibration; the baseline's when nothing was found."""
     solution: object

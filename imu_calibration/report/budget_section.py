@@ -16,8 +16,10 @@ LOWEST = 1e-5
 def budget_section(result):
     """Return the figure, the rows (largest component of each effect) and what was assumed."""
     budget = error_budget(result)
-    return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget), 'Error budget of each effect by cause, in tolerances'),
-            'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes], 'rows': _rows(result, budget)}
+    return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget),
+                           'Error budget of each effect by cause, in tolerances'),
+            'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],
+            'rows': _rows(result, budget)}
 
 
 def _effects(result):

@@ -30,11 +30,11 @@ def calibration_report(result):
     errors = window_errors(result)
     at_rest, moving = reading_tables(result, errors)
     navigation = navigation_section(result, errors)
-    return render('calibration.html', title='IMU calibration', verdict=judge(result.calibration, result.tolerances), facts=recording_facts(result),
-                  tiles=tiles(result, errors, navigation), groups=parameter_groups(result), sample=worked_sample(result), derived=derived_section(result),
-                  residuals=residual_section(result, errors), observability=observability_section(result), levers=lever_section(result),
-                  navigation=navigation, at_rest=at_rest, moving=moving, budget=budget_section(result), origin=origin_section(result),
-                  by_hand=result.table is None)
+    return render('calibration.html', title='IMU calibration', verdict=judge(result.calibration, result.tolerances),
+                  facts=recording_facts(result), tiles=tiles(result, errors, navigation), groups=parameter_groups(result),
+                  sample=worked_sample(result), derived=derived_section(result), residuals=residual_section(result, errors),
+                  observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
+                  moving=moving, budget=budget_section(result), origin=origin_section(result), by_hand=result.table is None)
 
 
 def tiles(result, errors, navigation):
@@ -47,7 +47,8 @@ def tiles(result, errors, navigation):
         found.append(_tile(f'{sensor} error', after, before, f'rms of {len(errors.time)} window means'))
     if navigation['rest']:
         after, before = navigation['rest']['position'][::-1]
-        found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m', f"of it, from the calibration: {navigation['rest']['parts'][0][2]} m"))
+        found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m',
+                           f"of it, from the calibration: {navigation['rest']['parts'][0][2]} m"))
     return found
 
 

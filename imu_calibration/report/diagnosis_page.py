@@ -31,11 +31,12 @@ def diagnosis_report(result):
     rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
     by_hand = result.table is None
     word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
-    return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests), lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
+    return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests),
+                  lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
-                  traces=draw_over_time(result),
-                  candidates=[_candidate(row) for row in diagnosis.candidates], rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
-                  not_testable=list(diagnosis.not_testable), groups=parameter_groups(result), by_hand=by_hand, windows=diagnosis.windows, locked=diagnosis.locked,
+                  traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
+                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], not_testable=list(diagnosis.not_testable),
+                  groups=parameter_groups(result), by_hand=by_hand, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
 
 
@@ -48,20 +49,27 @@ def _headline(diagnosis, rests):
 
 
 def _reasons(diagnosis, rests):
-    lines = [(in_type(finding.explanation), 'the extended calibration.yaml contains it' if not finding.indistinguishable_from else
-              f'this recording cannot tell it from {", ".join(n.replace("_", " ") for n in finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
-             for finding in diagnosis.findings]
+    lines = [(in_type(finding.explanation), _next_step(finding)) for finding in diagnosis.findings]
     if not lines and not rests:
         lines = [(f'No effect of the {len(diagnosis.candidates)} that were asked about explains more than noise does.', '')]
     for sensor, rest in rests:
         more = f', and it goes with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{in_unit(rest.rms, UNIT[sensor])} rms of the {sensor} are unexplained{more}' + (f'; {rest.where}' if rest.where else '') + '.',
+        lines.append((f'{in_unit(rest.rms, UNIT[sensor])} rms of the {sensor} are unexplained{more}'
+                      + (f'; {rest.where}' if rest.where else '') + '.',
                       'look there: a knock, a slip in the fixture, or a cause that the catalogue does not know'))
     return lines
 
 
+def _next_step(finding):
+    if not finding.indistinguishable_from:
+        return 'the extended calibration.yaml contains it'
+    others = ', '.join(name.replace('_', ' ') for name in finding.indistinguishable_from)
+    return f'this recording cannot tell it from {others}; to separate them: {finding.separating_motion}'
+
+
 def _tiles(diagnosis):
-    tiles = [{'what': 'effects asked about', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None, 'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
+    tiles = [{'what': 'effects asked about', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None,
+              'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
     if diagnosis.findings:
         gain = diagnosis.gain
         number, _, unit = in_unit(gain.heldout_rms_after, UNIT[gain.sensor]).partition(' ')
@@ -69,8 +77,9 @@ def _tiles(diagnosis):
                       'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'note': _reduction(gain)})
     navigation = diagnosis.traces.dead_reckoning
     if navigation and diagnosis.findings:
-        tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']), 'unit': 'm',
-                      'before': f'{text(navigation["position_before"])} m', 'note': f'dead reckoning, median of {navigation["stretches"]} stretches'})
+        tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']),
+                      'unit': 'm', 'before': f'{text(navigation["position_before"])} m',
+                      'note': f'dead reckoning, median of {navigation["stretches"]} stretches'})
     return tiles
 
 
@@ -80,12 +89,14 @@ def _reduction(gain):
 
 
 def _finding(diagnosis, finding, number):
-    rows = [{'name': name, 'cells': people(value, sd, unit), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'} for name, (value, sd, unit) in finding.parameters.items()]
+    rows = [{'name': name, 'cells': people(value, sd, unit), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
+            for name, (value, sd, unit) in finding.parameters.items()]
     gain = finding.gain
-    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows, 'p': chance(finding.p_value),
-            'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain),
-            'sensor': gain.sensor, 'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from], 'motion': finding.separating_motion,
-            'figure': draw_finding(diagnosis, finding, number)}
+    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows,
+            'p': chance(finding.p_value), 'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]),
+            'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain), 'sensor': gain.sensor,
+            'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
+            'motion': finding.separating_motion, 'figure': draw_finding(diagnosis, finding, number)}
 
 
 def draw_finding(diagnosis, finding, number):
@@ -100,9 +111,10 @@ def draw_over_time(result):
     return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, over), 'Residuals over time before and after the extension')
 
 
-CAUSES = (('thermal', ('temperature',)), ('drift', ('time',)), ('g_sensitivity', ('force',)), ('rate_product', ('rate',)), ('encoder', ('angle',)),
-          ('axis_non', ('angle',)), ('tilt', ('angle',)), ('accel_quadratic', ('force',)), ('accel_cubic', ('force',)), ('accel_cross', ('force',)),
-          ('accel_scale', ('force',)), ('gyro_quadratic', ('rate',)), ('gyro_scale', ('rate',)))
+CAUSES = (('thermal', ('temperature',)), ('drift', ('time',)), ('g_sensitivity', ('force',)), ('rate_product', ('rate',)),
+          ('encoder', ('angle',)), ('axis_non', ('angle',)), ('tilt', ('angle',)), ('accel_quadratic', ('force',)),
+          ('accel_cubic', ('force',)), ('accel_cross', ('force',)), ('accel_scale', ('force',)), ('gyro_quadratic', ('rate',)),
+          ('gyro_scale', ('rate',)))
 """Part of an effect's name -> variables that are its cause; others are drawn against the effect's own signal."""
 
 
@@ -137,7 +149,8 @@ def cause_of(traces, finding):
     kinds = next((kinds for part, kinds in CAUSES if part in finding.effect), ())
     if len(signal) < FEW:
         kinds = ()  # a mean over bins of so few poses says nothing
-    best = max(((explained_share(values, signal[:, axis]), label, values) for label, (kind, values) in variables(traces).items() if kind in kinds),
+    best = max(((explained_share(values, signal[:, axis]), label, values)
+                for label, (kind, values) in variables(traces).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
     if best[0] < CLEAR:
         factor, unit = for_people(UNIT[sensor])
@@ -208,8 +221,9 @@ class _OverTime:
 
 def _candidate(row):
     return {'effect': row.effect.replace('_', ' '), 'sensor': row.sensor, 'gain': text(row.gain_alone), 'p': chance(row.p_value_alone),
-            'beside': text(row.gain_beside) if row.gain_beside is not None else '', 'p_beside': chance(row.p_value_beside) if row.p_value_beside is not None else '',
-            'verdict': row.verdict, 'mark': row.verdict == 'found'}
+            'beside': text(row.gain_beside) if row.gain_beside is not None else '',
+            'p_beside': chance(row.p_value_beside) if row.p_value_beside is not None else '', 'verdict': row.verdict,
+            'mark': row.verdict == 'found'}
 
 
 def chance(probability):
@@ -223,7 +237,8 @@ def in_type(sentence):
 
 
 def _goes_with(rest):
-    return (rest.correlates_with or '–') + (f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else '')
+    share = f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else ''
+    return (rest.correlates_with or '–') + share
 
 
 def _rest(sensor, rest):

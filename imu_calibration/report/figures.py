@@ -11,13 +11,16 @@ AXIS = {'x': '#c44e1d', 'y': '#2b8a57', 'z': '#2566b0'}
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'static': 'o', 'spin': 's', 'dynamic': '^', 'turn': 's'}
 STYLE = {
-    'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold', 'axes.titlelocation': 'left',
-    'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8, 'axes.spines.top': False, 'axes.spines.right': False,
-    'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID, 'grid.linewidth': 0.8, 'xtick.color': FAINT, 'ytick.color': FAINT,
-    'xtick.labelcolor': GREY, 'ytick.labelcolor': GREY, 'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'text.color': INK, 'legend.frameon': False,
-    'legend.fontsize': 8.5, 'legend.handlelength': 1.4, 'figure.facecolor': 'none', 'axes.facecolor': 'none', 'savefig.facecolor': 'none',
-    'lines.linewidth': 1.5, 'axes.unicode_minus': True, 'axes.formatter.useoffset': False, 'svg.fonttype': 'none', 'path.simplify': True,
+    'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left', 'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8,
+    'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID,
+    'grid.linewidth': 0.8, 'xtick.color': FAINT, 'ytick.color': FAINT, 'xtick.labelcolor': GREY, 'ytick.labelcolor': GREY,
+    'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5,
+    'legend.handlelength': 1.4, 'figure.facecolor': 'none', 'axes.facecolor': 'none', 'savefig.facecolor': 'none', 'lines.linewidth': 1.5,
+    'axes.unicode_minus': True, 'axes.formatter.useoffset': False, 'svg.fonttype': 'none', 'path.simplify': True,
 }
+
+NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
 def draw(name, size, paint, label):
@@ -63,8 +66,8 @@ def _inside(svg, label):
     svg = svg[svg.index('<svg'):]
     svg = re.sub(r'<metadata>.*?</metadata>', '', svg, flags=re.S)
     svg = re.sub(r' id="[A-Za-z0-9.]+_[0-9]+"', '', svg)
-    svg = re.sub(r'<svg [^>]*viewBox="([^"]+)"[^>]*>', rf'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="\1" role="img" aria-label="{label}">',
-                 svg, count=1)
+    head = rf'<svg {NAMESPACES} viewBox="\1" role="img" aria-label="{label}">'
+    svg = re.sub(r'<svg [^>]*viewBox="([^"]+)"[^>]*>', head, svg, count=1)
     svg = re.sub(r'\n\s*', '\n', svg)
     return re.sub(r"font: ([0-9.]+)px[^;\"]*", r'font-size: \1px', svg)
 
@@ -89,5 +92,5 @@ def decade(value):
 def axis_legend(axes, where='upper right', **more):
     """Draw the legend of the three sensor axes."""
     from matplotlib.lines import Line2D
-    axes.legend(handles=[Line2D([], [], color=colour, marker='o', markersize=4, lw=0, label=name) for name, colour in AXIS.items()], loc=where, ncols=3,
-                columnspacing=1.0, handletextpad=0.2, **more)
+    axes.legend(handles=[Line2D([], [], color=colour, marker='o', markersize=4, lw=0, label=name) for name, colour in AXIS.items()],
+                loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)

@@ -20,7 +20,8 @@ def derived_section(result):
 
 def _derived(found, nominal):
     angles = [[' ± '.join(pair(v / DEG, s / DEG)) for v, s in zip(*rows)] for rows in zip(found.angles, found.angles_sd)]
-    between = [('xyz'[i] + '–' + 'xyz'[j], ' ± '.join(pair(v / DEG, s / DEG))) for (i, j), v, s in zip(PAIRS, found.between, found.between_sd)]
+    between = [('xyz'[i] + '–' + 'xyz'[j], ' ± '.join(pair(v / DEG, s / DEG)))
+               for (i, j), v, s in zip(PAIRS, found.between, found.between_sd)]
     lines = [{'what': what, 'unit': unit, 'values': [' ± '.join(pair(v, s)) for v, s in zip(values, sds)]}
              for what, unit, values, sds in in_paper_units(found, nominal)]
     ppm = [fixed((v - 1) * 1e6, decimals(max(s, 1e-12) * 1e6)) for v, s in zip(found.scale, found.scale_sd)]
@@ -33,7 +34,8 @@ def lever_section(result):
         return None
     gauge = result.calibration.gauge.get('origin')
     origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
-    return {'figure': draw('lever-arms', (8.6, 3.15), _Arms(result.calibration), 'Sensitive points of the three accelerometers in three views'), 'origin': origin}
+    return {'figure': draw('lever-arms', (8.6, 3.15), _Arms(result.calibration),
+                           'Sensitive points of the three accelerometers in three views'), 'origin': origin}
 
 
 class _Arms:
@@ -65,4 +67,5 @@ class _Arms:
         ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
         axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
         away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
-        axes.annotate('xyz'[element], (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center', va='center')
+        axes.annotate('xyz'[element], (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center',
+                      va='center')

@@ -43,7 +43,8 @@ def navigation_section(result, errors):
     found = {'rest': None, 'moving': None}
     if before is not None:
         after, parts = expected_growth(result, errors)
-        found['rest'] = _shown('rest', before, after, parts) | {'parts': [(name, *(text(v) for v in part.last())) for name, part in parts.items()]}
+        rows = [(name, *(text(v) for v in part.last())) for name, part in parts.items()]
+        found['rest'] = _shown('rest', before, after, parts) | {'parts': rows}
     if moving is not None:
         found['moving'] = _shown('moving', *moving)
     return found
@@ -51,7 +52,8 @@ def navigation_section(result, errors):
 
 def _shown(name, before, after, parts=None):
     (velocity_before, position_before), (velocity_after, position_after) = before.last(), after.last()
-    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after, parts or {}), 'Growth of velocity and position errors, before and after calibration'),
+    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after, parts or {}),
+                           'Growth of velocity and position errors, before and after calibration'),
             'seconds': text(before.time[-1]), 'runs': len(before.velocity), 'velocity': (text(velocity_before), text(velocity_after)),
             'position': (text(position_before), text(position_after))}
 
@@ -67,7 +69,8 @@ def rest_growth(errors):
         return None
     time = np.linspace(0.0, SECONDS, STEPS)
     before = errors.before
-    return _growth(time, [_rest_run(time, errors.true['accelerometer'][k], before['accelerometer'][k], before['gyroscope'][k]) for k in static])
+    return _growth(time,
+                   [_rest_run(time, errors.true['accelerometer'][k], before['accelerometer'][k], before['gyroscope'][k]) for k in static])
 
 
 def _rest_run(time, force, force_error, rate_error):
@@ -94,7 +97,8 @@ def expected_growth(result, errors):
     scatter = [float(np.max(result.calibration.noise(sensor)[1])) for sensor in ('accelerometer', 'gyroscope')]
     unstable = np.tile([3 * scatter[0]**2, 2 * scatter[1]**2], (len(static), 1))
     density = [d * np.sqrt(n) for d, n in zip(noise_densities(result), (3, 2))]
-    parts = {'parameters': _constant_growth(time, constants, gravity), 'instability of the biases': _constant_growth(time, unstable, gravity),
+    parts = {'parameters': _constant_growth(time, constants, gravity),
+             'instability of the biases': _constant_growth(time, unstable, gravity),
              'noise': Growth(time, np.hypot(density[0] * time**0.5, gravity * density[1] * time**1.5 / np.sqrt(3))[None],
                              np.hypot(density[0] * time**1.5 / np.sqrt(3), gravity * density[1] * time**2.5 / np.sqrt(20))[None])}
     total = Growth(time, *(np.sqrt(sum(getattr(part, name)**2 for part in parts.values())) for name in ('velocity', 'position')))
@@ -123,7 +127,8 @@ def noise_densities(result):
 
 
 def _growth(time, runs):
-    return Growth(time, np.array([np.linalg.norm(run.velocity_n, axis=1) for run in runs]), np.array([np.linalg.norm(run.position_n, axis=1) for run in runs]))
+    return Growth(time, np.array([np.linalg.norm(run.velocity_n, axis=1) for run in runs]),
+                  np.array([np.linalg.norm(run.position_n, axis=1) for run in runs]))
 
 
 def motion_growth(result):
@@ -140,7 +145,8 @@ def motion_growth(result):
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
     grid = np.linspace(0.0, length, STEPS)
-    return tuple(Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position'))) for k in range(2))
+    return tuple(Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position')))
+                 for k in range(2))
 
 
 def _moving_runs(result, window, length):
@@ -148,7 +154,8 @@ def _moving_runs(result, window, length):
     some = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
     time, motion = window.time[some], window.motion.select(some)
     truth = _at_origin(result.calibration, reference_motion(result.table, motion))
-    temperature = np.full(len(time), result.calibration.model.temperature_ref_c) if window.temperature_c is None else window.temperature_c[some]
+    reference_c = result.calibration.model.temperature_ref_c
+    temperature = np.full(len(time), reference_c) if window.temperature_c is None else window.temperature_c[some]
     corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], truth.alpha_s, temperature)
     grid, start = np.linspace(0.0, length, STEPS), truth.mat_sn[0].T
     true = strapdown(time, truth.force_s, truth.rate_s, truth.gravity, start)

@@ -16,7 +16,8 @@ def observability_section(result):
     """Return figures and weak directions."""
     calibration = result.calibration
     live = calibration.sd > 0
-    figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live), 'Standard deviation over tolerance of every parameter'),
+    figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live),
+                            'Standard deviation over tolerance of every parameter'),
                'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), 'Correlation between the parameters')}
     if result.table is not None:
         singular = singular_values(result)
@@ -33,7 +34,8 @@ def singular_values(result):
 
 def directions(calibration):
     """Return the weak directions as rows: members with weights, and the motion that is needed."""
-    return [{'members': [(name, text(weight, 2)) for name, weight in d['parameters'].items()], 'needs': d['needs']} for d in calibration.undetermined]
+    return [{'members': [(name, text(weight, 2)) for name, weight in d['parameters'].items()], 'needs': d['needs']}
+            for d in calibration.undetermined]
 
 
 def strongest(calibration, live, count=5):

@@ -9,14 +9,21 @@ def recording_facts(result):
     """Return (what, value) of the recording, for the head of the page."""
     calibration, conditions = result.calibration, result.calibration.conditions
     bags = calibration.provenance.get('bags') or []
-    facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'), ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
+    facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'),
+             ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
              ('length', _duration(conditions.get('duration_s'))), ('frame', calibration.frame_id or 'not named'),
-             ('reference', 'gravity, by hand' if result.table is None else f'table with {len(result.table.joints)} joints ({", ".join(result.table.joint_names)})')]
+             ('reference', _reference(result.table))]
     if conditions.get('largest_rate'):
         facts.append(('fastest turn', in_unit(conditions['largest_rate'], 'rad/s')))
     if conditions.get('temperature_range_c'):
         facts.append(('temperature', ' to '.join(fixed(t, 1) for t in conditions['temperature_range_c']) + ' °C'))
     return facts
+
+
+def _reference(table):
+    if table is None:
+        return 'gravity, by hand'
+    return f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})'
 
 
 def _duration(seconds):
@@ -29,14 +36,16 @@ def _duration(seconds):
 def origin_section(result):
     """Return the tables of windows, drops, settings, table description and provenance."""
     calibration, statistics = result.calibration, result.calibration.statistics
-    used = [(kind, count, (statistics.get('samples_used') or {}).get(kind, '')) for kind, count in (statistics.get('windows') or {}).items()]
+    used = [(kind, count, (statistics.get('samples_used') or {}).get(kind, ''))
+            for kind, count in (statistics.get('windows') or {}).items()]
     stream = statistics.get('stream') or {}
     kept_out = [(reason, count) for reason, count in stream.items() if reason not in dict(statistics.get('windows') or {}) and count]
     bags = [(bag['name'], bag['sha256']) for bag in calibration.provenance.get('bags') or []]
     return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()),
             'warnings': [found['text'] for found in statistics.get('preflight') or []], 'settings': _settings(result.options),
             'table': _table(result.table), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
-            'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing') for sensor in ('accelerometer', 'gyroscope', 'reference')]}
+            'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing')
+                      for sensor in ('accelerometer', 'gyroscope', 'reference')]}
 
 
 def _settings(options):
@@ -55,7 +64,8 @@ def _table(table):
              ('gravity', f'{fixed(table.gravity_value, 5)} m/s²' + (' as given' if table.gravity is not None else ', WGS 84 normal gravity')
               + (f', sd {text(table.gravity_sd)} m/s²' if table.gravity_sd else ''))]
     rows.append(('place', 'not given: Earth rate is estimated' if table.latitude is None
-                 else f'latitude {text(table.latitude, 5)}°' + (f', azimuth {text(table.azimuth_deg, 4)}°' if table.azimuth_deg is not None else ', azimuth not given')))
+                 else f'latitude {text(table.latitude, 5)}°'
+                 + (f', azimuth {text(table.azimuth_deg, 4)}°' if table.azimuth_deg is not None else ', azimuth not given')))
     rows.append(('mount', f'roll, pitch, yaw ({", ".join(text(a) for a in table.mount_rpy_deg)})°'
                  + ('; place not given' if table.mount_xyz is None else f'; at ({", ".join(text(a) for a in table.mount_xyz)}) m')))
     return rows

@@ -8,10 +8,13 @@ from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
-TITLES = {'bias': 'bias', 'matrix': 'matrix (scale factors and axis directions)', 'accel_size_effect': 'size effect: origin to the sensitive point of each axis',
-          'lever_arm': 'lever arm of the triad (the table’s business)', 'table_tilt': 'table tilt', 'earth_rate': 'Earth rate in the level frame'}
+TITLES = {'bias': 'bias', 'matrix': 'matrix (scale factors and axis directions)',
+          'accel_size_effect': 'size effect: origin to the sensitive point of each axis',
+          'lever_arm': 'lever arm of the triad (the table’s business)', 'table_tilt': 'table tilt',
+          'earth_rate': 'Earth rate in the level frame'}
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
-USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked', 'none': 'belongs to the table or the session, not removed'}
+USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
+       'none': 'belongs to the table or the session, not removed'}
 
 
 def parameter_groups(result):
@@ -22,8 +25,9 @@ def parameter_groups(result):
         part = calibration.model.slices[effect.sensor, effect.name]
         rows = [_row(result, index, effect.unit_of(k), effect.components[k], needs) for k, index in enumerate(range(part.start, part.stop))]
         section = 'reference' if effect.name in IN_REFERENCE else effect.sensor
-        groups.append({'sensor': SENSOR_TITLES[section], 'title': TITLES.get(effect.name, effect.name.replace('_', ' ')), 'name': effect.name,
-                       'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
+        groups.append({'sensor': SENSOR_TITLES[section], 'title': TITLES.get(effect.name, effect.name.replace('_', ' ')),
+                       'name': effect.name, 'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows,
+                       'unit': effect.unit_of(0)})
     return groups
 
 
@@ -67,8 +71,10 @@ def motions_needed(result):
         return {}
     if result.table is None:
         return {name: d['needs'] for d in calibration.undetermined for name in d['parameters']}
-    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, make_prior(result.solution.model).sd)
-    return {name: motion if not np.isfinite(sd) else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'
+    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value,
+                                          make_prior(result.solution.model).sd)
+    return {name: motion if not np.isfinite(sd)
+            else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'
             for name, (motion, sd) in needed.items()}
 
 

@@ -25,7 +25,9 @@ def _lines(readings):
     for first in range(0, len(readings), 3):
         triple = readings[first:first + 3]
         cells = [{'sensor': r.sensor, 'theory': fixed(r.theoretical_g, 5), 'before': fixed(r.before_g, 5), 'after': fixed(r.after_g, 5),
-                  'error_before': text(abs(r.before_g - r.theoretical_g) * 1e3, 3), 'error_after': text(abs(r.after_g - r.theoretical_g) * 1e3, 2),
+                  'error_before': text(abs(r.before_g - r.theoretical_g) * 1e3, 3),
+                  'error_after': text(abs(r.after_g - r.theoretical_g) * 1e3, 2),
                   'gain': text(r.improvement, 2) if np.isfinite(r.improvement) else '–'} for r in triple]
-        lines.append({'position': triple[0].position.replace('-', '−'), 'rate': text(triple[0].rate_deg_s), 'windows': triple[0].n_windows, 'cells': cells})
+        lines.append({'position': triple[0].position.replace('-', '−'), 'rate': text(triple[0].rate_deg_s), 'windows': triple[0].n_windows,
+                      'cells': cells})
     return lines

@@ -18,9 +18,10 @@ KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins
 def residual_section(result, errors):
     """Return figures and tables of the residuals."""
     figures = {sensor: draw_windows(errors, sensor) for sensor in SENSORS}
-    traces = autocorrelation(result) if result.table is not None else {}
-    return {'windows': figures, 'autocorrelation': draw('autocorrelation', (8.6, 2.7), _Lags(traces), 'Autocorrelation of the residuals within moving windows') if traces else None,
-            'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration), 'errors': error_rows(errors)}
+    traces = autocorrelation(result)
+    lags = draw('autocorrelation', (8.6, 2.7), _Lags(traces), 'Autocorrelation of the residuals within moving windows') if traces else None
+    return {'windows': figures, 'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration),
+            'errors': error_rows(errors)}
 
 
 def draw_windows(errors, sensor):
@@ -56,8 +57,8 @@ class _Windows:
         for kind in np.unique(self.errors.kind):
             rows = self.errors.kind == kind
             for column, colour in enumerate(AXIS.values()):
-                axes.plot(self.errors.time[rows], values[rows, column], MARKER.get(kind, 'o'), color=colour, markersize=3.8, mfc='none' if hollow else colour,
-                          mew=0.8, alpha=0.9, ls='none')
+                axes.plot(self.errors.time[rows], values[rows, column], MARKER.get(kind, 'o'), color=colour, markersize=3.8,
+                          mfc='none' if hollow else colour, mew=0.8, alpha=0.9, ls='none')
 
 
 def autocorrelation(result):
@@ -76,7 +77,8 @@ def autocorrelation(result):
     n_lags = max(2, min(int(LAG_SECONDS / period), int(typical) // 2))
     sums = {sensor: np.zeros((n_lags, 3)) for sensor in SENSORS}
     for window in windows:
-        for sensor, measured, predicted in zip(SENSORS, (window.force_s, window.rate_s), predict(model, values, table, window.motion, window.temperature_c)):
+        for sensor, measured, predicted in zip(SENSORS, (window.force_s, window.rate_s),
+                                               predict(model, values, table, window.motion, window.temperature_c)):
             rest = measured - predicted
             sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
     bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
@@ -118,7 +120,8 @@ def noise_rows(calibration):
         white = np.asarray(found.get('noise_sd', [np.nan] * 3), float)
         wander = found.get('wander_sd') or 0.0
         factor, name = for_people(unit)
-        rows.append({'sensor': sensor, 'noise': ', '.join(text(v * factor) for v in white) + f' {name}', 'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
+        rows.append({'sensor': sensor, 'noise': ', '.join(text(v * factor) for v in white) + f' {name}',
+                     'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
                      'between': in_unit(found.get('between_window_sd', 0.0), unit, 2) if found.get('between_window_sd') else 'none seen',
                      'wander': f'{in_unit(wander, unit, 2)} over {text(found.get("wander_time_s"), 2)} s' if wander else 'none seen',
                      'moving': in_unit(found['residual_rms_moving'], unit) if found.get('residual_rms_moving') is not None else '–'})

@@ -73,8 +73,9 @@ def _by_hand(result):
     time = (poses.start + poses.stop) / 2 * duration / max(samples - 1, 1)
     scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]
     zero = np.zeros_like(rate)
-    return WindowErrors(time, np.full(len(force), 'static'), {'accelerometer': force, 'gyroscope': rate}, {'accelerometer': true, 'gyroscope': zero},
-                        {'accelerometer': force - true, 'gyroscope': rate}, {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
+    return WindowErrors(time, np.full(len(force), 'static'), {'accelerometer': force, 'gyroscope': rate},
+                        {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
+                        {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
                         {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
 
 
@@ -95,7 +96,7 @@ def window_residuals(result):
     nominal = narrow.start()
     for sensor in SENSORS:
         means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
-        after, before = coefficients(narrow, sensor, solution.values), coefficients(narrow, sensor, np.where(np.isfinite(nominal), nominal, 0.0))
+        after, before = (coefficients(narrow, sensor, values) for values in (solution.values, np.where(np.isfinite(nominal), nominal, 0.0)))
         found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
                          'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
     return found

@@ -19,10 +19,11 @@ def worked_sample(result):
     inverses = {s: np.linalg.inv(calibration.value(s, 'matrix')) for s in ('accelerometer', 'gyroscope')}
     arms = arms_of(calibration)
     return {
-        'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.value(s, 'bias')], 'unit': unit, 'inverse': [[fixed(v, 7) for v in row] for row in inverses[s]]}
+        'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.value(s, 'bias')], 'unit': unit,
+                      'inverse': [[fixed(v, 7) for v in row] for row in inverses[s]]}
                      for name, s, unit in (('Accelerometer', 'accelerometer', 'm/s²'), ('Gyroscope', 'gyroscope', 'rad/s'))],
-        'arms': [[fixed(v * 1e3, 3) for v in row] for row in arms] if np.any(arms) else None, 'further': further_effects(calibration), 'where': sample.where,
-        'steps': _steps(result, sample, corrected),
+        'arms': [[fixed(v * 1e3, 3) for v in row] for row in arms] if np.any(arms) else None, 'further': further_effects(calibration),
+        'where': sample.where, 'steps': _steps(result, sample, corrected),
         'reference_known': sample.true_force is not None}
 
 
@@ -36,14 +37,16 @@ def _steps(result, sample, corrected):
     turning = lever_matrix(corrected.rate, sample.alpha[None])[0]
     felt = np.einsum('ij,jk,ik->i', calibration.value('accelerometer', 'matrix'), turning, arms)
     plain = not further_effects(calibration)
-    steps = [('raw rate', 'rad/s', sample.rate, ''), ('corrected rate', 'rad/s', corrected.rate[0], 'M⁻¹ (raw − b), gyroscope' if plain else ''),
+    steps = [('raw rate', 'rad/s', sample.rate, ''),
+             ('corrected rate', 'rad/s', corrected.rate[0], 'M⁻¹ (raw − b), gyroscope' if plain else ''),
              ('raw specific force', 'm/s²', sample.force, '')]
     if np.any(arms):
         steps.append(('lever-arm terms u', 'm/s²', felt, 'uᵢ = row i of M · (α × rᵢ + ω × (ω × rᵢ))'))
     how = 'M⁻¹ (raw − b − u), accelerometer' if np.any(arms) else 'M⁻¹ (raw − b), accelerometer'
     steps.append(('corrected specific force', 'm/s²', corrected.force[0], how if plain else ''))
     if sample.true_force is not None:
-        steps += [('the table says: rate', 'rad/s', sample.true_rate, 'the noise of one sample remains'), ('the table says: force', 'm/s²', sample.true_force, '')]
+        steps += [('the table says: rate', 'rad/s', sample.true_rate, 'the noise of one sample remains'),
+                  ('the table says: force', 'm/s²', sample.true_force, '')]
     return [{'what': what, 'unit': unit, 'values': [fixed(v, 5) for v in values], 'how': how, 'mark': what.startswith('corrected')}
             for what, unit, values, how in steps]
 
@@ -59,8 +62,8 @@ def _sample(result):
     else:
         row = result.gathered.accumulator.rows[0]
         force, rate = (row.sensors[s].mean[-3:] for s in ('accelerometer', 'gyroscope'))
-    return SimpleNamespace(force=force, rate=rate, alpha=np.zeros(3), temperature=_reference_temperature(result), true_force=None, true_rate=None,
-                           where='the mean of the first pose at rest')
+    return SimpleNamespace(force=force, rate=rate, alpha=np.zeros(3), temperature=_reference_temperature(result), true_force=None,
+                           true_rate=None, where='the mean of the first pose at rest')
 
 
 def _reference_temperature(result):
@@ -75,6 +78,8 @@ def _moving_sample(result, kept):
     arm = result.calibration.value('accelerometer', 'lever_arm') if result.calibration.has('accelerometer', 'lever_arm') else np.zeros(3)
     true_force = ref.force_s[0] + lever_matrix(ref.rate_s, ref.alpha_s)[0] @ arm
     temperature = _reference_temperature(result) if window.temperature_c is None else window.temperature_c[index:index + 1]
-    where = f'the fastest sample that was kept, at {text(window.time[index], 4)} s, with the table’s angular acceleration α = ({", ".join(fixed(a, 3) for a in ref.alpha_s[0])}) rad/s²'
-    return SimpleNamespace(force=window.force_s[index], rate=window.rate_s[index], alpha=ref.alpha_s[0], temperature=temperature, true_force=true_force,
-                           true_rate=ref.rate_s[0], where=where)
+    alpha = ', '.join(fixed(a, 3) for a in ref.alpha_s[0])
+    where = (f'the fastest sample that was kept, at {text(window.time[index], 4)} s, with the table’s angular acceleration '
+             f'α = ({alpha}) rad/s²')
+    return SimpleNamespace(force=window.force_s[index], rate=window.rate_s[index], alpha=ref.alpha_s[0], temperature=temperature,
+                           true_force=true_force, true_rate=ref.rate_s[0], where=where)

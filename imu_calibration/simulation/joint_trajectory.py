@@ -32,9 +32,7 @@ class JointTrajectory:
         return float(self.time[-1])
 
     def at(self, time):
-        """
-        Return the JointMotion at `time`, shape (m,): before the first point as there at rest, after the last at rest.
-        """
+        """Return the JointMotion at `time`, shape (m,): before the first point as there at rest, after the last at rest."""
         time = np.atleast_1d(np.asarray(time, float))
         inside = np.clip(time, self.time[0], self.time[-1])
         piece = np.clip(np.searchsorted(self.time, inside, side='right') - 1, 0, len(self.time) - 2)

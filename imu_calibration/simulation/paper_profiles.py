@@ -33,7 +33,7 @@ def avrutov_rates_deg(sample):
     return np.stack([rate, np.exp(-rate), rate**2], axis=1)
 
 
-def _equal_angles(builder, rng):
+def _equal_angles(builder, _rng):
     """All gimbals at the same angle, 41 positions (averaging of 30...60 s is shortened; `duration` stretches it)."""
     builder.rest(5.0)
     for angle in EQUAL_ANGLES_DEG:
@@ -41,7 +41,7 @@ def _equal_angles(builder, rng):
         builder.rest(5.0)
 
 
-def _body_rates(builder, rng, sample):
+def _body_rates(builder, _rng, sample):
     """Each row as one turn of the vertical joint: the inner two hold the wanted direction of the rate upright."""
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
@@ -50,7 +50,7 @@ def _body_rates(builder, rng, sample):
         builder.spin([[speed, 0.0, 0.0]], 10.0)
 
 
-def _gimbal_rates(builder, rng, sample):
+def _gimbal_rates(builder, _rng, sample):
     """Each row commanded to the three gimbals (x inner, z outer): the body rates are not the gimbal rates."""
     for x, y, z in avrutov_rates_deg(sample):
         builder.move([0.0, 0.0, 0.0])
@@ -64,7 +64,7 @@ def _six_faces(builder):
         builder.rest(10.0)
 
 
-def _zhang_spins(builder, rng):
+def _zhang_spins(builder, _rng):
     _six_faces(builder)
     for axis in np.eye(3):
         builder.move(pose_deg(axis, np.nan))
@@ -72,14 +72,14 @@ def _zhang_spins(builder, rng):
             builder.spin([[speed, 0.0, 0.0]], 10.0)
 
 
-def _zhang_oscillations(builder, rng):
+def _zhang_oscillations(builder, _rng):
     _six_faces(builder)
     for axis in range(3):
         for amplitude, frequency in ((10.0, 1.0), (5.0, 2.0), (90.0, 0.5)):
             swing(builder, axis, amplitude, frequency, 12.0)
 
 
-def _zhang_mixed(builder, rng):
+def _zhang_mixed(builder, _rng):
     _six_faces(builder)
     for axis in np.eye(3):
         spin_vertical(builder, axis, [200.0], 6.0)
@@ -93,8 +93,8 @@ SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_e
 """A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three sensor axes."""
 
 REGISTRY = {
-    **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn gravity',
-                                    _equal_angles, _table([AXIS[axis] for axis in order], up), 3)
+    **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
+                                    'gravity', _equal_angles, _table([AXIS[axis] for axis in order], up), 3)
        for order in ORDERS for suffix, up in (('', AXIS['Z']), ('_up_x', AXIS['X']), ('_up_y', AXIS['Y']))},
     'avrutov_111': ("the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)", _equal_angles,
                     _table([[1.0, 1.0, 1.0]]), 1),

@@ -153,7 +153,7 @@ def _rings(angle):
     return [[c, s, 0.0], [0.0, c, s], [s, 0.0, c]]
 
 
-def _thermal(builder, rng):
+def _thermal(builder, _rng):
     """The same short round again and again, so that only time and temperature differ between rounds."""
     rest_at_zero(builder, 20.0)
     for turn in range(6):
@@ -167,7 +167,7 @@ def _thermal(builder, rng):
         builder.rest(15.0)
 
 
-def _navigation(builder, rng):
+def _navigation(builder, _rng):
     """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
     builder.rest(10.0)
     tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], [0.3, 1.1, 2.0], 50.0)
@@ -176,7 +176,7 @@ def _navigation(builder, rng):
     builder.rest(5.0)
 
 
-def _tumbling(builder, rng):
+def _tumbling(builder, _rng):
     builder.rest(5.0)
     tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], [0.3, 1.1, 2.0], 60.0)
     builder.rest(5.0)

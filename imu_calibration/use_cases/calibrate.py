@@ -59,10 +59,10 @@ class Calibrated:
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:
         """Write calibration.yaml and, when wanted, report.html into a folder."""
-        text, folder = calibration_to_text(self.calibration), files.make_folder(folder)
+        text, place = calibration_to_text(self.calibration), files.make_folder(folder)
         if report:
-            files.write_text(folder / 'report.html', self.report)
-        files.write_text(folder / 'calibration.yaml', text)
+            files.write_text(place / 'report.html', self.report)
+        files.write_text(place / 'calibration.yaml', text)
 
     def __repr__(self):
         return repr(self.calibration)

@@ -60,8 +60,8 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     """Return what to estimate and how to judge it."""
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     tolerances = checked_tolerances(tolerances) if isinstance(tolerances, Mapping) else files.read_tolerances(tolerances)
-    models = (choices.get(name) for name in ('accelerometer_model', 'gyroscope_model', 'reference_model'))
-    return CalibrationOptions(*models, tolerances, window_settings(choices.get('setting') or ()), nominal_of(choices.get('nominal')))
+    return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
+                              tolerances, window_settings(choices.get('setting') or ()), nominal_of(choices.get('nominal')))
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:

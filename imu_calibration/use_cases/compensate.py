@@ -63,7 +63,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     Raises
     ------
     ImuCalibrationError
-        When nobody should be corrected with the calibration, the recording is corrected already, lacks temperatures that are needed, or the output exists.
+        When nobody should be corrected with the calibration, the recording is corrected already or lacks temperatures that are needed, or
+        the output exists.
 
     """
     calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration

@@ -60,10 +60,10 @@ class Diagnosed:
 
     def save(self, folder: str | PathLike) -> None:
         """Write diagnosis.json, report.html and the extended calibration.yaml into a folder."""
-        page, folder = self.report, files.make_folder(folder)
-        files.write_text(folder / 'diagnosis.json', json.dumps(self.document, indent=1) + '\n')
-        files.write_text(folder / 'report.html', page)
-        files.write_text(folder / 'calibration.yaml', calibration_to_text(self.calibration))
+        page, place = self.report, files.make_folder(folder)
+        files.write_text(place / 'diagnosis.json', json.dumps(self.document, indent=1) + '\n')
+        files.write_text(place / 'report.html', page)
+        files.write_text(place / 'calibration.yaml', calibration_to_text(self.calibration))
 
     def __str__(self):
         return '\n'.join(self.result.lines)
@@ -97,7 +97,8 @@ def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Ta
     check_names(choices)
     options = calibration_options(choices)
     table = files.read_table(table) if isinstance(table, (str, PathLike)) else table
-    source = source_of(recording, topics_of(choices), table and table.joint_names, want_joints=table is not None)
+    names = None if table is None else table.joint_names
+    source = source_of(recording, topics_of(choices), names, want_joints=table is not None)
     provenance = provenance_of([recording], kept(choices))
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:

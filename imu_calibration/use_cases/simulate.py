@@ -47,10 +47,11 @@ class Simulated:
         return f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu, {len(self.samples.joints)} JointState>'
 
 
-def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | None = None, calibration: str | PathLike | Calibration | None = None,
-             effects: Sequence[str] = (), size: float = 0.3, grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None,
-             duration: float | None = None, imu_rate: float = 100.0, joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0,
-             stamp_jitter_us: float = 0.0, temperature: bool = False) -> Simulated:
+def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | None = None,
+             calibration: str | PathLike | Calibration | None = None, effects: Sequence[str] = (), size: float = 0.3,
+             grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None, duration: float | None = None, imu_rate: float = 100.0,
+             joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0, stamp_jitter_us: float = 0.0,
+             temperature: bool = False) -> Simulated:
     """
     Simulate a session on a turntable.
 
@@ -83,20 +84,20 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
         When a name is unknown, or table, profile and calibration do not fit together.
 
     """
-    if isinstance(table, (str, PathLike)) or table is None:
-        table = files.read_table(table or config_file('table_three_axis.yaml'))
-    motion = make_profile(profile, seed, table, duration)
-    table = table if motion.table is None else Table.from_mapping(motion.table)
-    model, values = _truth(table, calibration, grade, seed if imu_seed is None else imu_seed)
+    given = table if isinstance(table, Table) else files.read_table(table or config_file('table_three_axis.yaml'))
+    motion = make_profile(profile, seed, given, duration)
+    mover = given if motion.table is None else Table.from_mapping(motion.table)
+    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed)
     for name in effects:
-        model, values = _with_effect(model, values, name, *hidden_effect(name, table.joint_names, seed, size))
+        model, values = _with_effect(model, values, name, *hidden_effect(name, mover.joint_names, seed, size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
     options = SimulationOptions(imu_rate, joint_rate, noise, temperature_start_c=25.0 if warm else None)
-    samples = SampleBlock(*run_session(model, values, table, motion, options, seed))
+    samples = SampleBlock(*run_session(model, values, mover, motion, options, seed))
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), options.frame_id,
-                        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': seed, 'profile': profile}})
-    return Simulated(samples, table, truth, motion.duration)
+                        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
+                        provenance={'simulated': {'seed': seed, 'profile': profile}})
+    return Simulated(samples, mover, truth, motion.duration)
 
 
 def _truth(table, calibration, grade, seed):
@@ -107,8 +108,9 @@ def _truth(table, calibration, grade, seed):
         return model, random_values(model, grade, seed)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     if known.model.reference and set(known.model.joint_names) != set(names):
-        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {', '.join(known.model.joint_names)}; "
-                         'give the table it was made with', key='table')
+        theirs = ', '.join(known.model.joint_names)
+        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {theirs}; give the table it was "
+                         'made with', key='table')
     return known.model, known.values
 
 
