@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.linear_least_squares import (
+from imu_calibration.papers import avrutov2017 as avrutov
+from imu_calibration.papers import avrutov2017_budget as avrutov_budget
+from imu_calibration.papers.linear_least_squares import (
     condition_numbers,
     null_directions,
     numerical_rank,
     predicted_sd,
     tolerance_scaled,
 )
-from imu_calibration.papers import avrutov2017 as avrutov
-from imu_calibration.papers import avrutov2017_budget as avrutov_budget
 
 from worlds.figures import show
 

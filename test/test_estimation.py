@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.effects.columns import columns
+from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import coefficients, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
@@ -202,3 +202,14 @@ def test_columns_are_the_derivative_of_the_prediction(session, name):
                 derivative = design @ (coefficients(model, sensor, values + step) - coefficients(model, sensor, values - step))
                 scale = max(np.max(np.abs(up - down)), 1e-9)
                 np.testing.assert_allclose(derivative, up - down, atol=0.01 * scale + 1e-10)
+
+
+def test_a_warp_of_one_sensor_leaves_the_other_sensors_motion_alone(session):
+    """The table's tilt concerns the accelerometer: worked out together, the columns of both are those worked out apart (to the bit)."""
+    model = FULL.with_effect('gyroscope', 'gyro_bandwidth').with_effect('reference', 'time_offset')
+    values = model.start()
+    values[model.slices['reference', 'table_tilt']], values[model.slices['gyroscope', 'gyro_bandwidth']] = (0.004, -0.003), 0.01
+    model, window = model.at(values), next(w for w in session if w.kind == 'dynamic')
+    together = References(model, TABLE, window.motion)
+    for sensor in ('accelerometer', 'gyroscope'):
+        np.testing.assert_array_equal(columns(model, sensor, TABLE, window.motion, references=together), columns(model, sensor, TABLE, window.motion))

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.linear_least_squares import (
+from imu_calibration.estimation.observability import tolerance_scaled_singular_values
+from imu_calibration.papers.linear_least_squares import (
     condition_numbers,
     null_directions,
     numerical_rank,
     predicted_sd,
     solve_linear,
     tolerance_scaled,
-    tolerance_scaled_covariance,
 )
 
 NAMES = ('bias', 'slope', 'curve')
@@ -124,6 +124,6 @@ def test_tolerance_scaling_of_design_and_covariance_agree():
     rng = np.random.default_rng(6)
     design, tolerances = vandermonde(rng), np.array([0.1, 2.0, 0.5])
     covariance = 0.3**2 * solve_linear(design, np.ones(12), NAMES).unit_covariance
-    by_design, by_covariance = tolerance_scaled(design, tolerances, 0.3), tolerance_scaled_covariance(covariance, tolerances)
-    np.testing.assert_allclose(by_covariance.singular_values, by_design.singular_values, rtol=1e-10)
-    np.testing.assert_allclose(by_covariance.sd_over_tolerance, by_design.sd_over_tolerance, rtol=1e-10)
+    by_design = tolerance_scaled(design, tolerances, 0.3)
+    np.testing.assert_allclose(tolerance_scaled_singular_values(np.linalg.inv(covariance), tolerances), by_design.singular_values, rtol=1e-9)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)) / tolerances, by_design.sd_over_tolerance, rtol=1e-10)

@@ -4,6 +4,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.observability import added_information
+from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 ENOUGH = 9.0
@@ -57,12 +58,4 @@ def _best_motion(solution, question, mate, gravity):
 
 def _unimitated(information, values, own):
     """Return the squared standard deviations of the effect that nothing else in the model imitates, its mate included."""
-    index = np.zeros(len(values), bool)
-    index[own] = True
-    rest = ~index
-    scale = 1 / np.sqrt(np.diag(information))
-    scaled = information * np.outer(scale, scale)
-    cross = scaled[np.ix_(rest, index)]
-    left = scaled[np.ix_(index, index)] - cross.T @ np.linalg.solve(scaled[np.ix_(rest, rest)] + 1e-12 * np.eye(rest.sum()), cross)
-    effect = values[index] / scale[index]
-    return float(effect @ left @ effect)
+    return float(values[own] @ np.linalg.solve(inverse_normal(information)[own, own], values[own]))

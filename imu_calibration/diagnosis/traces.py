@@ -67,7 +67,7 @@ def residual_traces(windows, table, before, after):
     time = np.concatenate([w.time for w in windows])
     navigation = _dead_reckoning(time, (before, after), errors, references, rows)
     known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
-    block, number = _blocks(windows, known)
+    block, number = _blocks(windows)
 
     def mean(values):
         return _block_mean(np.asarray(values, float)[known], block, number)
@@ -92,7 +92,7 @@ def _all_samples(windows):
     return motion, np.concatenate(parts), rows
 
 
-def _blocks(windows, known):
+def _blocks(windows):
     """Return the block number of each known sample and the size of each block; blocks end with their window."""
     numbers, last = [], 0
     for window in windows:

@@ -52,9 +52,8 @@ class References:
 
     def at(self, sensor, effect=None, values=None):
         """Return the reference of `sensor`, with other values for one effect where given."""
-        lags = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and e.sensor == sensor and np.any(self.model.warp_point(e)))
-        own = effect is not None and effect.sensor == sensor
-        key = (sensor if own else lags, effect and effect.name, None if values is None else tuple(values))
+        acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.warp_point(e)))
+        key = (acting, effect and effect.name, None if values is None else tuple(values))
         if key not in self._known:
             change = None if effect is None else {effect.name: values}
             self._known[key] = warped_reference(self.model, sensor, self.table, self.motion, self.temperature_c, change)

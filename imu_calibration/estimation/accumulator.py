@@ -18,11 +18,11 @@ class Accumulator:
     """
     Everything that least squares needs of any number of windows.
 
-    Mean rows stay single, because the bias that wanders from window to window makes their weights depend on one another;
+    Mean rows stay single, because the bias that moves from window to window makes their weights depend on one another;
     the centred rows of each kind of window are one triangular factor per sensor.
     """
 
-    rows: list = field(default_factory=list)
+    rows: list[WindowStatistics] = field(default_factory=list)
     """Windows in order of time with their mean rows (WindowStatistics whose `within` is empty)."""
     within: dict = field(default_factory=dict)
     """(sensor, kind) -> triangular factor of the centred rows."""
@@ -35,7 +35,7 @@ class Accumulator:
     windows: dict = field(default_factory=dict)
     """Kind -> number of windows."""
 
-    def add(self, window):
+    def add(self, window: WindowStatistics) -> None:
         """Take one window (WindowStatistics)."""
         for sensor in SENSORS:
             statistics = window.sensors[sensor]
@@ -48,11 +48,11 @@ class Accumulator:
         if len(self.rows) > CAPACITY:
             self._thin()
 
-    def copy(self):
+    def copy(self) -> 'Accumulator':
         """Return an accumulator that goes its own way; rows and factors are never changed in place."""
         return Accumulator(list(self.rows), *(dict(getattr(self, f.name)) for f in fields(self)[1:]))
 
-    def merge(self, other):
+    def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
         for mine, its in ((self.within, other.within), (self.slow, other.slow)):
             for key, factor in its.items():

@@ -43,12 +43,12 @@ class BandMisfit:
         return replace(self, fast=np.where(self.apart, WEIGHTLESS * self.fast, self.fast))
 
     @property
-    def noise(self):
+    def noise(self) -> np.ndarray:
         """Return the variance to take for that of white noise when there is no rest, shape (3,)."""
         return np.where(self.apart, self.slow, self.overall)
 
 
-def band_misfit(total, dof_total, slow, dof_slow):
+def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, dof_slow: float) -> BandMisfit:
     """
     Return the `BandMisfit` of centred rows.
 
@@ -73,7 +73,7 @@ def band_misfit(total, dof_total, slow, dof_slow):
     return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart)
 
 
-def own_misfit(rows):
+def own_misfit(rows: np.ndarray) -> np.ndarray:
     """Return what the best fit of each axis to rows ``[columns | output]`` alone leaves of the outputs, shape (k, 3)."""
     columns, output = rows[:, :-3], rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)

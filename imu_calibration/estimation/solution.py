@@ -4,21 +4,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Estimated parameters with everything that is needed to judge them."""
 
-    model: object
-    """The SensorModel, linearised where the columns were taken."""
+    model: SensorModel
+    """The effects, linearised where the columns were taken."""
     values: np.ndarray
     """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
     covariance: np.ndarray
     """Their covariance, the priors of held parameters included, shape (n_params, n_params)."""
     held: np.ndarray
     """True where the recording says next to nothing and the prior stands, shape (n_params,)."""
-    noise: dict
-    """Sensor -> WindowNoise."""
+    noise: dict[str, NoiseModel]
+    """Sensor -> its noise."""
     chi2_per_dof: dict
     """Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom."""
     information: np.ndarray
@@ -29,15 +32,15 @@ class Solution:
     """Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean."""
 
     @property
-    def param_names(self):
+    def param_names(self) -> list[str]:
         """Names in the order of `values`."""
         return self.model.param_names
 
     @property
-    def sd(self):
+    def sd(self) -> np.ndarray:
         """Standard deviations, shape (n_params,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def value(self, sensor, effect):
+    def value(self, sensor: str, effect: str) -> np.ndarray:
         """Return the values of one effect."""
         return self.values[self.model.slices[sensor, effect]]

@@ -22,7 +22,7 @@ class SensorStatistics:
     """
     The rows ``[columns | output]`` of one sensor in one window, split in mean and rest.
 
-    The mean row carries a random offset of the window (bias wander) beside the averaged noise; the centred rows do not.
+    The mean row carries a random offset of the window (of its bias) beside the averaged noise; the centred rows do not.
     Weighted apart, the two are an exact summary for the model ``output = columns @ coefficients + window offset + noise``.
     """
 
@@ -52,7 +52,7 @@ class WindowStatistics:
     """Length, s."""
     count: int
     """Number of samples."""
-    sensors: dict
+    sensors: dict[str, SensorStatistics]
     """Sensor name -> SensorStatistics."""
     session: int = 0
     """Recording that the window comes from."""
@@ -120,7 +120,7 @@ def _reduce_moving(design, output, length):
     return SensorStatistics(mean, triangular(rows), unknown, unknown, triangular(slow), len(slow))
 
 
-def piece_length(window):
+def piece_length(window: Window) -> int:
     """Return the number of samples in SLOW_TIME, at least one; zero for a static window."""
     if window.kind == 'static':
         return 0
@@ -128,18 +128,18 @@ def piece_length(window):
     return max(int(round(SLOW_TIME * (len(window.time) - 1) / span)), 1) if span > 0 else 1
 
 
-def slow_part(rows, length):
+def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     """Return the means of pieces of `length` rows times the root of their length, none when a piece is a single row."""
     pieces = len(rows) // length if length > 1 else 0
     return rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
 
 
-def batch_statistics(output, batches=16):
+def batch_statistics(output: np.ndarray, batches: int = 16) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the variance of each column and the factor by which means of it scatter more than white noise.
 
     The factor is the variance of the means of `batches` equal pieces, times their length, over the sample variance:
-    a sensor's low-pass filter makes it larger than one. Pieces rather than the whole keep slow wander out.
+    a sensor's low-pass filter makes it larger than one. Pieces rather than the whole keep slow drift out.
     """
     variance = output.var(axis=0, ddof=1)
     length = len(output) // batches

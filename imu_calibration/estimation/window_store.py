@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.columns import columns
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
 from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 
 STATIC_MOST = 4096
@@ -29,17 +31,17 @@ class WindowStore:
 
     """
 
-    def __init__(self, most, complete=True):
+    def __init__(self, most: int, complete: bool = True):
         self._most, self._entries, self._n_samples, self._n_static = most, [], 0, 0
         self.complete = complete and most > 0
 
-    def copy(self):
+    def copy(self) -> 'WindowStore':
         """Return a copy that shares the windows."""
         twin = WindowStore(self._most, self.complete)
         twin._entries, twin._n_samples, twin._n_static = list(self._entries), self._n_samples, self._n_static
         return twin
 
-    def add(self, window, reduced):
+    def add(self, window: Window, reduced: WindowStatistics) -> None:
         """Take one window (Window, WindowStatistics); when it does not fit, forget them all."""
         if not self.complete:
             return
@@ -53,7 +55,7 @@ class WindowStore:
         if self._n_samples > self._most or self._n_static > STATIC_MOST:
             self.complete, self._entries = False, []
 
-    def reduced(self, model, table, session):
+    def reduced(self, model: SensorModel, table: Table, session: int) -> Accumulator:
         """Return the accumulator of all windows with the columns of `model`."""
         accumulator = Accumulator()
         for entry in self._entries:
@@ -71,7 +73,7 @@ def _again(reduced, motion, temperature, model, table):
     return replace(reduced, sensors=sensors)
 
 
-def owned_window(window):
+def owned_window(window: Window) -> Window:
     """Return the window in memory of its own: slices would keep the whole chunk that they were cut from."""
     motion = JointMotion(*(np.array(getattr(window.motion, name)) for name in ('time', 'position', 'rate', 'acceleration', 'jerk')))
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.estimation.linear_least_squares import solve_linear
+from imu_calibration.papers.linear_least_squares import solve_linear
 from imu_calibration.reference.reference_motion import skew
 
 COLUMNS = {

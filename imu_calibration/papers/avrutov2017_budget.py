@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.estimation.linear_least_squares import LinearSolution, solve_linear
 from imu_calibration.papers.avrutov2017 import COLUMNS, calibrate, design_matrix, gravity_readings, turn
+from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
 
 @dataclass(frozen=True, eq=False)

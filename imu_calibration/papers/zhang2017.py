@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.linear_least_squares import solve_linear
+from imu_calibration.papers.linear_least_squares import solve_linear
 
 """m/s^2, the g of the paper's units."""
 TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])

@@ -12,7 +12,7 @@ import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import NotObservableError
-from imu_calibration.estimation.linear_least_squares import RANK_TOLERANCE, solve_linear, tolerance_scaled
+from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, solve_linear, tolerance_scaled
 from imu_calibration.papers.zhang2017_designs import stack_runs
 
 PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')

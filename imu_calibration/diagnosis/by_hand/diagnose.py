@@ -72,7 +72,7 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
 
     Every pose is held out in turn. The accelerometer is judged by the norm of gravity, the gyroscope by the rates at rest and by the
     directions of gravity before and after each turn. Poses are few, so that variances are estimated along (F tests, losses
-    ``n log(mean square)``), with a wandering bias beside the scatter from pose to pose.
+    ``n log(mean square)``), with a bias process beside the scatter from pose to pose.
 
     Parameters
     ----------

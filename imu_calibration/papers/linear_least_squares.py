@@ -201,15 +201,6 @@ def tolerance_scaled(design, tolerances, sigma=1.0):
     return ToleranceScaled(singular, right, predicted_sd(design) / tolerances)
 
 
-def tolerance_scaled_covariance(covariance, tolerances):
-    """Do the same as `tolerance_scaled` from a covariance, shape (n_params, n_params)."""
-    tolerances = np.asarray(tolerances, float)
-    variances, vectors = np.linalg.eigh(np.asarray(covariance, float) / np.outer(tolerances, tolerances))
-    with np.errstate(divide='ignore'):
-        singular = 1 / np.sqrt(np.maximum(variances, 0))
-    return ToleranceScaled(singular, vectors.T, np.sqrt(np.diag(covariance)) / tolerances)
-
-
 def _checked(design, outputs, param_names, weights):
     design, outputs, names = np.asarray(design, float), np.asarray(outputs, float), tuple(param_names)
     if design.ndim != 2 or design.shape[1] != len(names):
