@@ -6,6 +6,8 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST, ByHandSettings
 from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes
+from imu_calibration.calibration.effect_states import Progress
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import SCALES
 from imu_calibration.errors import with_hint
 from imu_calibration.segmentation.static_detector import find_still
@@ -41,8 +43,8 @@ NOTHING = Findings([], None, 0, 0, {}, 0.0)
 class HandStatus:
     """How far a calibration by hand has come, for people."""
 
-    word: str
-    """'waiting' before a solution is possible, 'weak' while something is missing, or 'determined'."""
+    word: Progress
+    """WAITING before a solution is possible, WEAK while something is missing, or DETERMINED."""
     message: str
     """One line: what there is, and what to do next."""
     values: dict
@@ -104,13 +106,13 @@ def _needs(found, not_seen, calibration, gravity_unknown, hints):
     if found.attitudes < POSES_LEAST or calibration is None:
         still = f'hold it still with {not_seen[0]} up' if not_seen else 'hold it still in an attitude between two faces'
         more = f' (not seen yet: {", ".join(not_seen)})' if len(not_seen) > 1 else ''
-        return 'waiting', [f'{still}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
-    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
+        return Progress.WAITING, [f'{still}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
+    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
     if not lacking:
-        return 'determined', []
+        return Progress.DETERMINED, []
     if gravity_unknown and set(lacking) <= set(SCALES):
-        return 'weak', [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
-    return 'weak', list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+        return Progress.WEAK, [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
+    return Progress.WEAK, list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 
 
 def _plural(count, noun):

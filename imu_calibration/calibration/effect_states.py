@@ -1,16 +1,23 @@
 """What is known of each effect of a calibration that goes on: determined, weak, held or waiting, and the motion that is still needed."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.calibration.status import HELD, WEAK
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
-WAITING = 'waiting'
-"""Status of a parameter group before the first solution; then 'determined', 'weak' or 'held'."""
+
+class Progress(StrEnum):
+    """How far a session has come with an effect, or with everything."""
+
+    WAITING = 'waiting'
+    """There is no solution yet."""
+    HELD = 'held'
+    WEAK = 'weak'
+    DETERMINED = 'determined'
 
 
 @dataclass(frozen=True)
@@ -21,8 +28,8 @@ class GroupState:
     """'accelerometer', 'gyroscope' or 'reference'."""
     effect: str
     """Name of the effect."""
-    status: str
-    """The worst of its parameters: 'determined', 'weak', 'held', or 'waiting' before the first solution."""
+    status: Progress
+    """That of the worst of its parameters."""
     parameter: str
     """The parameter whose standard deviation is largest in tolerances."""
     sd: float
@@ -47,7 +54,7 @@ def group_states(result):
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
         state = group_status(status)
-        text, predicted = needed.get(names[worst], ('', float('nan'))) if state != 'determined' else ('', float('nan'))
+        text, predicted = needed.get(names[worst], ('', float('nan'))) if state != Progress.DETERMINED else ('', float('nan'))
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), text, predicted))
     return states
@@ -55,13 +62,13 @@ def group_states(result):
 
 def group_status(statuses):
     """Return the worst of the statuses of an effect's parameters."""
-    return next((kind for kind in (HELD, WEAK) if kind in statuses), 'determined')
+    return next((progress for progress in (Progress.HELD, Progress.WEAK) if progress in statuses), Progress.DETERMINED)
 
 
 def waiting_groups(model):
     """Return the GroupState of every effect of a model of which nothing is known yet."""
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-    return [GroupState(e.sensor, e.name, WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
+    return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
             for e in model.effects]
 
 
@@ -73,7 +80,7 @@ def hand_group_states(result):
         part = calibration.model.slices[effect.sensor, effect.name]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         state = group_status(calibration.status[part])
-        own = set(names[part]) if state != 'determined' else set()
+        own = set(names[part]) if state != Progress.DETERMINED else set()
         needs = next((item['needs'] for item in calibration.undetermined if own & set(item['parameters'])), '')
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), needs))

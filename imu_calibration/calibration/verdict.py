@@ -1,17 +1,32 @@
 """Good, weak or bad: whether a calibration may be used, why, and what to do next."""
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.calibration.plausibility import implausible
-from imu_calibration.calibration.status import DETERMINED, HELD, WEAK
+from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import with_hint
 from imu_calibration.units import for_people, significant
 
-GOOD, BAD, NOTE = 'good', 'bad', 'note'
+
+class Judgement(StrEnum):
+    """What a reason, or all of them together, say of a calibration."""
+
+    GOOD = 'good'
+    """Use it."""
+    WEAK = 'weak'
+    """Usable, with gaps."""
+    BAD = 'bad'
+    """Do not use it as it is."""
+    NOTE = 'note'
+    """A reason that leaves the verdict alone."""
+
+
+GOOD, WEAK, BAD, NOTE = Judgement
 MISFIT = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
 LOOSE = 2.0
@@ -29,8 +44,8 @@ SHOWN_NAMES = 6
 class Reason:
     """One thing that speaks for or against the calibration."""
 
-    word: str
-    """'good', 'weak', 'bad', or 'note', which leaves the verdict alone."""
+    word: Judgement
+    """What it says."""
     what: str
     """What was seen."""
     next: str
@@ -43,8 +58,8 @@ class Reason:
 class Verdict:
     """The verdict with its reasons, the gravest first."""
 
-    word: str
-    """'good', 'weak' or 'bad'."""
+    word: Judgement
+    """GOOD, WEAK or BAD."""
     reasons: tuple
     """Reason, ..."""
 
@@ -130,9 +145,9 @@ def _first_need(calibration, start=''):
 
 def _undetermined(calibration):
     reasons = []
-    for status, text in ((WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
+    for status, text in ((Status.WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
         names = [n for n, s in zip(calibration.param_names, calibration.status) if s == status and requested(n)]
-        if status == WEAK and _gravity_unknown(calibration, names):
+        if status == Status.WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
             what = f'{listed(scale)}: the local gravity was not given, which scales them together'
             reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity'))

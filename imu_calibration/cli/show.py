@@ -2,7 +2,7 @@
 
 from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.errors import with_hint
-from imu_calibration.preflight.finding import SEVERITIES
+from imu_calibration.preflight.finding import Severity
 
 
 def console():
@@ -31,7 +31,7 @@ def show_findings(out, findings, hints):
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True, style='bold')
     table.add_column(overflow='fold')
-    for finding in sorted(findings, key=lambda found: SEVERITIES.index(found.severity)):
+    for finding in sorted(findings, key=lambda found: list(Severity).index(found.severity)):
         text = with_hint(finding.text, finding.key, hints)
         table.add_row(Text(finding.severity, STYLES[finding.severity]), finding.check.replace('_', ' '), Text(text))
     out.print(table)

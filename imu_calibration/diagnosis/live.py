@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 from imu_calibration.calibration.options import choose_model
 from imu_calibration.diagnosis.diagnose import diagnose
@@ -10,15 +11,33 @@ from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.estimation.window_store import owned_window
 from imu_calibration.selection.investigation import LEAST_WINDOWS
 
-WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = 'waiting', 'off', 'found', 'nothing found', 'unexplained', 'failed'
+
+class Outcome(StrEnum):
+    """What a diagnosis came to."""
+
+    WAITING = 'waiting'
+    """It cannot be asked yet."""
+    OFF = 'off'
+    """It is not asked."""
+    FOUND = 'found'
+    """The model lacks something that has a name."""
+    NOTHING = 'nothing found'
+    """The model is adequate."""
+    UNEXPLAINED = 'unexplained'
+    """Something stays that no effect explains."""
+    FAILED = 'failed'
+    """It ended by a fault."""
+
+
+WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
 
 @dataclass(frozen=True)
 class DiagnosisState:
     """What a diagnosis said, or why none was made yet."""
 
-    word: str = WAITING
-    """'waiting', 'off', 'found', 'nothing found', 'unexplained' or 'failed'."""
+    word: Outcome = WAITING
+    """What it came to."""
     message: str = f'it is asked after a solution, once there are {LEAST_WINDOWS} windows'
     """One line."""
     values: dict = field(default_factory=dict)

@@ -8,9 +8,7 @@ from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
 from imu_calibration.preflight import stamp_checks, value_checks
 from imu_calibration.preflight.evidence import EvidenceGatherer
-from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, SEVERITIES, WARNING, Finding
-
-__all__ = ['CHECKS', 'GOOD', 'NOTE', 'REFUSE', 'SEVERITIES', 'WARNING', 'Finding', 'Preflight', 'refuse', 'unusable', 'warnings']
+from imu_calibration.preflight.finding import REFUSE, WARNING
 
 CHECKS = (
     value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.handedness,

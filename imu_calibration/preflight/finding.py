@@ -1,10 +1,23 @@
 """What a check says about a recording."""
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
-REFUSE, WARNING, NOTE, GOOD = 'refuse', 'warning', 'note', 'good'
-SEVERITIES = (REFUSE, WARNING, NOTE, GOOD)
-"""The result would be wrong; it may suffer; worth knowing; checked and in order."""
+
+class Severity(StrEnum):
+    """How much a finding matters, the worst first."""
+
+    REFUSE = 'refuse'
+    """The result would be wrong."""
+    WARNING = 'warning'
+    """It may suffer."""
+    NOTE = 'note'
+    """Worth knowing."""
+    GOOD = 'good'
+    """Checked and in order."""
+
+
+REFUSE, WARNING, NOTE, GOOD = Severity
 
 
 @dataclass(frozen=True)
@@ -13,8 +26,8 @@ class Finding:
 
     check: str
     """Name of the check."""
-    severity: str
-    """One of SEVERITIES."""
+    severity: Severity
+    """How much it matters."""
     text: str
     """What must hold, what came, what to do; for GOOD what was seen."""
     samples: int = 0
@@ -22,10 +35,10 @@ class Finding:
     key: str | None = None
     """What has to be given, a key of `errors.KEYS`."""
 
-    def named(self, name):
+    def named(self, name: str) -> 'Finding':
         """Return the finding with the name of its recording before the text."""
         return replace(self, text=f'{name}: {self.text}')
 
-    def to_mapping(self):
+    def to_mapping(self) -> dict:
         """Return what stands in the calibration file."""
         return {'check': self.check, 'severity': self.severity, 'text': self.text, 'samples': self.samples}

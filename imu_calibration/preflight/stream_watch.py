@@ -1,6 +1,7 @@
 """How the streams of a live session are doing, by header stamps: rates, silence, what is being dropped."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from imu_calibration.segmentation.window_cutter import dropped
 
@@ -9,15 +10,27 @@ SILENT_AFTER = 2.0
 RECENT = 10.0
 """Seconds for which a loss is called recent."""
 _MESSAGES = {'imu': 'Imu', 'joints': 'JointState'}
-GOOD, TROUBLE, SILENT = 'good', 'trouble', 'silent'
+
+
+class StreamHealth(StrEnum):
+    """How the streams of a session are."""
+
+    GOOD = 'good'
+    TROUBLE = 'trouble'
+    """Something is lost, late or apart."""
+    SILENT = 'silent'
+    """Nothing comes."""
+
+
+GOOD, TROUBLE, SILENT = StreamHealth
 
 
 @dataclass(frozen=True)
 class StreamState:
     """The state of all streams together."""
 
-    word: str
-    """'good', 'trouble' or 'silent'."""
+    word: StreamHealth
+    """How they are."""
     message: str
     """One line: what is wrong and what to do."""
     values: dict

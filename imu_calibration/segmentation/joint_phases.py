@@ -1,13 +1,28 @@
 """When the joints stand, turn steadily or change their rate, seen in noisy or quantised readings."""
 
+from enum import IntEnum
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.special import ndtri
 
 from imu_calibration.reference.encoder import encoder_step
 
-STILL, STEADY, MOVING, LOST = 0, 1, 2, 3
-"""Phases: all joints at rest; all rates constant and one joint turning; anything else that moves; joints unknown."""
+
+class Phase(IntEnum):
+    """What the joints do at a reading."""
+
+    STILL = 0
+    """All of them rest."""
+    STEADY = 1
+    """All rates are constant, and one joint turns."""
+    MOVING = 2
+    """Anything else that moves."""
+    LOST = 3
+    """They are not known."""
+
+
+STILL, STEADY, MOVING, LOST = Phase
 RATE_SPAN = 0.2
 """Rates are slopes over this time, s: long enough for encoders, short against `settling`."""
 LONGEST_SPAN = 1.0

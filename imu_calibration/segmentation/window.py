@@ -1,6 +1,7 @@
 """What a window is, and how samples become one."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -8,12 +9,35 @@ from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.samples import _Columns
 
 
+class WindowKind(StrEnum):
+    """What the IMU does in a window."""
+
+    UNUSED = 'unused'
+    """Kept out on purpose."""
+    STATIC = 'static'
+    """It rests."""
+    SPIN = 'spin'
+    """All joint rates are constant, and one joint turns."""
+    DYNAMIC = 'dynamic'
+    """Anything else that moves."""
+
+
+class UnusedReason(StrEnum):
+    """Why samples that arrived whole are in no window of a kind."""
+
+    NONE = ''
+    SETTLING = 'settling'
+    NOT_QUIET = 'not quiet'
+    TURN_ON = 'turn-on'
+    TOO_SHORT = 'too short'
+
+
 @dataclass(frozen=True, eq=False)
 class Window:
     """A stretch of samples of one kind, without gaps."""
 
-    kind: str
-    """'static', 'spin', 'dynamic' or 'unused'."""
+    kind: WindowKind
+    """What the IMU does."""
     stamp_ns: np.ndarray
     """Header stamps, int64, shape (n,)."""
     time: np.ndarray
@@ -23,11 +47,11 @@ class Window:
     rate_s: np.ndarray
     """Measured angular rate, rad/s, shape (n, 3)."""
     motion: JointMotion
-    """The joints at the IMU's stamps; one row for 'static': mean position, and rates of zero unless the joints clearly creep."""
+    """The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the joints clearly creep."""
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,), or None."""
-    reason: str = ''
-    """Why the window is 'unused'."""
+    reason: UnusedReason = UnusedReason.NONE
+    """Why the window is unused."""
     joint_step: np.ndarray | None = None
     """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
 
@@ -80,12 +104,13 @@ class PhasedSamples(_Columns):
     """Steps of the encoders, rad, zero where none show, shape (n, n_joints)."""
 
 
-def make_window(samples, kind, reason=''):
+def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
     """Return the `Window` of a kind that holds all of `samples`."""
     temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
     moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk)
-    motion = _mean_motion(samples) if kind == 'static' else moving
-    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason, samples.joint_step.max(axis=0))
+    motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
+    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
+                  samples.joint_step.max(axis=0))
 
 
 def _mean_motion(samples):

@@ -3,10 +3,12 @@
 import numpy as np
 
 from imu_calibration.segmentation.joint_phases import MOVING, STEADY, STILL
-from imu_calibration.segmentation.window import PhasedSamples, make_window
+from imu_calibration.segmentation.window import PhasedSamples, UnusedReason, WindowKind, make_window
 
-UNUSED, STATIC, SPIN, DYNAMIC = 0, 1, 2, 3
-_KINDS = ('unused', 'static', 'spin', 'dynamic')
+_KINDS, _REASONS = tuple(WindowKind), tuple(UnusedReason)
+UNUSED, STATIC, SPIN, DYNAMIC = range(len(_KINDS))
+_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT = range(1, len(_REASONS))
+_LEAST_SAMPLES = 5
 
 
 class WindowCutter:
@@ -150,11 +152,6 @@ class WindowCutter:
         return [make_window(samples, _KINDS[kind], _REASONS[reason])] if kind != UNUSED or self._keep_unused else []
 
 
-_REASONS = ('', 'settling', 'not quiet', 'turn-on', 'too short')
-_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT = 1, 2, 3, 4
-_LEAST_SAMPLES = 5
-
-
 def _runs(value, broken):
     """Return starts and stops of runs of equal values that are not broken."""
     begins = np.concatenate([[True], (value[1:] != value[:-1]) | broken[1:]])
@@ -167,7 +164,7 @@ def _between_motion(k, before, original, after_gap, stop):
     return before[k] in (STEADY, MOVING) and follows
 
 
-ACCEPTED = ('static', 'spin', 'dynamic', 'settling', 'not quiet', 'turn-on', 'too short', 'edge of joints')
+ACCEPTED = (*_KINDS[1:], *_REASONS[1:], 'edge of joints')
 """Counts of samples that arrived whole; the last five are kept out of windows on purpose."""
 
 
