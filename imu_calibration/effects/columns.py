@@ -53,7 +53,8 @@ class References:
     def at(self, sensor, effect=None, values=None):
         """Return the reference of `sensor`, with other values for one effect where given."""
         acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.warp_point(e)))
-        key = (acting, effect and effect.name, None if values is None else tuple(values))
+        moved = effect is not None and np.any(values != self.model.warp_point(effect))
+        key = (acting, *((effect.name, *values) if moved else ()))
         if key not in self._known:
             change = None if effect is None else {effect.name: values}
             self._known[key] = warped_reference(self.model, sensor, self.table, self.motion, self.temperature_c, change)
@@ -65,7 +66,7 @@ def columns(model, sensor, table, motion, temperature_c=None, references=None):
     Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
 
     A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
-    its coefficients are matrix times parameter. The derivative is a central difference of the exact kinematics.
+    its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
     """
     references = references or References(model, table, motion, temperature_c)
     ref = references.at(sensor)
@@ -94,7 +95,8 @@ def warp_columns(model, effect, sensor, references):
     if clock is not None and effect.sensor == sensor and not np.any(model.warp_point(effect)):
         effect = clock   # a lag of zero is a delay to first order
     inputs, levers = [], []
-    for above, below, width in _central_steps(effect, model.warp_point(effect)):
+    # A search, which folds the arms, asks for so many warps that it takes half the references, and errs by the curvature over a step.
+    for above, below, width in _steps(effect, model.warp_point(effect), forward=model.folded_arms is not None):
         ends = [references.at(sensor, effect, at) for at in (above, below)]
         change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
         if sensor == 'accelerometer' and model.has_arms and (model.folded_arms is None or model.folded_arms.any()):
@@ -107,15 +109,15 @@ def warp_columns(model, effect, sensor, references):
     return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
 
 
-def _central_steps(effect, at):
+def _steps(effect, at, forward):
     """Yield (values above, values below, distance) for the derivative by each parameter; time constants stay positive."""
     for index in range(effect.size):
         step = np.zeros(effect.size)
         step[index] = effect.step
-        below = at - step
+        below = at if forward else at - step
         if effect.components[index] == 'time_constant':
             step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
-            below = at - step if at[index] > 0 else at
+            below = at - step if at[index] > 0 and not forward else at
         yield at + step, below, (at + step - below)[index]
 
 

@@ -16,7 +16,7 @@ from imu_calibration.selection.noise_beside_effects import first_noise, noise_be
 from imu_calibration.selection.normal_matrices import normal_matrix
 from imu_calibration.selection.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
 from imu_calibration.selection.questions import Question, extended_model, time_constants
-from imu_calibration.selection.reduced_recording import ReducedRecording, arms_of, reduce_recording
+from imu_calibration.selection.reduced_recording import ReducedRecording, mean_arms, reduce_recording
 from imu_calibration.selection.search import Search
 from imu_calibration.selection.trusted_band import in_trusted_band
 
@@ -51,7 +51,7 @@ class Attempt:
         self.baseline, self.effects = baseline, effects
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
-        model = replace(model, folded_arms=arms_of(model, values))
+        model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(windows, table, model, values, self.constants, progress)
         used = baseline_parameters(baseline, model)
         if point is None:

@@ -174,10 +174,15 @@ def _describe(window):
     return found
 
 
-def arms_of(model: SensorModel, values: np.ndarray) -> np.ndarray:
-    """Return the lever arms of the three accelerometers in a model, zero where it has none, shape (3, 3)."""
+def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
+    """
+    Return the mean lever arm of the accelerometers for each of them, zero where a model has none, shape (3, 3).
+
+    Their differences change the derivative of a delay little where they are millimetres, and bend it where a recording does not show them
+    and they come out as centimetres.
+    """
     arms = np.zeros((3, 3))
     for name in ('lever_arm', 'accel_size_effect'):
         if ('accelerometer', name) in model.slices:
-            arms = arms + values[model.slices['accelerometer', name]].reshape(-1, 3)
+            arms += values[model.slices['accelerometer', name]].reshape(-1, 3).mean(axis=0)
     return arms
