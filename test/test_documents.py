@@ -12,7 +12,7 @@ from imu_calibration import documents
 from imu_calibration.calibration.document import Calibration, calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.status import DETERMINED, HELD, WEAK
-from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
 
@@ -35,7 +35,7 @@ def models(draw):
     sensors = [('bias', 'matrix') + tuple(n for n in some(names)) for names in (ACCELEROMETER, GYROSCOPE)]
     # a sensor's lag stands under `reference` in the document and comes back as the last effect of its sensor
     sensors = [tuple(sorted(names, key=lambda n: n in IN_DOCUMENT_REFERENCE + ('lever_arm',))) for names in sensors]
-    known = [name for name in REFERENCE if ('reference', name) in catalogue(joints)]
+    known = [name for name in REFERENCE if ('reference', name) in CATALOGUE.effects(joints)]
     return SensorModel(*sensors, some(known), joints, draw(st.floats(-40, 85)))
 
 

@@ -181,8 +181,8 @@ def test_fewer_columns_are_the_same_as_a_smaller_model(session):
                                   'axis_non_orthogonality', 'encoder_zero', 'encoder_harmonic', 'earth_rate'])
 def test_columns_are_the_derivative_of_the_prediction(session, name):
     """Columns times the derivative of the coefficients equal finite differences of the forward equations."""
-    from imu_calibration.effects.catalogue import owner_of
-    owner = owner_of(name)
+    from imu_calibration.effects.catalogue import CATALOGUE
+    owner = CATALOGUE.owner_of(name)
     model = FULL.with_effect(owner, name) if (owner, name) not in FULL.slices else FULL
     values = true_values(model, 11)
     part = model.slices[owner, name]

@@ -9,14 +9,14 @@ from imu_calibration.diagnosis import diagnose as on_a_table
 from imu_calibration.diagnosis.by_hand import diagnose as by_hand
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.sentences import candidates_of
-from imu_calibration.effects.catalogue import find_effect
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Score
 
-FIRST, SECOND, MATE, OTHER = (Question(find_effect('accelerometer', name), (k,), 3, name)
+FIRST, SECOND, MATE, OTHER = (Question(CATALOGUE.find('accelerometer', name), (k,), 3, name)
                               for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product')))
 GAIN = Gain('accelerometer', 'samples', 2.0, 1.0, (0.4, 0.6), 5)
 

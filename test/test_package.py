@@ -13,7 +13,7 @@ from catkin_pkg.package import parse_package
 
 import imu_calibration
 from imu_calibration import resources
-from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -208,5 +208,5 @@ def test_an_installation_answers_for_itself(tmp_path, monkeypatch, layout):
 def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():
     listed = yaml.safe_load((ROOT / 'config' / 'tolerances.yaml').read_text())
     flat = {(sensor, name): value for sensor, group in listed.items() for name, value in group.items()}
-    declared = {(effect.sensor, effect.name): effect.tolerance for effect in catalogue().values()}
+    declared = {(effect.sensor, effect.name): effect.tolerance for effect in CATALOGUE.effects().values()}
     assert flat == pytest.approx(declared, rel=1e-5)

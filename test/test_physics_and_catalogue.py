@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from imu_calibration.effects.catalogue import owner_of
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
@@ -44,7 +44,7 @@ def predicted(session, name=None):
     parts = {('accelerometer', 'bias'): triads[0].bias, ('accelerometer', 'matrix'): triads[0].matrix,
              ('gyroscope', 'bias'): triads[1].bias, ('gyroscope', 'matrix'): triads[1].matrix}
     if name is not None:
-        sensor = owner_of(name)
+        sensor = CATALOGUE.owner_of(name)
         model = model.with_effect(sensor, name)
         parts[sensor, name] = session.truth['values'][name]
     values = model.start()

@@ -17,6 +17,9 @@ from imu_calibration.by_hand.poses import (
 )
 from imu_calibration.by_hand.solver import solve_joint
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.segmentation.static_detector import find_still
@@ -24,7 +27,7 @@ from imu_calibration.settings import setting
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
-PUBLISHED = (*BASE_NAMES[:3], *(f'accelerometer.matrix.{a}{b}' for a in 'xyz' for b in 'xyz'), *BASE_NAMES[9:])
+PUBLISHED = tuple(SensorModel().param_names)
 """Order of the parameters in the result; further effects follow."""
 POSES_LEAST = 4
 """Fewer attitudes leave even the accelerometer's biases to the prior."""
@@ -127,8 +130,9 @@ class HandCalibration:
     @property
     def gyroscope(self):
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
-        part = self.model.parts.get(('gyroscope', 'gyro_g_sensitivity'))
-        return (*unpack(self.state.values)[2:], np.zeros((3, 3)) if part is None else self.state.values[part].reshape(3, 3))
+        effect = self.model.model.find('gyroscope', Role.CROSS)
+        response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.parts[effect.key]].reshape(3, 3)
+        return *unpack(self.state.values)[2:], response
 
     def compensate(self, force, rate, time=None, temperature_c=None):
         """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` where effects ask for them."""
@@ -142,7 +146,7 @@ class HandCalibration:
 
 
 def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
-                      tolerances=None, accelerometer=None, gyroscope=None, temperature_c=None):
+                      tolerances=None, accelerometer=None, gyroscope=None, temperature_c=None, catalogue=CATALOGUE):
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
@@ -169,6 +173,8 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
         Effects to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
     temperature_c : array, optional
         Temperature at the samples, shape (n,).
+    catalogue : Catalogue
+        Where the effects are declared.
 
     Returns
     -------
@@ -182,7 +188,8 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
     """
     imu = imu if nominal is None else nominal.apply(imu)
     data = gather_by_hand(imu, stills, settings, known_turns, temperature_c)
-    return solve_by_hand(data.poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
+    return solve_by_hand(data.poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope,
+                         catalogue=catalogue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,12 +219,12 @@ def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), 
 
 
 def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None,
-                  point=None):
+                  point=None, catalogue=CATALOGUE):
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
     default, evidence = _gyroscope_effects(poses, settings)
     reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
-    model = HandModel(SensorModel(accelerometer or ('bias', 'matrix'), gyroscope or default, temperature_ref_c=reference_c, point=point or {}), gravity)
+    model = HandModel(SensorModel(accelerometer or BASE, gyroscope or default, temperature_ref_c=reference_c, point=point or {}, catalogue=catalogue), gravity)
     _check_temperature(model, poses)
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd=gravity_sd, fallback=fallback)
@@ -241,9 +248,10 @@ def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, toler
 
 def _settled(model, found):
     """Return whether the columns of warm-ups were taken close enough to where the solution lies."""
-    for (_, name), part in model.parts.items():
-        if name.endswith('_bias_drift') and not found.held[part][-1]:
-            known = model.model.full_point()[name][-1]
+    for effect in model.extras:
+        part = model.parts[effect.key]
+        if effect.time_constant and not found.held[part][-1]:
+            known = model.model.point_of(effect)[-1]
             if abs(found.state.values[part][-1] / known - 1) > SETTLED:
                 return False
     return True
@@ -262,7 +270,7 @@ def _gyroscope_effects(poses, settings):
     evidence = g_sensitivity_evidence(poses)
     wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
                                                 and evidence['g_sensitivity_heldout_ratio'] < 1)
-    return ('bias', 'matrix', 'gyro_g_sensitivity') if wanted else ('bias', 'matrix'), evidence
+    return G_SENSITIVE if wanted else BASE, evidence
 
 
 def _statuses(sd, held, tolerances):

@@ -15,7 +15,8 @@ from imu_calibration.calibration.effect_states import hand_group_states, waiting
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import SensorModel, parse_effects
+from imu_calibration.effects.named_models import BASE, parse_effects
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
@@ -70,7 +71,7 @@ class LiveByHand:
 
     def __init__(self, options, settings, by_hand=LiveByHandSettings(), saved=None, clock=time.monotonic):
         self.options, self.settings, self._clock = options, settings, clock
-        self._names = {sensor: None if text is None else parse_effects(sensor, text)
+        self._names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
                        for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
         self._gravity = by_hand.gravity or None
         _check_model(self.model)
@@ -84,7 +85,7 @@ class LiveByHand:
     @property
     def model(self):
         """The model, as far as it is known before a solution."""
-        return SensorModel(*(names or ('bias', 'matrix') for names in self._names.values()))
+        return SensorModel(*(names or BASE for names in self._names.values()), catalogue=self.options.catalogue)
 
     @property
     def n_windows(self):
@@ -164,7 +165,7 @@ class LiveByHand:
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
         solved = calibrate_samples_by_hand(recording, self._gravity, self.options.tolerances, provenance, *self._names.values(),
-                                           stills=self.found.rests)
+                                           stills=self.found.rests, catalogue=self.options.catalogue)
         self.result = result_by_hand(*solved, self.options)
         return self.result
 

@@ -5,33 +5,32 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.effects.regressors import GROUPS
-from imu_calibration.effects.sensor_model import SensorModel, prior_sds
+from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import effect_slopes
+from imu_calibration.effects.sensor_model import SensorModel, linear_names
 from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 """Entries of the accelerometer matrix that the gauge leaves free."""
-FIXED = ('accelerometer.matrix.xy', 'accelerometer.matrix.xz', 'accelerometer.matrix.yz')
+FIXED = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
-BASE_NAMES = (
-    *(f'accelerometer.bias.{a}' for a in AXES), *(f'accelerometer.matrix.{AXES[i]}{AXES[j]}' for i, j in LOWER),
-    *(f'gyroscope.bias.{a}' for a in AXES), *(f'gyroscope.matrix.{a}{b}' for a in AXES for b in AXES))
+BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in FIXED)
 """Parameters that every calibration by hand has, in their order."""
 N_BASE = len(BASE_NAMES)
 ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
 BASE_NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
 """Zero bias, identity matrices."""
-UNKNOWN_BY_HAND = ('lever', 'attitude')
-"""Column groups that need more than gravity in poses and the rates between them."""
+UNKNOWN_BY_HAND = {'angular acceleration', 'attitude'}
+"""Quantities that gravity in poses and the rates between them do not tell."""
 REPEATS = 4
 """Fixed-point steps that invert an effect: each gains a factor of its size against the input, a thousand or more."""
 
 
 def possible_by_hand(effect):
     """Return whether gravity in poses and the turns between them can show an effect: it has columns, and none of them asks for a table."""
-    return bool(effect.groups) and effect.warp is None and not set(effect.groups) & set(UNKNOWN_BY_HAND)
+    return bool(effect.groups) and effect.warp is None and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
 
 
 def unpack(values):
@@ -61,7 +60,7 @@ class HandModel:
 
     def __post_init__(self):
         """Refuse what cannot be seen by hand."""
-        strange = [e.name for e in self.model.effects if e.name not in ('bias', 'matrix') and not possible_by_hand(e)]
+        strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
             raise InputError(f'calibration by hand knows gravity and the turns between poses, {", ".join(strange)} cannot be seen from them; '
                              'give a table, or leave it out', key='table')
@@ -69,13 +68,13 @@ class HandModel:
     @cached_property
     def extras(self):
         """Effects beyond bias and matrix, in parameter order."""
-        return [e for e in self.model.effects if e.name not in ('bias', 'matrix')]
+        return self.model.further
 
     @cached_property
     def parts(self):
         """(sensor, effect name) -> slice of the parameter vector, for the further effects."""
         ends = np.cumsum([N_BASE] + [e.size for e in self.extras])
-        return {(e.sensor, e.name): slice(a, b) for e, a, b in zip(self.extras, ends, ends[1:])}
+        return {e.key: slice(a, b) for e, a, b in zip(self.extras, ends, ends[1:])}
 
     @cached_property
     def param_names(self):
@@ -91,20 +90,18 @@ class HandModel:
     def nominal(self):
         """Values before any data, shape (n,)."""
         start = self.model.start()
-        return np.concatenate([BASE_NOMINAL, *(start[self.model.slices[e.sensor, e.name]] for e in self.extras)])
+        return np.concatenate([BASE_NOMINAL, *(start[self.model.slices[e.key]] for e in self.extras)])
 
     @cached_property
     def priors(self):
         """Standard deviations about `nominal` before any data, shape (n,)."""
-        sds = {(e.sensor, e.name): prior_sds(e) for e in self.model.effects}
-        base = [sds[tuple(name.split('.')[:2])][0] for name in BASE_NAMES]
-        return np.concatenate([base, *(sds[e.sensor, e.name] for e in self.extras)])
+        known = dict(zip(self.model.param_names, self.model.prior()[1]))
+        return np.array([known[name] for name in self.param_names])
 
     def tolerances(self, given):
         """Return the standard deviations that are good enough, shape (n,); the catalogue's where `given` has none."""
-        known = {(e.sensor, e.name): e.tolerance for e in self.model.effects}
-        keys = [tuple(name.split('.')[:2]) for name in self.param_names]
-        return np.array([given.get(sensor, {}).get(effect, known[sensor, effect]) for sensor, effect in keys], float)
+        known = dict(zip(self.model.param_names, tolerances_of(self.model, given)))
+        return np.array([known[name] for name in self.param_names])
 
     def index_of(self, sensor):
         """Return the parameters of one sensor, bias and matrix first."""
@@ -150,8 +147,8 @@ class HandModel:
         ref = _reference(force, rate, time, temperature_c, self.gravity)
         point, own = self.model.full_point(), self.model.values_of(sensor, self.in_model_order(values))
         for effect in effects:
-            basis = {group: GROUPS[group](ref, point) for group in effect.groups}
-            coefficients, slopes = _coefficients(effect, own, point)
+            basis = {group.name: group.columns(ref, point) for group in effect.groups}
+            coefficients, slopes = effect_slopes(effect, own, point)
             output = output + sum(basis[group] @ block for group, block in coefficients.items())
             columns.append(sum(np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()))
         return output, np.concatenate(columns, axis=2)
@@ -194,14 +191,3 @@ def _reference(force, rate, time, temperature_c, gravity):
     time = np.zeros(len(force)) if time is None else np.asarray(time, float)
     return Reference(time, np.zeros((len(force), 3, 3)), force, rate, np.zeros_like(force), gravity, temperature_c)
 
-
-def _coefficients(effect, own, point):
-    """Return {group: coefficients (w, 3)} and {group: derivative by the effect's own values (w, 3, p)}, by complex steps."""
-    found = effect.coefficients(own, point)
-    slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
-    for k in range(effect.size):
-        moved = own[effect.name].astype(complex)
-        moved[k] += 1e-30j
-        for group, block in effect.coefficients({**own, effect.name: moved}, point).items():
-            slopes[group][..., k] = np.imag(block) / 1e-30
-    return found, slopes

@@ -8,6 +8,7 @@ from imu_calibration.by_hand.calibrate import ByHandSettings, calibrate_by_hand
 from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, make_windows
 from imu_calibration.by_hand.relative_arm_fit import Rows, fit_arm, jackknife_covariance, lever_rows, response
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.reference.reference_motion import skew
 from imu_calibration.segmentation.static_detector import find_still
@@ -301,7 +302,7 @@ def _calibration_covariance(fit, rows, a, b):
 def _matrix_covariance(calibration):
     if calibration is None:
         return UNCALIBRATED_SCALE_SD**2 * np.eye(9)
-    index = [calibration.param_names.index(f'gyroscope.matrix.{p}{q}') for p in 'xyz' for q in 'xyz']
+    index = [calibration.param_names.index(name) for name in linear_names('gyroscope').ravel()]
     return calibration.covariance[np.ix_(index, index)]
 
 

@@ -15,7 +15,8 @@ from imu_calibration.calibration.status import HELD, statuses, tolerances_of
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import parse_effects
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.named_models import parse_effects
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_force
@@ -79,7 +80,8 @@ def read_imu(blocks):
     return recording.imu, recording.counts
 
 
-def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None):
+def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None,
+                                catalogue=CATALOGUE):
     """
     Calibrate a recording without a table and return (Calibration, HandCalibration, Gathered, tolerances).
 
@@ -94,17 +96,20 @@ def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=N
         {section: {effect: tolerance}}.
     accelerometer, gyroscope : tuple of str, optional
         Effects to estimate, see `calibrate_by_hand`.
+    catalogue : Catalogue
+        Where they are declared.
 
     """
     recording = read_by_hand(blocks, nominal)
-    return calibrate_samples_by_hand(recording, gravity, tolerances, provenance, accelerometer, gyroscope)
+    return calibrate_samples_by_hand(recording, gravity, tolerances, provenance, accelerometer, gyroscope, catalogue=catalogue)
 
 
-def calibrate_samples_by_hand(recording, gravity=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None, stills=None):
+def calibrate_samples_by_hand(recording, gravity=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None, stills=None,
+                              catalogue=CATALOGUE):
     """Calibrate a HandRecording; `stills` as in `calibrate_by_hand`, the rest and what is returned as in `calibrate_recording_by_hand`."""
     gravity, gravity_sd = reference_gravity(gravity)
     hand = calibrate_by_hand(recording.imu, gravity, stills, gravity_sd=gravity_sd, accelerometer=accelerometer, gyroscope=gyroscope,
-                             temperature_c=recording.temperature_c)
+                             temperature_c=recording.temperature_c, catalogue=catalogue)
     gathered = recording.gathered
     calibration, limits = document_of_hand(hand, gathered, len(recording.imu), tolerances, provenance)
     return calibration, hand, gathered, limits
@@ -149,10 +154,11 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
     """
     if len(sources) != 1:
         raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
-    names = {sensor: None if text is None else parse_effects(sensor, text)
+    names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
              for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
     preflight = Preflight(gravity, options.nominal)
-    result = result_by_hand(*calibrate_recording_by_hand(preflight.watch(sources[0]()), gravity, options.nominal, options.tolerances, provenance, **names), options)
+    result = result_by_hand(*calibrate_recording_by_hand(preflight.watch(sources[0]()), gravity, options.nominal, options.tolerances, provenance, **names,
+                                                          catalogue=options.catalogue), options)
     result.gathered.findings = preflight.findings
     return replace(result, calibration=replace(result.calibration, statistics=result.calibration.statistics | preflight_statistics(preflight.findings)))
 

@@ -8,6 +8,7 @@ from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.solver import solve
@@ -45,7 +46,9 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
 
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
-    model = choose_model(options, table, _first_temperature(sources, options))
+    model = choose_model(options, table)
+    if model.needs_temperature:
+        model = model.with_reference_temperature(_first_temperature(sources))
     for _ in range(PASSES):
         step = GatherStep(table, model, options.windows, options.nominal, names, progress)
         gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
@@ -57,10 +60,8 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
     return result
 
 
-def _first_temperature(sources, options):
-    """Return the first temperature of the first recording when a thermal effect asks for a reference temperature."""
-    if 'thermal' not in (options.accelerometer_model or '') + (options.gyroscope_model or ''):
-        return None
+def _first_temperature(sources):
+    """Return the first temperature of the first recording."""
     for block in sources[0]():
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
@@ -73,7 +74,7 @@ def finish(gathered, model, table, options=CalibrationOptions(), provenance=None
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
     solution = solve(accumulator, narrow)
     if options.accelerometer_model is None and _size_effect_unseen(solution):
-        smaller = narrow.without('accelerometer', 'accel_size_effect').without('accelerometer', 'lever_arm')
+        smaller = narrow.without_arms()
         solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
     tolerances = tolerances_of(narrow, options.tolerances)
     calibration = document(solution, tolerances, table, gathered, provenance)
@@ -81,5 +82,5 @@ def finish(gathered, model, table, options=CalibrationOptions(), provenance=None
 
 
 def _size_effect_unseen(solution):
-    part = solution.model.slices.get(('accelerometer', 'accel_size_effect'))
-    return part is not None and bool(solution.held[part].all())
+    part = solution.model.part('accelerometer', Role.ARMS)
+    return part.stop > part.start and bool(solution.held[part].all())

@@ -6,10 +6,11 @@ import numpy as np
 
 from imu_calibration.calibration import shown
 from imu_calibration.calibration.document_checks import check_numbers, check_parts
-from imu_calibration.calibration.document_parts import IN_REFERENCE, SECTIONS, parts_of
+from imu_calibration.calibration.document_parts import parts_of
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.catalogue import catalogue, find_effect
+from imu_calibration.effects.base import SECTIONS
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
 
@@ -61,8 +62,12 @@ class Calibration:
 
     def value(self, sensor, effect):
         """Return the value of one effect in its documented shape."""
-        found = find_effect(sensor, effect, self.model.joint_names)
+        found = self.model.catalogue.find(sensor, effect, self.model.joint_names)
         return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
+
+    def of(self, sensor, role):
+        """Return the value of the effect in a place of a sensor's equation (`effects.base.Role`) in its documented shape, or None."""
+        return self.model.value(sensor, role, self.values)
 
     def has(self, sensor, effect):
         """Return whether the model contains the effect."""
@@ -73,6 +78,11 @@ class Calibration:
         found = self.statistics.get(sensor, {})
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
         return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
+
+    @property
+    def requested(self):
+        """Status of the parameters that somebody asks for, by name; table, clock and the common arm are nuisances."""
+        return {name: status for name, status, wanted in zip(self.param_names, self.status, self.model.requested) if wanted}
 
     def all_determined(self):
         """Return whether every parameter is determined."""
@@ -112,7 +122,7 @@ class Calibration:
         return shown.as_html(self)
 
 
-def checked_tolerances(mapping):
+def checked_tolerances(mapping, catalogue=CATALOGUE):
     """
     Return the content of a tolerance file when it is one: {section: {effect: number above zero}}.
 
@@ -122,7 +132,7 @@ def checked_tolerances(mapping):
         When a section or an effect does not exist, or a tolerance is no number above zero.
 
     """
-    known = {section: [name for owner, name in catalogue() if owner == section] for section in SECTIONS}
+    known = {section: [name for owner, name in catalogue.effects() if owner == section] for section in SECTIONS}
     for section, entries in mapping.items():
         if section not in known or not isinstance(entries, dict):
             raise InputError(f'a tolerance file must hold the mappings {", ".join(SECTIONS)}, it holds {shortened(repr(section))}: '
@@ -138,6 +148,9 @@ def checked_tolerances(mapping):
 def to_mapping(calibration):
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
+    definitions = calibration.model.catalogue.definitions({effect.name for effect in calibration.model.effects})
+    if definitions:
+        document['effects'] = _plain(definitions)
     for section in SECTIONS:
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
@@ -153,15 +166,11 @@ def to_mapping(calibration):
     return document
 
 
-def _members(model, section):
-    return [e for e in model.effects if (e.name in IN_REFERENCE and section == 'reference') or (e.sensor == section and e.name not in IN_REFERENCE)]
-
-
 def _section(calibration, section):
-    effects = _members(calibration.model, section)
+    effects = [effect for effect in calibration.model.effects if effect.section == section]
     entries = {'effects': [effect.name for effect in effects]}
     for effect in effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
+        part = calibration.model.slices[effect.key]
         status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
         entries[effect.name] = {
             'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.sd[part].reshape(effect.shape)),

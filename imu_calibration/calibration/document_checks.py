@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from imu_calibration.calibration.document_parts import SECTIONS
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import DocumentError, shortened
 
 CONDITION_LIMIT = 20.0
@@ -119,7 +119,8 @@ def check_numbers(calibration):
 
     """
     values, covariance = calibration.values, calibration.covariance
-    levels = np.array([name.endswith('saturation.level') for name in calibration.param_names], bool)
+    effects = calibration.model.effects
+    levels = np.repeat([e.role is Role.LIMIT for e in effects], [e.size for e in effects])
     if not np.all(np.isfinite(values[~levels])) or not np.all(np.isfinite(covariance)):
         raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again')
     if not np.all(values[levels] > 0):
@@ -128,10 +129,10 @@ def check_numbers(calibration):
         raise DocumentError(f'values and standard deviations must stay below {LARGEST:g}, some do not; calibrate again')
     _check_covariance(covariance)
     for sensor in SENSORS:
-        for needed in ('bias', 'matrix'):
+        for needed in BASE:
             if not calibration.has(sensor, needed):
                 raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
-        condition = np.linalg.cond(calibration.value(sensor, 'matrix'))
+        condition = np.linalg.cond(calibration.of(sensor, Role.LINEAR))
         if not condition < CONDITION_LIMIT:
             raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {condition:.3g}; '
                                 'calibrate again with more attitudes')

@@ -3,14 +3,11 @@
 import numpy as np
 
 from imu_calibration.calibration.status import Status
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SECTIONS
+from imu_calibration.effects.catalogue import JOINTS, Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, shortened
 from imu_calibration.reference.joint import JointNames
-
-SECTIONS = SENSORS + ('reference',)
-IN_REFERENCE = {'lever_arm': 'accelerometer', 'accel_bandwidth': 'accelerometer', 'gyro_bandwidth': 'gyroscope'}
-"""Effects of a sensor that a document lists under `reference`, since they belong to the table and the session -> that sensor."""
 
 
 def parts_of(document):
@@ -24,10 +21,10 @@ def parts_of(document):
 
     """
     model, entries = _model(document)
-    values = np.concatenate([_shaped(entries[e.sensor, e.name]['value'], e) for e in model.effects])
-    status = [word for e in model.effects for word in _statuses(entries[e.sensor, e.name]['status'], e)]
+    values = np.concatenate([_shaped(entries[e.key]['value'], e) for e in model.effects])
+    status = [word for e in model.effects for word in _statuses(entries[e.key]['status'], e)]
     for effect in model.effects:
-        entry = entries[effect.sensor, effect.name]
+        entry = entries[effect.key]
         _check_unit(entry.get('unit'), effect)
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
             raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; write it anew")
@@ -40,18 +37,20 @@ def parts_of(document):
 
 def _model(document):
     """Return (SensorModel, {(sensor, effect): what the document says of it})."""
+    joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
+    catalogue = Catalogue.from_definitions(document.get('effects') or {})
+    owners = {effect.name: effect.sensor for effect in catalogue.effects(joint_names).values() if effect.in_reference}
     members, entries = {section: [] for section in SECTIONS}, {}
     for section in SECTIONS:
         part = document.get(section) or {'effects': []}
         for name in part['effects']:
-            sensor = IN_REFERENCE.get(name, section)
+            sensor = owners.get(name, section)
             if (sensor, name) in entries:
                 raise DocumentError(f"an effect must be listed once, '{name}' is there twice")
             members[sensor].append(name)
             entries[sensor, name] = part[name]
-    joint_names = JointNames.of(document.get('joint_names', ('outer', 'middle', 'inner')), document.get('joint_errors'))
     return SensorModel(*(tuple(members[s]) for s in SECTIONS), joint_names=joint_names,
-                       temperature_ref_c=float(document.get('reference_temperature_c', 25.0))), entries
+                       temperature_ref_c=float(document.get('reference_temperature_c', 25.0)), catalogue=catalogue), entries
 
 
 def _shaped(value, effect):
@@ -77,6 +76,6 @@ def _check_unit(found, effect):
 def _covariance(given, model, entries):
     """Return the covariance in the model's order; without one, the diagonal of the standard deviations."""
     if not given:
-        return np.diag(np.concatenate([_shaped(entries[e.sensor, e.name]['sd'], e) for e in model.effects])**2)
+        return np.diag(np.concatenate([_shaped(entries[e.key]['sd'], e) for e in model.effects])**2)
     order = [given['names'].index(name) for name in model.param_names]
     return np.asarray(given['matrix'], float)[np.ix_(order, order)]

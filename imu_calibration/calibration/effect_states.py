@@ -50,7 +50,7 @@ def group_states(result):
     needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, prior_sd)
     names, sd, states = calibration.param_names, calibration.sd, []
     for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
+        part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
         state = group_status(status)
@@ -77,7 +77,7 @@ def hand_group_states(result):
     calibration, states = result.calibration, []
     names, sd = calibration.param_names, calibration.sd
     for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
+        part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         state = group_status(calibration.status[part])
         own = set(names[part]) if state != Progress.DETERMINED else set()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.constants import ARCMIN, STANDARD_GRAVITY
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns, warped_reference
 from imu_calibration.effects.forward_equations import coefficient_jacobian, sensor_output
 from imu_calibration.estimation.noise_model import sessions_of
@@ -84,7 +84,7 @@ def error_budget(result, errors=ReferenceErrors()):
 def _causes(result, errors, gravity_sd):
     """Return (name, text, scattered, changes); a change turns (table, motion) into what they truly are, one sd away."""
     found = []
-    if ('reference', 'table_tilt') not in result.solution.model.slices:
+    if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
         found.append(('levelling', text, False, [_Tilted(errors.levelling * np.eye(2)[k]) for k in range(2)]))
     text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, drawn anew in every window'
@@ -222,8 +222,7 @@ def _piece(result, kind, time, session, count, stride, motion, temperature, chan
 
 def _known(model, motion, temperature):
     """Return temperatures where the model needs them; at rest their mean was not kept and the reference temperature stands in."""
-    needs = any(name.endswith('temperature') for sensor in SENSORS for name, _ in model.groups(sensor))
-    return np.full(len(motion), model.temperature_ref_c) if needs and temperature is None else temperature
+    return np.full(len(motion), model.temperature_ref_c) if model.needs_temperature and temperature is None else temperature
 
 
 def _output(model, sensor, values, table, motion, temperature):
@@ -236,7 +235,7 @@ def _budget_by_hand(result, errors):
     causes, texts = {'noise': result.calibration.sd}, {'noise': 'noise, scatter of poses and turns, as this recording shows them'}
     if solution.gravity == STANDARD_GRAVITY:
         return ErrorBudget(tuple(model.param_names), causes, {'noise': texts['noise'] + ', and the gravity, which was not given'})
-    part = model.slices['accelerometer', 'matrix']
+    part = model.part('accelerometer', Role.LINEAR)
     gravity = np.zeros(len(result.calibration.values))
     gravity[part] = np.abs(result.calibration.values[part]) * errors.gravity / solution.gravity
     return ErrorBudget(tuple(model.param_names), causes | {'gravity': gravity}, texts | {'gravity': f'gravity known to {errors.gravity:.2g} m/s²'})

@@ -8,7 +8,7 @@ import imu_calibration
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.status import statuses
 from imu_calibration.calibration.verdict import judged
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.preflight.checks import unusable, warnings
@@ -25,7 +25,7 @@ def document(solution, tolerances, table, gathered, provenance=None):
     needed = observability.needed_motions(solution, tolerances, table.gravity_value, prior.sd)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
-    centred = ('accelerometer', 'lever_arm') in model.slices and ('accelerometer', 'accel_size_effect') in model.slices
+    centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
                               statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
@@ -42,7 +42,7 @@ def with_gravity_uncertainty(solution, table):
     if not table.gravity_sd:
         return solution.covariance
     direction = np.zeros(len(solution.values))
-    part = solution.model.slices['accelerometer', 'matrix']
+    part = solution.model.part('accelerometer', Role.LINEAR)
     direction[part] = solution.values[part] * table.gravity_sd / table.gravity_value
     return solution.covariance + np.outer(direction, direction)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.effects.base import Role
 from imu_calibration.samples import NominalScaling
 
 
@@ -52,9 +53,9 @@ def derive(calibration, sensor):
         'accelerometer' or 'gyroscope'.
 
     """
-    matrix, bias = calibration.value(sensor, 'matrix'), calibration.value(sensor, 'bias')
-    parts = {name: calibration.model.slices[sensor, name] for name in ('matrix', 'bias')}
-    covariance = calibration.covariance[parts['matrix'], parts['matrix']]
+    matrix, bias = calibration.of(sensor, Role.LINEAR), calibration.of(sensor, Role.OFFSET)
+    linear, offset = (calibration.model.part(sensor, role) for role in (Role.LINEAR, Role.OFFSET))
+    covariance = calibration.covariance[linear, linear]
     scale, axes = split(matrix)
     tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[:, None, None]  # d axes_i / d row_i
     blocks = [covariance[3 * i:3 * i + 3, 3 * i:3 * i + 3] for i in range(3)]
@@ -63,7 +64,7 @@ def derive(calibration, sensor):
     angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
     between = np.array([_angle(axes[i], axes[j]) for i, j in PAIRS])
     between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in PAIRS])
-    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[parts['bias']],
+    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[offset],
                    np.linalg.solve(matrix, bias))
 
 

@@ -12,7 +12,7 @@ LINEAR_STEPS = 25
 
 def linearise_again(model, solution):
     """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
-    return model.at(_values_in(model, solution, _cautious(solution))) if _needs_another_pass(model, solution) else None
+    return model.at(model.start_from(solution.model, _cautious(solution))) if _needs_another_pass(model, solution) else None
 
 
 def _cautious(solution):
@@ -26,8 +26,8 @@ def _cautious(solution):
     move, pull = np.zeros(len(values)), np.zeros(len(values))
     for effect in model.relinearised:
         if effect.warp is not None:
-            part = model.slices[effect.sensor, effect.name]
-            move[part], pull[part] = values[part] - model.warp_point(effect), (LINEAR_STEPS * effect.step)**-2
+            part = model.slices[effect.key]
+            move[part], pull[part] = values[part] - model.point_of(effect), (LINEAR_STEPS * effect.step)**-2
     moving = np.flatnonzero(pull)
     if not len(moving):
         return values
@@ -40,17 +40,11 @@ def _cautious(solution):
 def _needs_another_pass(model, solution):
     """Return whether an effect moved so far from where its columns were taken that the first derivative no longer holds."""
     for effect in model.relinearised:
-        if (effect.sensor, effect.name) not in solution.model.slices:
+        if effect.key not in solution.model.slices:
             continue
-        part = solution.model.slices[effect.sensor, effect.name]
-        moved = np.abs(solution.values[part] - model.warp_point(effect))
+        part = solution.model.slices[effect.key]
+        moved = np.abs(solution.values[part] - model.point_of(effect))
         if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
             return True
     return False
 
-
-def _values_in(model, solution, known):
-    values = model.start()
-    for effect in solution.model.effects:
-        values[model.slices[effect.sensor, effect.name]] = known[solution.model.slices[effect.sensor, effect.name]]
-    return values

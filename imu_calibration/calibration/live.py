@@ -66,13 +66,13 @@ class LiveCalibration:
 
     def __init__(self, table, options=CalibrationOptions(), settings=LiveSettings(), earlier=None):
         self.table, self.options, self.settings, self.earlier = table, options, settings, earlier
-        self._thermal = 'thermal' in (options.accelerometer_model or '') + (options.gyroscope_model or '')
+        self._asked = choose_model(options, table)
         self._waiting, self._collector = [], None
         self.result = None
         self.open_windows = []
         """Windows that were still open at the last solution with `pending`, closed in a copy."""
-        if not self._thermal:
-            self._begin(None)
+        if not self._asked.needs_temperature:
+            self._begin(self._asked)
 
     @property
     def n_windows(self):
@@ -116,14 +116,13 @@ class LiveCalibration:
         del self._waiting[:-HELD_BACK]
         if block.temperature is None or not len(block.temperature):
             return []
-        self._begin(float(block.temperature.temperature_c[0]))
+        self._begin(self._asked.with_reference_temperature(float(block.temperature.temperature_c[0])))
         blocks, self._waiting = self._waiting, []
         for held_back in blocks:
             self._collector.push(held_back)
         return self._completed()
 
-    def _begin(self, temperature_c):
-        model = choose_model(self.options, self.table, temperature_c)
+    def _begin(self, model):
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)

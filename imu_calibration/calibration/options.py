@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from imu_calibration.effects.sensor_model import SensorModel, parse_effects
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 
@@ -22,9 +24,11 @@ class CalibrationOptions:
     """How windows are found."""
     nominal: object | None = None
     """NominalScaling for recordings in volts or counts."""
+    catalogue: Catalogue = CATALOGUE
+    """The effects that there are."""
 
 
-def choose_model(options, table, temperature_c=None):
+def choose_model(options, table):
     """
     Return the model whose columns are gathered; `settle_model` takes out what the rotation does not show.
 
@@ -32,16 +36,10 @@ def choose_model(options, table, temperature_c=None):
     sensitive points.
     """
     names = table.joint_names
-    accelerometer = parse_effects('accelerometer', options.accelerometer_model or 'bias+matrix+accel_size_effect', names)
-    gyroscope = parse_effects('gyroscope', options.gyroscope_model or 'bias+matrix', names)
-    if 'accel_size_effect' in accelerometer and table.mount_xyz is None and 'lever_arm' not in accelerometer:
-        accelerometer += ('lever_arm',)
-    if options.reference_model is None:
-        reference = ('table_tilt',) + (('earth_rate',) if table.latitude is None or table.azimuth_deg is None else ())
-    else:
-        reference = tuple(name for name in options.reference_model.split('+') if name not in ('', 'none'))
-    reference_c = 25.0 if temperature_c is None else float(round(temperature_c))
-    return SensorModel(accelerometer, gyroscope, reference, names, reference_c)
+    asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
+    chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, options.catalogue) for sensor, text in asked.items()}
+    model = SensorModel(**chosen, reference=parse_reference(options.reference_model, table), joint_names=names, catalogue=options.catalogue)
+    return with_common_arm(model) if table.mount_xyz is None else model
 
 
 def settle_model(model, options, gathered):
@@ -49,5 +47,5 @@ def settle_model(model, options, gathered):
     if options.accelerometer_model is not None:
         return model
     if gathered.accumulator.samples.get('spin', 0) + gathered.accumulator.samples.get('dynamic', 0) == 0:
-        return model.without('accelerometer', 'accel_size_effect').without('accelerometer', 'lever_arm')
+        return model.without_arms()
     return model

@@ -10,8 +10,7 @@ def implausible(calibration):
         if not effect.plausible:
             continue
         grade, largest, source = effect.plausible[-1]
-        values = calibration.values[calibration.model.slices[effect.sensor, effect.name]]
-        size = np.max(np.abs(values if effect.components[-1] != 'time_constant' or effect.size == 1 else values[:-1]))
+        size = np.max(np.abs(effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])))
         if size > 10 * largest:
             lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
                          f'({largest:.3g}; {source}): check units and axes')

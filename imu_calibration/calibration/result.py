@@ -8,7 +8,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import judge, requested
+from imu_calibration.calibration.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
 
 
@@ -47,5 +47,5 @@ def summary(result, hints=None):
 def exit_code(result):
     """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
     calibration = result.calibration
-    lacking = any(status != DETERMINED for name, status in zip(calibration.param_names, calibration.status) if requested(name))
+    lacking = any(status != DETERMINED for status in calibration.requested.values())
     return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0

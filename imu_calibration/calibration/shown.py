@@ -18,7 +18,7 @@ NUMBERS = ('value', 'sd')
 def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
     """Yield the cells of each parameter in the order of `HEADINGS`."""
     for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
+        part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
             factor, unit = for_people(effect.unit_of(k))
             value, sd = with_sd(calibration.values[index] * factor, calibration.sd[index] * factor)

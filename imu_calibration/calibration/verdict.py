@@ -8,7 +8,8 @@ import numpy as np
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import with_hint
 from imu_calibration.units import for_people, significant
 
@@ -33,7 +34,7 @@ LOOSE = 2.0
 """From this factor on the misfit is worth a note."""
 LOST_SHARE = 0.05
 """Losing more than this share of the samples is worth a look at the recording."""
-SCALES = tuple(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz')
+SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
 HAND_AXES = 'accelerometer_lower_triangular'
 """The axes of a calibration by hand."""
 SHOWN_NAMES = 6
@@ -70,11 +71,6 @@ class Verdict:
             lines.append(reason.what if reason.word in (GOOD, self.word) else f'{reason.word}: {reason.what}')
             lines += [f'next: {with_hint(reason.next, reason.key, hints or {})}'] if reason.next else []
         return list(dict.fromkeys(lines))
-
-
-def requested(name):
-    """Return whether a parameter is the robot's business; table, clock and the common arm are nuisances."""
-    return not name.startswith('reference.') and '.lever_arm.' not in name
 
 
 def judge(calibration, tolerances):
@@ -131,9 +127,9 @@ def _misfits(calibration):
 def _blind(calibration):
     reasons = []
     for sensor in SENSORS:
-        own = {n: s for n, s in zip(calibration.param_names, calibration.status) if n.startswith(sensor) and requested(n)}
-        matrix_held = all(status == HELD for name, status in own.items() if '.matrix.' in name)
-        if own and matrix_held and DETERMINED not in own.values():
+        own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
+        matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
+        if own and matrix_held and DETERMINED not in own:
             reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor)))
     return reasons
 
@@ -146,7 +142,7 @@ def _first_need(calibration, start=''):
 def _undetermined(calibration):
     reasons = []
     for status, text in ((Status.WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
-        names = [n for n, s in zip(calibration.param_names, calibration.status) if s == status and requested(n)]
+        names = [name for name, found in calibration.requested.items() if found == status]
         if status == Status.WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
             what = f'{listed(scale)}: the local gravity was not given, which scales them together'
@@ -185,12 +181,11 @@ def listed(names):
 
 
 def _all_well(calibration, tolerances):
-    share = np.where([requested(n) for n in calibration.param_names], calibration.sd / tolerances, 0.0)
+    share = np.where(calibration.model.requested, calibration.sd / tolerances, 0.0)
     worst = int(np.argmax(share))
-    count = sum(requested(n) for n in calibration.param_names)
     fit = [ratio for sensor in SENSORS for ratio in _ratios(calibration, sensor).values()]
     more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {_quiet(calibration)}' if fit else ''
-    return Reason(GOOD, f'all {count} parameters are within their tolerance (the closest, {calibration.param_names[worst]}, '
+    return Reason(GOOD, f'all {len(calibration.requested)} parameters are within their tolerance (the closest, {calibration.param_names[worst]}, '
                         f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', or compensator_node")
 
 
@@ -208,10 +203,10 @@ def _unstable(calibration, tolerances):
     """Return notes on biases that move from window to window by more than the tolerance on their mean."""
     reasons = []
     for sensor in SENSORS:
-        part = calibration.model.slices[sensor, 'bias']
+        offset = calibration.model.find(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
-        if scatter > tolerances[part][0]:
-            factor, unit = for_people(calibration.model.effects[[e.sensor for e in calibration.model.effects].index(sensor)].unit_of(0))
+        if scatter > tolerances[calibration.model.slices[offset.key]][0]:
+            factor, unit = for_people(offset.unit)
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by {significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',
                                   'let the IMU warm up and the table stand firm, or estimate the bias in use'))

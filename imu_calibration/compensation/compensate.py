@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
@@ -72,7 +72,7 @@ def invertible(model):
 def invertible_values(calibration):
     """Return (model, values) of the part of a calibration that compensation inverts."""
     model = invertible(calibration.model)
-    values = np.concatenate([calibration.values[calibration.model.slices[e.sensor, e.name]] for e in model.effects])
+    values = np.concatenate([calibration.values[calibration.model.slices[e.key]] for e in model.effects])
     return model, values
 
 
@@ -99,7 +99,7 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
 
     """
     model, values = invertible_values(calibration)
-    if temperature_c is None and needs_temperature(model):
+    if temperature_c is None and model.needs_temperature:
         raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
     with np.errstate(over='ignore', invalid='ignore'):
         true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, temperature_c)
@@ -112,14 +112,9 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
     return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged, marks)
 
 
-def needs_temperature(model):
-    """Return whether an effect of the model depends on temperature."""
-    return any('temperature' in effect.needs for effect in model.effects)
-
-
 def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
-    inverse = {s: np.linalg.inv(values[model.slices[s, 'matrix']].reshape(3, 3)) for s in SENSORS}
-    bias = {s: values[model.slices[s, 'bias']] for s in SENSORS}
+    inverse = {s: np.linalg.inv(model.value(s, Role.LINEAR, values)) for s in SENSORS}
+    bias = {s: model.value(s, Role.OFFSET, values) for s in SENSORS}
     measured = {'accelerometer': force_s, 'gyroscope': rate_s}
     true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
     attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
@@ -144,8 +139,8 @@ def moved(transfer, force_s, rate_s, alpha_s):
 
 def saturation_level(calibration, sensor):
     """Return the reading from which a sensor counts as saturated, infinite without a saturation in the calibration."""
-    name = {'accelerometer': 'accel_saturation', 'gyroscope': 'gyro_saturation'}[sensor]
-    return float(calibration.value(sensor, name)) * (1 - 1e-6) if calibration.has(sensor, name) else np.inf
+    level = calibration.of(sensor, Role.LIMIT)
+    return np.inf if level is None else float(level) * (1 - 1e-6)
 
 
 def saturation_marks(calibration, force_s, rate_s):
@@ -160,9 +155,8 @@ def saturation_marks(calibration, force_s, rate_s):
 
 def arms_of(calibration):
     """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
-    if not calibration.has('accelerometer', 'accel_size_effect'):
-        return np.zeros((3, 3))
-    return calibration.value('accelerometer', 'accel_size_effect')
+    arms = calibration.of('accelerometer', Role.ARMS)
+    return np.zeros((3, 3)) if arms is None else arms
 
 
 def outside_conditions(calibration, rate_s, temperature_c=None):

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.compensation.kernel import make_kernel
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import columns_at_point
 from imu_calibration.effects.forward_equations import coefficients_at_point
 from imu_calibration.reference.reference_motion import Reference
@@ -66,8 +66,8 @@ class Uncertainty:
     def __init__(self, calibration, transfer=None, derivative=None):
         self._model, self._values = invertible_values(calibration)
         self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
-        self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
-        index = [np.arange(len(calibration.values))[calibration.model.slices[e.sensor, e.name]] for e in self._model.effects]
+        self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
+        index = [np.arange(len(calibration.values))[calibration.model.slices[e.key]] for e in self._model.effects]
         index = np.concatenate(index)
         self._covariance = calibration.covariance[np.ix_(index, index)]
         self._slopes = [self._coefficient_slopes(sensor) for sensor in SENSORS]

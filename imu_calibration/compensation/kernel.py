@@ -1,27 +1,25 @@
 """
 Compensation of one sample after another: a function written for one calibration, in plain floats.
 
-The text of the function is made from the same coefficients that the catalogue's own compensation uses (`compensation`); zeros
-are left out. With bias, matrix and lever arms it is one straight line of products; every further effect adds fixed-point steps.
+The text of the function is made of the texts of the column groups and of the coefficients that the catalogue's own compensation uses
+(`compensation.compensate`), multiplied out; zeros are left out. With bias, matrix and lever arms it is one straight line of products; every
+further effect adds fixed-point steps.
 """
+
+import re
 
 import numpy as np
 
 from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, invertible_values
-from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
-from imu_calibration.effects.regressors import CUBES, SQUARES
+from imu_calibration.effects.regressors import LEVER
 
 SETTLED = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) after which there is nothing left to gain."""
-OWN = {'accelerometer': 'force', 'gyroscope': 'rate'}
-LEVER = ('-(yy + zz)', 'xy - gz', 'xz + gy', 'xy + gz', '-(xx + zz)', 'yz - gx', 'xz - gy', 'yz + gx', '-(xx + yy)')
-"""Entries of ``[alpha x] + [omega x]^2`` by rows, from products of rates and the angular acceleration g."""
-PRODUCTS = ('xx', 'yy', 'zz', 'xy', 'xz', 'yz', 'gx', 'gy', 'gz')
-LEVER_OF_PRODUCTS = np.array([[0, -1, -1, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0, 0, -1], [0, 0, 0, 0, 1, 0, 0, 1, 0],
-                              [0, 0, 0, 1, 0, 0, 0, 0, 1], [-1, 0, -1, 0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1, -1, 0, 0],
-                              [0, 0, 0, 0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 1, 1, 0, 0], [-1, -1, 0, 0, 0, 0, 0, 0, 0]], float)
-"""The same as a matrix, rows as in `LEVER`, columns as in `PRODUCTS`."""
+BEFOREHAND = {'temperature', 'reference temperature'}
+"""What is known of a sample before either sensor is corrected."""
 
 
 def make_kernel(calibration, transfer=None):
@@ -38,114 +36,120 @@ def make_kernel(calibration, transfer=None):
     transfer : compensation.Transfer, optional
         Another point and frame.
 
+    Raises
+    ------
+    InputError
+        When an effect that is to be undone has columns that a single sample does not tell.
+
     """
-    namespace = {}
+    namespace = dict(SCALAR_FUNCTIONS)
     exec(compile(kernel_text(calibration, transfer), '<compensation kernel>', 'exec'), namespace)
     return namespace['kernel']
 
 
 def kernel_text(calibration, transfer=None):
-    """Return the Python text of the function that `make_kernel` compiles."""
+    """Return the Python text of the function that `make_kernel` compiles: measured f, w, a to true force u, rate v and slope g."""
     model, values = invertible_values(calibration)
-    parts = {sensor: _Part(model, sensor, values) for sensor in SENSORS}
-    accel, gyro = parts['accelerometer'], parts['gyroscope']
+    known = _known(model.temperature_ref_c)
+    accel, gyro = (_Part(model, sensor, values, known) for sensor in SENSORS)
     turn, arm = (np.eye(3), np.zeros(3)) if transfer is None else (transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t)
+    at_arm = [_sum(arm, row) for row in np.reshape(LEVER.products(known), (3, 3))]
+    slope = _turned(gyro.inverse, _vector('a'))
     lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt):']
-    lines += [f'    v{k} = {_sum(row, ("wx", "wy", "wz"), c)}' for k, row, c in zip(AXES, gyro.inverse, gyro.constant)]
-    straight = set(accel.rest) <= {'lever'} and not gyro.rest
-    if not straight:
-        lines += [f'    g{k} = {_sum(row, ("ax", "ay", "az"))}' for k, row in zip(AXES, gyro.inverse)]
-        lines += _iteration(accel, gyro)
-    lever = (accel.rest['lever'] if straight and 'lever' in accel.rest else np.zeros((9, 3))) + np.kron(np.eye(3), arm[:, None])
-    lever = LEVER_OF_PRODUCTS.T @ lever
-    if straight:
-        lever[6:] = gyro.inverse.T @ lever[6:]
-        lines += _outcome(('fx', 'fy', 'fz'), accel.inverse, accel.constant, ('ax', 'ay', 'az'), lever, turn)
+    if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends_with('g'):
+        # Nothing has to be solved: the rate follows from what was measured, and what disturbs the force follows from the rate.
+        lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
+        force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
     else:
-        lines += _outcome(('ux', 'uy', 'uz'), np.eye(3), np.zeros(3), ('gx', 'gy', 'gz'), lever, turn)
-    return '\n'.join(lines) + '\n'
+        lines += _assigned('g', slope, '    ') + _iteration(accel, gyro)
+        force = _less(_vector('u'), at_arm)
+    more, texts = _worked_out(_turned(turn, force) + _turned(turn, _vector('v')), '    ')
+    return '\n'.join([*lines, *more, f'    return ({", ".join(texts)})']) + '\n'
 
 
 class _Part:
-    """One sensor: true = inverse @ measured + constant - rest(true)."""
+    """One sensor: true = alone - rest(true), each three sums of products (`effects.expressions`), `alone` in the measured readings."""
 
-    def __init__(self, model, sensor, values):
-        matrix = values[model.slices[sensor, 'matrix']].reshape(3, 3)
-        bias = values[model.slices[sensor, 'bias']]
+    def __init__(self, model, sensor, values, known):
+        matrix, bias = (model.value(sensor, role, values) for role in (Role.LINEAR, Role.OFFSET))
         self.inverse = np.linalg.inv(matrix)
-        self.constant = -self.inverse @ bias
-        self.rest = {}
-        start, total = 0, coefficients_at_point(model, sensor, values)
-        for group, width in model.groups(sensor):
-            block = total[start:start + width]
-            block = block - (bias if group == 'one' else matrix.T if group == OWN[sensor] else 0.0)
-            start += width
-            if np.any(np.abs(block) > 0) and group not in ('one', OWN[sensor]):
-                self.rest[group] = block @ self.inverse.T
+        measured = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))
+        self.alone = [added(row, {(): -constant}) for row, constant in zip(measured, self.inverse @ bias)]
+        layout, total = model.layout(sensor), coefficients_at_point(model, sensor, values)
+        total[model.columns_of(sensor, Role.OFFSET)] -= bias
+        total[model.columns_of(sensor, Role.LINEAR)] -= matrix.T
+        total, self.rest, self.uses = total @ self.inverse.T, [{}, {}, {}], set()
+        for name, group in layout.groups.items():
+            block = total[layout.rows[name]]
+            if np.any(block):
+                columns = group.products(known)
+                self.rest = [added(row, _sum(block[:, axis], columns)) for axis, row in enumerate(self.rest)]
+                self.uses |= group.uses
+
+    def bends_with(self, letter):
+        """Return whether a variable enters the rest in a product or a function."""
+        return any(re.search(rf'\b{letter}[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
+
+
+def _known(temperature_ref_c):
+    """Return name in a column -> the sum of products that stands for it in the function."""
+    vectors = {f'{letter}_{k}': {(f'{variable}{k}',): 1.0} for letter, variable in (('f', 'u'), ('w', 'v'), ('alpha', 'g')) for k in AXES}
+    return vectors | {'temperature_c': {('dt',): 1.0, (): temperature_ref_c}, 'temperature_ref_c': {(): temperature_ref_c}}
 
 
 def _iteration(accel, gyro):
     """Return the lines that leave the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
-    # The arguments ax, ay, az have gone into gx, gy, gz by now: a is the force, b the rate, that matrix and bias alone would give.
-    lines = [f'    a{k} = {_sum(row, ("fx", "fy", "fz"), c)}' for k, row, c in zip(AXES, accel.inverse, accel.constant)]
-    lines += ['    bx, by, bz, ux, uy, uz = vx, vy, vz, ax, ay, az',
-              f'    for _ in range({ITERATIONS}):', '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
-    for part, names, known in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
-        columns, block = [], []
-        for group, coefficients in part.rest.items():
-            used = np.flatnonzero(np.any(coefficients != 0, axis=1))
-            columns += [_columns(group)[k] for k in used]
-            block.append(coefficients[used])
-        if not columns:
-            continue
-        block = np.concatenate(block)
-        if 'lever' in part.rest:
-            lines += ['        xx, yy, zz, xy, xz, yz = vx * vx, vy * vy, vz * vz, vx * vy, vx * vz, vy * vz']
-        lines += [f'        c{k} = {text}' for k, text in enumerate(columns)]
-        lines += [f'        {names}{axis} = {known}{axis} - ({_sum(block[:, i], [f"c{k}" for k in range(len(columns))])})'
-                  for i, axis in enumerate(AXES)]
+    # ax, ay, az have gone into gx, gy, gz by now: a is the force, b the rate, that matrix and bias alone would give.
+    lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
+    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({ITERATIONS}):', '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
+    for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
+        if any(part.rest):
+            lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
     change = ' + '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
     return lines + [f'        change = {change}', f'        if change < {SETTLED}:', '            break',
                     f'    if not change < {CONVERGED}:', "        return (float('nan'),) * 6"]
 
 
-def _columns(group):
-    """Return the expressions of a column group in the true force u, the true rate v, products, angular acceleration g and dt."""
-    vector = ['ux', 'uy', 'uz'] if group.startswith('force') else ['vx', 'vy', 'vz']
-    kind = group.partition('_')[2]
-    if group == 'lever':
-        return [f'({text})' for text in LEVER]
-    if group == 'temperature':
-        return ['dt']
-    if kind == 'squares':
-        return [f'{vector[j]} * {vector[k]}' for j, k in SQUARES]
-    if kind == 'cubes':
-        return [f'{vector[i]} * {vector[j]} * {vector[k]}' for i, j, k in CUBES]
-    if kind == 'signed':
-        return [f'(({vi} > 0) - ({vi} < 0)) * {vj}' for vi in vector for vj in vector]
-    if kind == 'temperature':
-        return [f'{v} * dt' for v in vector]
-    return vector
+def _vector(letter):
+    return [{(letter + axis,): 1.0} for axis in AXES]
 
 
-def _outcome(force, inverse, constant, alpha, lever, turn):
-    """Return the lines that take out what is left of the lever arms, turn into the target frame and return."""
-    lever, inverse, constant = lever @ turn.T, turn @ inverse, turn @ constant
-    lines = []
-    if np.any(lever[:6]):
-        lines += ['    xx, yy, zz, xy, xz, yz = vx * vx, vy * vy, vz * vz, vx * vy, vx * vz, vy * vz']
-    names = [*force, *PRODUCTS[:6], *alpha]
-    texts = [_sum(np.concatenate([inverse[i], -lever[:, i]]), names, constant[i]) for i in range(3)]
-    texts += [_sum(row, ('vx', 'vy', 'vz')) for row in turn]
-    return lines + ['    return (' + ', '.join(texts) + ')']
+def _sum(coefficients, rows):
+    """Return the linear combination of sums of products."""
+    return added(*(scaled(row, float(c)) for c, row in zip(coefficients, rows)))
 
 
-def _sum(coefficients, names, constant=0.0):
-    """Return the text of a linear combination without its zeros."""
-    terms = [repr(float(constant))] if constant else []
-    for c, name in zip(coefficients, names):
-        if c == 1.0:
-            terms.append(name)
-        elif c:
-            terms.append(f'{float(c)!r} * {name}')
-    return ' + '.join(terms) or '0.0'
+def _turned(matrix, rows):
+    return [_sum(coefficients, rows) for coefficients in matrix]
+
+
+def _less(rows, others):
+    return [added(row, scaled(other, -1.0)) for row, other in zip(rows, others)]
+
+
+def _with_slope(row, slope):
+    """Return a sum in which the angular acceleration, which enters as it is, is replaced by the derivative of the measured rate."""
+    places = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
+    return added(*(scaled(places[factors], c) if factors in places else {factors: c} for factors, c in row.items()))
+
+
+def _assigned(letter, rows, indent):
+    """Return the lines that assign three sums to the components of a vector, all at once."""
+    lines, texts = _worked_out(rows, indent)
+    return [*lines, f'{indent}{", ".join(letter + axis for axis in AXES)} = {", ".join(texts)}']
+
+
+def _worked_out(rows, indent):
+    """Return (lines that work each function and product out once, the sums as texts)."""
+    names, lines, sums = {}, [], []
+
+    def name_of(text):
+        if text not in names:
+            names[text] = f'm{len(names)}'
+            lines.append(f'{indent}{names[text]} = {text}')
+        return names[text]
+
+    for row in rows:
+        factors = {key: [f if f.isidentifier() else name_of(f) for f in key] for key in row}
+        sums.append({(name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[key] for key, found in factors.items()})
+    return lines, [as_text(terms) for terms in sums]

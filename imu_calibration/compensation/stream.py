@@ -3,8 +3,9 @@
 import numpy as np
 
 from imu_calibration.compensation.angular_acceleration import StampedDerivative, choose_derivative, typical_period
-from imu_calibration.compensation.compensate import Transfer, arms_of, compensate, invertible, needs_temperature, outside_conditions
+from imu_calibration.compensation.compensate import Transfer, arms_of, compensate, invertible, outside_conditions
 from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
@@ -29,11 +30,11 @@ class CompensationStream:
 
     def __init__(self, calibration, period=None, temperature=None, transfer=None):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
-        if needs_temperature(invertible(calibration.model)) and temperature is None:
+        if invertible(calibration.model).needs_temperature and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
         self.period, self.derivative = period, None
         self.count, self.flagged, self.frame_id = 0, 0, ''
-        self._inverse_rate = np.linalg.inv(calibration.value('gyroscope', 'matrix'))
+        self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
         self._fastest, self._temperatures, self._last = 0.0, [], ()
 
     def correct(self, imu):
@@ -47,7 +48,7 @@ class CompensationStream:
         finite = np.isfinite(imu.rate_s).all(axis=1)
         slope = np.zeros_like(imu.rate_s)
         slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
-        force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.value(sensor, 'bias'))
+        force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
                            for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
         corrected = compensate(self.calibration, force_s, rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
         corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
@@ -154,6 +155,5 @@ def requested_transfer(frame_id, xyz, rpy):
 
 def late_ns(calibration, wanted=True):
     """Return by how much stamps are to be moved back, ns: the calibration's time_offset when that is `wanted`, else 0."""
-    if not wanted or not calibration.has('reference', 'time_offset'):
-        return 0
-    return round(float(calibration.value('reference', 'time_offset')) * 1e9)
+    late = calibration.of('reference', Role.DELAY) if wanted else None
+    return 0 if late is None else round(float(late) * 1e9)

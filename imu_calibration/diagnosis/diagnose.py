@@ -10,8 +10,7 @@ from imu_calibration.diagnosis.sentences import candidates_of, sentence
 from imu_calibration.diagnosis.separating_motion import separating_motion
 from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.diagnosis.unexplained import unexplained
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import find_effect
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
@@ -77,8 +76,7 @@ def _assembled(windows, table, found):
 
 
 def _clipping(limit, solution):
-    short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[limit.sensor]
-    effect = find_effect(limit.sensor, f'{short}_saturation')
+    effect = solution.model.find(limit.sensor, Role.LIMIT)
     parameters = parameters_of(solution, limit.sensor, effect.name)
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
     return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value,

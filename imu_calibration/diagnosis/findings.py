@@ -35,4 +35,5 @@ def finding(search: Search, named: list[Question], place: int, solution: Solutio
     mates = [mate for mate, _ in search.class_mates(named, question)]
     parameters, gain = parameters_of(solution, question.sensor, question.name), gain_of(place)
     return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
-                   share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '')
+                   share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '',
+                   question.effect.against)

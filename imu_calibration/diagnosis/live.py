@@ -136,9 +136,9 @@ def baseline_model(options, table, solved):
         The model of the last solution: where its columns were linearised holds for the same effects here.
 
     """
-    model = choose_model(baseline_options(options), table, solved.temperature_ref_c)
+    model = choose_model(baseline_options(options), table)
     names = {effect.name for effect in model.effects}
-    return replace(model, point={name: value for name, value in solved.point.items() if name in names})
+    return replace(model, point={name: value for name, value in solved.point.items() if name in names}, temperature_ref_c=solved.temperature_ref_c)
 
 
 def describe(diagnosis, forgotten=0):

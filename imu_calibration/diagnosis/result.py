@@ -29,6 +29,8 @@ class Finding:
     """Effects that this recording cannot tell apart from it, at most two."""
     separating_motion: str
     """Which motion would tell them apart; empty when there is nothing to tell apart."""
+    against: tuple = ()
+    """What its residual is drawn against, as in ``Effect.against``."""
 
 
 @dataclass(frozen=True, eq=False)

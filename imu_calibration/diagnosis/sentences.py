@@ -29,7 +29,7 @@ def sentence(effect, parameters, gain, n_clipped=None):
 
     """
     values = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
-    label, value, sd, unit = max((v for v in values if v[0] != 'time_constant' or len(values) == 1), key=lambda v: abs(v[1]))
+    label, value, sd, unit = max(effect.amplitudes(values), key=lambda v: abs(v[1]))
     size = _size(value, sd, unit)
     if n_clipped is not None:
         return (f'{effect.explanation} The limit is {readable(value, unit)}; {n_clipped} samples sit on it and were left out, with those '

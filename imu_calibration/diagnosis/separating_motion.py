@@ -42,9 +42,8 @@ def motions_of(question, mate):
 
 def _best_motion(solution, question, mate, gravity):
     model = solution.model.with_effect(mate.sensor, mate.name)
-    values = np.where(np.isfinite(model.start()), model.start(), 0.0)
-    for effect in solution.model.effects:
-        values[model.slices[effect.sensor, effect.name]] = solution.values[solution.model.slices[effect.sensor, effect.name]]
+    values = model.start_from(solution.model, solution.values)
+    values = np.where(np.isfinite(values), values, 0.0)
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
     own = model.slices[question.sensor, question.name]
     best = (ENOUGH, None)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import INPUT_OF, warped_reference
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.navigation import drift_over
@@ -131,7 +131,7 @@ def _drifts(piece, time, solution, error, reference, rows):
     at = rows[piece]
     felt = {}
     for sensor in SENSORS:
-        matrix = solution.value(sensor, 'matrix').reshape(3, 3)
+        matrix = solution.model.value(sensor, Role.LINEAR, solution.values)
         felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[at] + np.linalg.solve(matrix, error[sensor][piece].T).T
     base = reference['accelerometer'].select(at)
     true = replace(base, time=time[piece], rate_s=reference['gyroscope'].rate_s[at])

@@ -16,7 +16,7 @@ from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import parse_effects
+from imu_calibration.effects.named_models import BARE, parse_effects
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.units import for_people, significant
@@ -81,7 +81,7 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
 
 def baseline_options(options):
     """Return the options of the model that a diagnosis starts from: what was not asked for has to prove itself."""
-    return replace(options, accelerometer_model=options.accelerometer_model or 'bias+matrix', reference_model=options.reference_model or 'none')
+    return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
 
 
 def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, provenance=None, progress=None):
@@ -108,8 +108,9 @@ def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, p
     recording = read_by_hand(preflight.watch(source()), options.nominal)
     value, spread = reference_gravity(gravity)
     data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-    names = {sensor: parse_effects(sensor, text or 'bias+matrix') for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
-    found = diagnose_by_hand(data, value, spread, tolerances=options.tolerances, **names, progress=_percent(progress) if progress else None)
+    names = {sensor: parse_effects(sensor, text or BARE, catalogue=options.catalogue) for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
+    found = diagnose_by_hand(data, value, spread, tolerances=options.tolerances, **names,
+                             catalogue=options.catalogue, progress=_percent(progress) if progress else None)
     document_of, limits = document_of_hand(found.hand, recording.gathered, len(recording.imu), options.tolerances, provenance)
     calibration = result_by_hand(document_of, found.hand, recording.gathered, limits, options).calibration
     calibration = replace(calibration, statistics=calibration.statistics | preflight_statistics(preflight.findings))

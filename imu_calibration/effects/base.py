@@ -1,30 +1,62 @@
 """What an effect is: one physical cause of sensor output, declared once."""
 
 from dataclasses import dataclass
-from typing import Callable
+from enum import Enum, auto
+from typing import Any, Callable
 
 import numpy as np
 
 AXES = ('x', 'y', 'z')
 SENSORS = ('accelerometer', 'gyroscope')
+SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
+"""Beginning of the names of a sensor's own effects and columns."""
+SECTIONS = SENSORS + ('reference',)
+"""Sections of a model and of a calibration document."""
 
 VECTOR = AXES
 MATRIX = tuple(row + column for row in AXES for column in AXES)
 PRODUCTS = tuple(f'{row}_{pair}' for row in AXES for pair in ('xy', 'yz', 'xz'))
 
 
-@dataclass(frozen=True, eq=False)
+class Role(Enum):
+    """
+    Place of an effect in ``output = limit(offset + linear @ (input + lever_matrix @ (arm + arms_i)) + cross @ force + terms)``.
+
+    A model has at most one effect of a sensor in each place, but any number of terms.
+    """
+
+    OFFSET = auto()
+    LINEAR = auto()
+    CROSS = auto()
+    """Response of the gyroscope to specific force."""
+    ARMS = auto()
+    """One lever arm for each axis."""
+    ARM = auto()
+    """One lever arm for the triad."""
+    LIMIT = auto()
+    """Largest reading: the output is clipped there, which is censoring and no column."""
+    DELAY = auto()
+    """By how much the stamps are late."""
+    TILT = auto()
+    """How the table stands."""
+    TERM = auto()
+    """A term, or a warp, of its own."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Effect:
     """
     One physical cause of sensor output.
 
-    A *sensor* effect acts on one sensor. It names column groups of `effects.regressors` and gives, for values of the
-    whole sensor's parameters, the coefficients of those columns, so that ``output = sum(columns @ coefficients)``. Products
+    A *sensor* effect acts on one sensor. It has column groups (`effects.column_group`) and gives, for values of the whole
+    sensor's parameters, the coefficients of those columns, so that ``output = sum(columns @ coefficients)``. Products
     of parameters (matrix times arm) become coefficients of columns of their own; a triangular factor of the columns is
     then an exact summary of the data.
 
     A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is thought to have felt: `warp`
     gives tables and motions with weights, of which the reference is the weighted mean.
+
+    Whatever other parts need to know of an effect is a field here: nothing is read out of its name.
     """
 
     name: str
@@ -35,24 +67,30 @@ class Effect:
     """Component labels; the parameter is called SENSOR.EFFECT.COMPONENT."""
     shape: tuple
     """Shape of the value in a calibration document."""
-    unit: str
+    unit: str | tuple
     """SI unit of every component (or a tuple, one each)."""
     tolerance: float
-    """Standard deviation up to which a component counts as determined; overridden by config/tolerances.yaml."""
-    prior_sd: float
-    """Standard deviation of the prior, around `prior`."""
+    """Standard deviation up to which a component counts as determined; a user's file of tolerances overrides it."""
+    tolerance_reason: str = ''
+    """Where the tolerance comes from; printed beside it in config/tolerances.yaml."""
+    prior: Any = 0.0
+    """Prior value of every component (or a sequence, one each); where columns depend on it they are first taken here."""
+    prior_sd: Any
+    """Standard deviation of the prior (or a sequence, one each)."""
     explanation: str
     """One sentence for a test engineer."""
+    title: str = ''
+    """Heading in a report; the name in words where empty."""
     motion: tuple
-    """Standard motions (`observability.MOTIONS`) that show it."""
+    """Standard motions (`estimation.standard_motions`) that show it."""
     compensation: str
     """'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the table or the session)."""
-    prior: float = 0.0
-    """Prior value of every component ('matrix' has the identity)."""
+    role: Role = Role.TERM
+    """Its place in the sensor's equation."""
     groups: tuple = ()
-    """Column groups, names in `effects.regressors.GROUPS`."""
+    """The ColumnGroups that its coefficients multiply."""
     coefficients: Callable | None = None
-    """``coefficients(values, point) -> {group: (n_columns, 3)}`` with `values` a dict effect name -> array of the sensor."""
+    """``coefficients(values, point) -> {group name: (n_columns, 3)}`` with `values` a dict effect name -> array of the sensor."""
     warp: Callable | None = None
     """``warp(table, motion, values) -> [(weight, table, motion), ...]``."""
     derivative: Callable | None = None
@@ -65,21 +103,88 @@ class Effect:
     """Step of the central difference that turns a warp into columns."""
     plausible: tuple = ()
     """Plausible size by grade: (grade, largest, source), in `unit`."""
+    time_constant: bool = False
+    """Whether the last component is a time constant, s, on which the columns depend, and the others are amplitudes."""
+    nonnegative: bool = False
+    """Whether the values cannot be negative, as those of a lag."""
+    smooth: bool = False
+    """Whether it changes smoothly in time: any other smooth curve resembles it."""
+    against: tuple = ()
+    """What its residual is drawn against: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own signal."""
+    contained_in: str = ''
+    """Effect of the same sensor of which it is a special case."""
+    known_size: bool = False
+    """Whether the plausible size is the true one, as for the Earth's rate: a larger value is no explanation."""
+    moot: Callable | None = None
+    """``moot(table) -> (why, what to do) or None``: why it cannot be asked about with this table."""
+    in_reference: bool = False
+    """Whether a document lists an effect of a sensor under `reference`: it belongs to the table and the session."""
+    nuisance: bool = False
+    """Whether it is estimated for the sake of the others only, so that nobody asks for its value."""
+    definition: dict | None = None
+    """The plain data that it was made of (`effects.term`), which may travel in documents; None for the catalogue's own."""
+
+    def __reduce__(self):
+        """Travel to other processes by the definition, where there is one."""
+        if self.definition is None:
+            return super().__reduce__()
+        from imu_calibration.effects.term import from_definition
+        return from_definition, (self.name, self.definition)
+
+    @property
+    def key(self):
+        """(sensor, name), by which models and catalogues know it."""
+        return self.sensor, self.name
 
     @property
     def size(self):
         """Return the number of parameters."""
         return len(self.components)
 
+    @property
+    def heading(self):
+        """Its title, or its name in words."""
+        return self.title or self.name.replace('_', ' ')
+
+    @property
+    def section(self):
+        """Section of the document that lists it."""
+        return 'reference' if self.in_reference else self.sensor
+
+    @property
+    def relinearised(self):
+        """Whether its columns depend on its own value."""
+        return self.warp is not None or self.time_constant
+
+    @property
+    def shared(self):
+        """Whether its values enter the coefficients of other effects."""
+        return self.role in (Role.LINEAR, Role.ARMS, Role.ARM)
+
+    @property
+    def largest(self):
+        """Largest plausible size, infinite where nothing is known."""
+        return max((limit for _, limit, _ in self.plausible), default=np.inf)
+
     def prior_values(self):
         """Return the prior values, shape (size,)."""
-        if self.name == 'matrix':
-            return np.eye(3).ravel()
-        return np.full(self.size, self.prior)
+        return np.array(np.broadcast_to(np.asarray(self.prior, float), (self.size,)))
 
-    def param_names(self, sensor=None):
+    def prior_sds(self):
+        """Return the standard deviations of the prior, shape (size,)."""
+        return np.array(np.broadcast_to(np.asarray(self.prior_sd, float), (self.size,)))
+
+    def amplitudes(self, values):
+        """Return the values without the time constant."""
+        return values[:-1] if self.time_constant else values
+
+    def at_time_constant(self, constant):
+        """Return the prior values with another time constant, shape (size,): where a bank takes the columns."""
+        return np.append(self.prior_values()[:-1], constant)
+
+    def param_names(self):
         """Return SENSOR.EFFECT.COMPONENT for each parameter."""
-        return [f'{sensor or self.sensor}.{self.name}.{component}' for component in self.components]
+        return [f'{self.sensor}.{self.name}.{component}' for component in self.components]
 
     def unit_of(self, index):
         """Return the unit of component `index`."""

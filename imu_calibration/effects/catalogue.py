@@ -1,35 +1,101 @@
 """The catalogue of effects: declared once for simulation, calibration, compensation, diagnosis and planning."""
 
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-from imu_calibration.effects.base import AXES, SENSORS, Effect
+from imu_calibration.effects.base import SECTIONS, Effect
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
+from imu_calibration.effects.term import from_definition
 from imu_calibration.errors import InputError
+from imu_calibration.reference.joint import JointNames
 
-__all__ = ['AXES', 'SENSORS', 'Effect', 'catalogue', 'find_effect', 'owner_of']
+JOINTS = ('outer', 'middle', 'inner')
+"""Joint names where no table says other ones."""
+UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'reference temperature'}
+"""Quantities that compensation knows of a sample."""
 
 
 @lru_cache(maxsize=8)
-def catalogue(joint_names=('outer', 'middle', 'inner')):
-    """Return every effect by (sensor, name) for a table with these joints."""
+def _own_effects(joint_names):
     every = ACCELEROMETER + GYROSCOPE + reference_effects(joint_names)
-    return {(effect.sensor, effect.name): effect for effect in every if effect.size}
+    return {effect.key: effect for effect in every if effect.size}
 
 
-def find_effect(sensor, name, joint_names=('outer', 'middle', 'inner')):
-    """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
-    effects = catalogue(joint_names)
-    if (sensor, name) not in effects:
-        known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
-        raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
-    return effects[sensor, name]
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """
+    The effects that there are: those declared in this package, and those that somebody added.
+
+    It is a value: to add an effect makes another catalogue, which a SensorModel carries to wherever it goes.
+    """
+
+    added: tuple = field(default=())
+    """Effects beside the package's own."""
+
+    def __reduce__(self):
+        """Travel by what was added."""
+        return Catalogue, (self.added,)
+
+    def effects(self, joint_names=JOINTS):
+        """Return every effect by (sensor, name) for a table with these joints."""
+        return _own_effects(JointNames.of(joint_names)) | {effect.key: effect for effect in self.added}
+
+    def find(self, sensor, name, joint_names=JOINTS):
+        """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
+        effects = self.effects(joint_names)
+        if (sensor, name) not in effects:
+            known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
+            raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
+        return effects[sensor, name]
+
+    def owner_of(self, name, joint_names=JOINTS):
+        """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
+        names = [known for _, known in self.effects(joint_names)]
+        if names.count(name) != 1:
+            raise InputError(f"effect '{name}' is unknown or ambiguous; choose from {', '.join(sorted(n for n in names if names.count(n) == 1))}")
+        return next(sensor for sensor, known in self.effects(joint_names) if known == name)
+
+    def with_effects(self, *effects: Effect):
+        """
+        Return a catalogue with further effects.
+
+        Raises
+        ------
+        InputError
+            When a name is taken, the sensor is unknown, or an effect that compensation shall undo has columns that it cannot know.
+
+        """
+        grown = self
+        for effect in effects:
+            _check(effect, {name for _, name in grown.effects()})
+            grown = replace(grown, added=(*grown.added, effect))
+        return grown
+
+    def definitions(self, names):
+        """Return {effect name: plain data} of those among `names` that were added, for a document."""
+        added = [effect for effect in self.added if effect.name in names]
+        for effect in added:
+            if effect.definition is None:
+                raise InputError(f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; make it with `effects.term.term`")
+        return {effect.name: effect.definition for effect in added}
+
+    @classmethod
+    def from_definitions(cls, definitions):
+        """Return the catalogue with the effects of {name: plain data}."""
+        return cls().with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
 
 
-def owner_of(name, joint_names=('outer', 'middle', 'inner')):
-    """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
-    owners = [sensor for sensor, known in catalogue(joint_names) if known == name]
-    if len(owners) != 1:
-        known = sorted({known for _, known in catalogue(joint_names)} - {'bias', 'matrix'})
-        raise InputError(f"effect '{name}' is unknown or ambiguous; choose from {', '.join(known)}")
-    return owners[0]
+CATALOGUE = Catalogue()
+"""The package's own effects."""
+
+
+def _check(effect, taken):
+    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken:
+        raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; choose another one")
+    if effect.sensor not in SECTIONS:
+        raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")
+    strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
+    if effect.compensation == 'exact' and strange:
+        raise InputError(f"effect '{effect.name}' must do without {', '.join(sorted(strange))}, which compensation does not know; "
+                         "declare it with compensation 'none'")

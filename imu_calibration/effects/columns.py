@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import WARP
 from imu_calibration.errors import InputError
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
@@ -23,7 +24,7 @@ def warped_reference(model, sensor, table, motion, temperature_c=None, values=No
         if effect.warp is None:
             continue
         at = (values or {}).get(effect.name)
-        at = model.warp_point(effect) if at is None else np.atleast_1d(at)
+        at = model.point_of(effect) if at is None else np.atleast_1d(at)
         if not np.any(at):
             continue
         branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in effect.warp(a, b, at)]
@@ -52,8 +53,8 @@ class References:
 
     def at(self, sensor, effect=None, values=None):
         """Return the reference of `sensor`, with other values for one effect where given."""
-        acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.warp_point(e)))
-        moved = effect is not None and np.any(values != self.model.warp_point(effect))
+        acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
+        moved = effect is not None and np.any(values != self.model.point_of(effect))
         key = (acting, *((effect.name, *values) if moved else ()))
         if key not in self._known:
             change = None if effect is None else {effect.name: values}
@@ -69,17 +70,15 @@ def columns(model, sensor, table, motion, temperature_c=None, references=None):
     its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
     """
     references = references or References(model, table, motion, temperature_c)
-    ref = references.at(sensor)
-    if ref.temperature_c is None and any(name.endswith('temperature') for name, _ in model.groups(sensor)):
+    ref, layout, parts = references.at(sensor), model.layout(sensor), []
+    if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
         raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
-    point, parts = model.full_point(), []
-    warps = {e.name: e for e in model.concerning(sensor) if e.warp is not None}
-    for name, _ in model.groups(sensor):
-        kind, _, owner = name.partition(':')
-        if kind == 'warp':
-            parts += warp_columns(model, warps[owner], sensor, references)
-        elif kind != 'warp_lever':
-            parts.append(GROUPS[name](ref, point))
+    warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
+    for name in layout.rows:
+        if name in warps:
+            parts += warp_columns(model, warps[name], sensor, references)
+        elif name in layout.groups:
+            parts.append(layout.groups[name].columns(ref, layout.point))
     return np.concatenate(parts, axis=1)
 
 
@@ -91,15 +90,15 @@ def warp_columns(model, effect, sensor, references):
     """
     if effect.derivative is not None:
         return [effect.derivative(references.at(sensor))]
-    clock = next((e for e in model.effects if e.name == 'time_offset'), None)
-    if clock is not None and effect.sensor == sensor and not np.any(model.warp_point(effect)):
+    clock = model.find('reference', Role.DELAY)
+    if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock   # a lag of zero is a delay to first order
     inputs, levers = [], []
     # A search, which folds the arms, asks for so many warps that it takes half the references, and errs by the curvature over a step.
-    for above, below, width in _steps(effect, model.warp_point(effect), forward=model.folded_arms is not None):
+    for above, below, width in _steps(effect, model.point_of(effect), forward=model.folded_arms is not None):
         ends = [references.at(sensor, effect, at) for at in (above, below)]
         change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
-        if sensor == 'accelerometer' and model.has_arms and (model.folded_arms is None or model.folded_arms.any()):
+        if sensor == 'accelerometer' and model.arms and (model.folded_arms is None or model.folded_arms.any()):
             turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(ends[1].rate_s, ends[1].alpha_s)
             if model.folded_arms is None:
                 levers.append(turned.reshape(-1, 9) / width)
@@ -110,12 +109,12 @@ def warp_columns(model, effect, sensor, references):
 
 
 def _steps(effect, at, forward):
-    """Yield (values above, values below, distance) for the derivative by each parameter; time constants stay positive."""
+    """Yield (values above, values below, distance) for the derivative by each parameter; what cannot be negative is not tried below zero."""
     for index in range(effect.size):
         step = np.zeros(effect.size)
         step[index] = effect.step
         below = at if forward else at - step
-        if effect.components[index] == 'time_constant':
+        if effect.nonnegative:
             step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
             below = at - step if at[index] > 0 and not forward else at
         yield at + step, below, (at + step - below)[index]
@@ -124,5 +123,5 @@ def _steps(effect, at, forward):
 def columns_at_point(model, sensor, table, motion, temperature_c=None, ref=None):
     """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
     ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
-    point = model.full_point()
-    return np.concatenate([GROUPS[name](ref, point) for name, _ in model.groups(sensor) if name in GROUPS], axis=1)
+    layout = model.layout(sensor)
+    return np.concatenate([group.columns(ref, layout.point) for group in layout.groups.values()], axis=1)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import columns_at_point
-from imu_calibration.effects.regressors import GROUPS
+from imu_calibration.effects.sensor_model import WARP, WARP_LEVER
 
 
 def coefficients(model, sensor, values):
@@ -19,25 +19,21 @@ def coefficients(model, sensor, values):
 def _add_coefficients(total, model, effect, of_sensor, layout):
     """Add one effect's coefficients in place."""
     if effect.warp is not None:
-        change = of_sensor[effect.name] - model.warp_point(effect)
+        change = of_sensor[effect.name] - model.point_of(effect)
         matrix = of_sensor['matrix'].reshape(3, 3)
-        total[layout.rows['warp:' + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(-1, 3)
-        if 'warp_lever:' + effect.name in layout.rows:
-            products = (matrix[:, :, None] * _all_arms(of_sensor)[:, None, :]).reshape(3, 9).T
-            total[layout.rows['warp_lever:' + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
+        total[layout.rows[WARP + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(-1, 3)
+        if WARP_LEVER + effect.name in layout.rows:
+            arms = sum((of_sensor[e.name].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
+            products = (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T
+            total[layout.rows[WARP_LEVER + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
     elif effect.coefficients is not None:
         for group, block in effect.coefficients(of_sensor, layout.point).items():
             total[layout.rows[group]] += block
 
 
-def _all_arms(of_sensor):
-    """Return the arms from the reference point, shape (3, 3)."""
-    arms = of_sensor['accel_size_effect'].reshape(3, 3) if 'accel_size_effect' in of_sensor else np.zeros((3, 3))
-    return arms + of_sensor['lever_arm'] if 'lever_arm' in of_sensor else arms
-
-
-SHARED = ('matrix', 'accel_size_effect', 'lever_arm')
-"""Effects whose values enter the coefficients of others."""
+def all_arms(model, values):
+    """Return the arms from the reference point to the three sensitive points, shape (3, 3), zero where the model has none."""
+    return sum((values[model.slices[e.key]].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
 
 
 def coefficient_jacobian(model, sensor, values):
@@ -49,8 +45,8 @@ def coefficient_jacobian(model, sensor, values):
     layout, step = model.layout(sensor), 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
     for effect in layout.effects:
-        concerned = layout.effects if effect.name in SHARED else (effect,)
-        part = model.slices[effect.sensor, effect.name]
+        concerned = layout.effects if effect.shared else (effect,)
+        part = model.slices[effect.key]
         for index in range(part.start, part.stop):
             moved = values.astype(complex)
             moved[index] += 1j * step
@@ -59,6 +55,18 @@ def coefficient_jacobian(model, sensor, values):
                 _add_coefficients(total, model, other, of_sensor, layout)
             jacobian[:, :, index] = total.imag / step
     return jacobian
+
+
+def effect_slopes(effect, of_sensor, point):
+    """Return {group: coefficients (w, 3)} of one effect and {group: derivative by its own values (w, 3, size)}, by complex steps."""
+    found = effect.coefficients(of_sensor, point)
+    slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
+    for k in range(effect.size):
+        moved = of_sensor[effect.name].astype(complex)
+        moved[k] += 1e-30j
+        for group, block in effect.coefficients({**of_sensor, effect.name: moved}, point).items():
+            slopes[group][..., k] = np.imag(block) / 1e-30
+    return found, slopes
 
 
 def predict(model, values, table, motion, temperature_c=None):
@@ -77,17 +85,14 @@ def predict(model, values, table, motion, temperature_c=None):
 
 def coefficients_at_point(model, sensor, values):
     """Return the coefficients that belong to `columns_at_point`."""
-    rows = np.concatenate([np.full(width, name in GROUPS) for name, width in model.groups(sensor)])
-    return coefficients(model, sensor, values)[rows]
+    layout, found = model.layout(sensor), coefficients(model, sensor, values)
+    return np.concatenate([found[layout.rows[name]] for name in layout.groups])
 
 
 def clip(model, sensor, values, output):
     """Clip the output at the saturation level, when the model has one."""
-    name = {'accelerometer': 'accel_saturation', 'gyroscope': 'gyro_saturation'}[sensor]
-    if (sensor, name) not in model.slices:
-        return output
-    level = float(values[model.slices[sensor, name]][0])
-    return np.clip(output, -level, level)
+    level = model.value(sensor, Role.LIMIT, values)
+    return output if level is None else np.clip(output, -level, level)
 
 
 def sensor_output(model, sensor, values, ref):

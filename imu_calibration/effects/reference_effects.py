@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.effects.base import Effect
+from imu_calibration.effects.base import SENSORS, SHORT, Effect, Role
+from imu_calibration.effects.regressors import ATTITUDE
 from imu_calibration.reference.axis_angles import with_axis_angles
 from imu_calibration.reference.encoder import with_encoder_harmonics
 from imu_calibration.reference.joint import JointNames
@@ -62,40 +63,63 @@ def _lag(table, motion, values):
 def _earth(values, point):
     """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
     matrix = values['matrix'].reshape(3, 3)
-    return {'attitude': (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T}
+    return {ATTITUDE.name: (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T}
+
+
+def _earth_known(table):
+    """Return why the Earth's rate cannot be asked about: it is in the reference."""
+    if table.latitude is None or table.azimuth_deg is None:
+        return None
+    return 'the reference holds the rotation of the Earth already, from latitude and azimuth', 'leave the azimuth out of the table description'
 
 
 def _lag_effect(sensor):
-    short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[sensor]
-    return Effect(f'{short}_bandwidth', sensor, ('time_constant',), (), 's', 1e-4, 0.1,
-                  f'The {sensor} answers through a first-order low-pass filter: its output lags and loses amplitude at speed.',
-                  ('oscillate_fast',), 'none', warp=_lag, acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4,
-                  plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),))
+    return Effect(
+        name=f'{SHORT[sensor]}_bandwidth', sensor=sensor, components=('time_constant',), shape=(), unit='s', nonnegative=True, in_reference=True,
+        explanation=f'The {sensor} answers through a first-order low-pass filter: its output lags and loses amplitude at speed.',
+        tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
+        tolerance_reason='1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer' else '0.1 deg/s while the rate changes by 1000 deg/s^2',
+        motion=('oscillate_fast',), compensation='none', warp=_lag, acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
 
 
 def reference_effects(joint_names):
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
+    of_table = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True, 'against': ('angle',)}
     return (
-        Effect('table_tilt', 'reference', ('x', 'y'), (2,), 'rad', 1e-4, 2e-3,
-               'The table does not stand level: its vertical is turned by a small angle about the base axes.', ('turn_about_vertical',), 'none',
-               warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),)),
-        Effect('axis_non_orthogonality', 'reference', names.angles, (len(names.angles),), 'rad',
-               1e-4, 0.01, 'The axes of the table do not stand at the angles to one another that its description says.', ('two_axis', 'static_dense'), 'none',
-               warp=_axes, needs=('joints', 'two_joints'), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),)),
-        Effect('encoder_zero', 'reference', names.zeros, (len(names.zeros),), 'rad', 1e-4, 0.01,
-               'The zero of an inner joint angle is not where the table description says.', ('static_dense',), 'none',
-               warp=_zero, needs=('joints', 'three_joints'), step=1e-4, plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),)),
-        Effect('encoder_harmonic', 'reference', tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
-               (len(names.turning), len(ORDERS), 2), 'rad', 1e-4, 0.01,
-               'The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).', ('slow_turn',), 'none',
-               warp=_harmonics, needs=('joints',), step=1e-4, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),)),
-        Effect('time_offset', 'reference', ('offset',), (), 's', 1e-4, 0.1, 'The IMU stamps are late against the joint stamps.',
-               ('oscillate_fast', 'two_axis'), 'none', warp=_late, needs=('joints', 'dynamic'), step=2e-4,
-               plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),)),
-        Effect('earth_rate', 'reference', ('x', 'y', 'z'), (3,), 'rad/s', 2e-6, 1e-4, "The gyroscopes feel the Earth's rotation, which the model leaves out.",
-               ('turn_about_vertical', 'static_poses'), 'none', groups=('attitude',), coefficients=_earth, acts_on=('gyroscope',), needs=('joints',),
-               plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),)),
-        _lag_effect('accelerometer'),
-        _lag_effect('gyroscope'),
+        Effect(
+            **of_table, name='table_tilt', role=Role.TILT, components=('x', 'y'), shape=(2,),
+            explanation='The table does not stand level: its vertical is turned by a small angle about the base axes.',
+            tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias', prior_sd=2e-3,
+            plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),), motion=('turn_about_vertical',),
+            warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',)),
+        Effect(
+            **of_table, name='axis_non_orthogonality', components=names.angles, shape=(len(names.angles),),
+            explanation='The axes of the table do not stand at the angles to one another that its description says.',
+            tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
+            motion=('two_axis', 'static_dense'), warp=_axes, needs=('joints', 'two_joints')),
+        Effect(
+            **of_table, name='encoder_zero', components=names.zeros, shape=(len(names.zeros),),
+            explanation='The zero of an inner joint angle is not where the table description says.',
+            tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),),
+            motion=('static_dense',), warp=_zero, needs=('joints', 'three_joints')),
+        Effect(
+            **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ORDERS), 2),
+            components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
+            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
+            tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),),
+            motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
+        Effect(
+            name='time_offset', sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
+            explanation='The IMU stamps are late against the joint stamps.',
+            tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1, plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late, needs=('joints', 'dynamic'), step=2e-4),
+        Effect(
+            name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
+            title='Earth rate in the level frame', known_size=True, moot=_earth_known,
+            explanation="The gyroscopes feel the Earth's rotation, which the model leaves out.",
+            tolerance=2e-6, tolerance_reason="3 % of the Earth's rotation", prior_sd=1e-4, plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),),
+            motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth, acts_on=('gyroscope',),
+            needs=('joints',)),
+        *map(_lag_effect, SENSORS),
     )

@@ -1,72 +1,52 @@
-"""Column groups: functions of the reference motion that effects multiply with their coefficients."""
+"""The column groups of the catalogue, and the coefficients with which their powers make functions along an input axis."""
 
 import numpy as np
 
-from imu_calibration.reference.reference_motion import lever_matrix
+from imu_calibration.effects.base import AXES, SENSORS, SHORT
+from imu_calibration.effects.column_group import ColumnGroup
 
-SQUARES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-CUBES = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (1, 1, 0), (1, 1, 2), (2, 2, 0), (2, 2, 1), (0, 1, 2))
-
-
-def _squares(vector):
-    return np.stack([vector[:, j] * vector[:, k] for j, k in SQUARES], axis=1)
-
-
-def _cubes(vector):
-    return np.stack([vector[:, i] * vector[:, j] * vector[:, k] for i, j, k in CUBES], axis=1)
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+TRIPLES = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (1, 1, 0), (1, 1, 2), (2, 2, 0), (2, 2, 1), (0, 1, 2))
+WARMTH = 'temperature_c - temperature_ref_c'
+INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
+_VECTOR = {'accelerometer': [f'f_{a}' for a in AXES], 'gyroscope': [f'w_{a}' for a in AXES]}
 
 
-def _signed(vector):
-    """Return sign(v_i) v_j, column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
-    return (np.sign(vector)[:, :, None] * vector[:, None, :]).reshape(len(vector), 9)
+def _of_input(ending, texts):
+    """Return {sensor: ColumnGroup} made of the components of its true input."""
+    return {sensor: ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor]))) for sensor in SENSORS}
 
 
-def _temperature(ref, point):
-    return (ref.temperature_c - point.get('temperature_ref_c', 25.0))[:, None]
-
-
-def _warm_up(sensor):
-    def columns(ref, point):
-        constant = point[sensor + '_bias_drift'][3]
-        decay = np.exp(-ref.time / constant)
-        return np.stack([1 - decay, -decay * ref.time / constant**2], axis=1)
-    return columns
-
-
-GROUPS = {
-    'one': lambda ref, point: np.ones((len(ref), 1)),
-    'force': lambda ref, point: ref.force_s,
-    'force_squares': lambda ref, point: _squares(ref.force_s),
-    'force_cubes': lambda ref, point: _cubes(ref.force_s),
-    'force_signed': lambda ref, point: _signed(ref.force_s),
-    'force_temperature': lambda ref, point: ref.force_s * _temperature(ref, point),
-    'lever': lambda ref, point: lever_matrix(ref.rate_s, ref.alpha_s).reshape(len(ref), 9),
-    'rate': lambda ref, point: ref.rate_s,
-    'rate_squares': lambda ref, point: _squares(ref.rate_s),
-    'rate_signed': lambda ref, point: _signed(ref.rate_s),
-    'rate_temperature': lambda ref, point: ref.rate_s * _temperature(ref, point),
-    'temperature': _temperature,
-    'attitude': lambda ref, point: ref.mat_sn.reshape(len(ref), 9),
-    'accel_warm_up': _warm_up('accel'),
-    'gyro_warm_up': _warm_up('gyro'),
-}
-WIDTH = {'one': 1, 'force': 3, 'force_squares': 6, 'force_cubes': 10, 'force_signed': 9, 'force_temperature': 3, 'lever': 9, 'rate': 3,
-         'rate_squares': 6, 'rate_signed': 9, 'rate_temperature': 3, 'temperature': 1, 'attitude': 9, 'accel_warm_up': 2, 'gyro_warm_up': 2}
+ONE = ColumnGroup('one', ('1',))
+TRUE_INPUT = _of_input('', lambda v: v)
+SQUARES = _of_input('_squares', lambda v: [f'{v[j]} * {v[k]}' for j, k in PAIRS])
+CUBES = _of_input('_cubes', lambda v: [f'{v[i]} * {v[j]} * {v[k]}' for i, j, k in TRIPLES])
+SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj in v])
+"""Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
+THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({WARMTH})' for vi in v])
+TEMPERATURE = ColumnGroup('temperature', (WARMTH,))
+LEVER = ColumnGroup('lever', (
+    '-(w_y * w_y + w_z * w_z)', 'w_x * w_y - alpha_z', 'w_x * w_z + alpha_y',
+    'w_x * w_y + alpha_z', '-(w_x * w_x + w_z * w_z)', 'w_y * w_z - alpha_x',
+    'w_x * w_z - alpha_y', 'w_y * w_z + alpha_x', '-(w_x * w_x + w_y * w_y)'))
+"""Entries of ``[alpha x] + [omega x]^2`` by rows (Zhang 2017, eq. 11)."""
+ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
+WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in SHORT.items()}
 
 
 def square_coefficients(axes):
-    """Return the coefficients of `_squares` that give (u_i . v)^2 for each row u_i of `axes`, shape (6, 3)."""
-    return np.stack([axes[:, j] * axes[:, k] * (1.0 if j == k else 2.0) for j, k in SQUARES])
+    """Return the coefficients of `SQUARES` that give (u_i . v)^2 for each row u_i of `axes`, shape (6, 3)."""
+    return np.stack([axes[:, j] * axes[:, k] * (1.0 if j == k else 2.0) for j, k in PAIRS])
 
 
 def cube_coefficients(axes):
-    """Return the coefficients of `_cubes` that give (u_i . v)^3 for each row u_i of `axes`, shape (10, 3)."""
-    count = [1 if i == j == k else 6 if len({i, j, k}) == 3 else 3 for i, j, k in CUBES]
-    return np.stack([axes[:, i] * axes[:, j] * axes[:, k] * m for (i, j, k), m in zip(CUBES, count)])
+    """Return the coefficients of `CUBES` that give (u_i . v)^3 for each row u_i of `axes`, shape (10, 3)."""
+    count = [1 if i == j == k else 6 if len({i, j, k}) == 3 else 3 for i, j, k in TRIPLES]
+    return np.stack([axes[:, i] * axes[:, j] * axes[:, k] * m for (i, j, k), m in zip(TRIPLES, count)])
 
 
 def signed_coefficients(axes):
-    """Return the coefficients of `_signed` that give |u_i . v| for each row u_i of `axes`, shape (9, 3)."""
+    """Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`, shape (9, 3)."""
     block = np.zeros((3, 3, 3), axes.dtype)
     block[np.arange(3), :, np.arange(3)] = axes
     return block.reshape(9, 3)

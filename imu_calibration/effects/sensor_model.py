@@ -5,20 +5,14 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import find_effect
-from imu_calibration.effects.regressors import WIDTH
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
+from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint import JointNames
 
-NAMED_MODELS = {
-    'axial': ('bias', 'matrix'),
-    'pendulous': ('bias', 'matrix', 'accel_cross_product'),
-    'size_effect': ('bias', 'matrix', 'accel_size_effect'),
-    'rate': ('bias', 'matrix'),
-    'extended_rate': ('bias', 'matrix', 'gyro_rate_product'),
-}
-"""Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10."""
+WARP, WARP_LEVER = 'warp:', 'warp_lever:'
+"""Beginnings of the names of columns that a warp makes: its change of the true input, and of the lever-arm terms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +21,8 @@ class Layout:
 
     effects: tuple
     """Effects that concern the sensor."""
+    groups: dict
+    """Group name -> ColumnGroup, those that a warp makes left out."""
     rows: dict
     """Group name -> slice of the columns."""
     width: int
@@ -44,13 +40,13 @@ class SensorModel:
     The columns are exact there; away from it they are the first derivative.
     """
 
-    accelerometer: tuple = ('bias', 'matrix')
+    accelerometer: tuple = BASE
     """Names of the accelerometer's effects."""
-    gyroscope: tuple = ('bias', 'matrix')
+    gyroscope: tuple = BASE
     """Names of the gyroscope's effects."""
     reference: tuple = ()
     """Names of the effects of table and clock."""
-    joint_names: JointNames = ('outer', 'middle', 'inner')
+    joint_names: JointNames = JOINTS
     """Joints of the table; a plain sequence of names is taken for turning joints of which no two neighbours are parallel."""
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
@@ -61,6 +57,8 @@ class SensorModel:
     Arms, shape (3, 3), for which the columns of a warp hold its change of the lever-arm terms too; None: that change has columns of its
     own. Folded, the columns are fewer and exact at these arms only, as everything is exact at `point` only.
     """
+    catalogue: Catalogue = CATALOGUE
+    """Where the effects are declared."""
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
@@ -72,8 +70,7 @@ class SensorModel:
     @cached_property
     def effects(self):
         """Effects in parameter order."""
-        return [find_effect(sensor, name, self.joint_names)
-                for sensor in SENSORS + ('reference',) for name in getattr(self, sensor)]
+        return [self.catalogue.find(sensor, name, self.joint_names) for sensor in SECTIONS for name in getattr(self, sensor)]
 
     @cached_property
     def param_names(self):
@@ -84,118 +81,147 @@ class SensorModel:
     def slices(self):
         """Slice of the parameter vector for each (sensor, effect name)."""
         ends = np.cumsum([0] + [effect.size for effect in self.effects])
-        return {(e.sensor, e.name): slice(a, b) for e, a, b in zip(self.effects, ends, ends[1:])}
+        return {effect.key: slice(a, b) for effect, a, b in zip(self.effects, ends, ends[1:])}
+
+    def find(self, sensor, role):
+        """Return the effect of a sensor in a place of its equation, or None."""
+        return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)
+
+    def part(self, sensor, role):
+        """Return the slice of the parameter vector of the effect in a place of a sensor's equation; empty where there is none."""
+        effect = self.find(sensor, role)
+        return slice(0, 0) if effect is None else self.slices[effect.key]
+
+    def value(self, sensor, role, values):
+        """Return the values of the effect in a place of a sensor's equation in its documented shape, or None."""
+        effect = self.find(sensor, role)
+        return None if effect is None else values[self.slices[effect.key]].reshape(effect.shape)
+
+    @property
+    def further(self):
+        """Effects that are neither offset nor linear response."""
+        return [e for e in self.effects if e.role not in (Role.OFFSET, Role.LINEAR)]
+
+    @property
+    def needs_temperature(self):
+        """Whether an effect depends on temperature."""
+        return any('temperature' in effect.needs for effect in self.effects)
+
+    @cached_property
+    def requested(self):
+        """Whether somebody asks for each parameter; table, clock and the common arm are nuisances. Shape (n_params,)."""
+        return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
 
     def prior(self):
         """Return prior values and prior standard deviations, both shape (n_params,)."""
-        values = np.concatenate([effect.prior_values() for effect in self.effects])
-        return values, np.concatenate([prior_sds(effect) for effect in self.effects])
+        return tuple(np.concatenate(parts) for parts in zip(*((e.prior_values(), e.prior_sds()) for e in self.effects)))
 
     def start(self):
-        """Return the values to start from: the prior's, with time constants where they act."""
-        values = self.prior()[0]
-        for effect in self.effects:
-            values[self.slices[effect.sensor, effect.name]] = start_values(effect, self.point)
+        """Return the values to start from: the prior's, or the point of the columns."""
+        return np.concatenate([self.point_of(effect) for effect in self.effects])
+
+    def start_from(self, other, known):
+        """Return the values to start from, those of the effects of another model as they are known there."""
+        values = self.start()
+        for effect in other.effects:
+            if effect.key in self.slices:
+                values[self.slices[effect.key]] = known[other.slices[effect.key]]
         return values
 
     def values_of(self, sensor, values):
         """Return {effect name: values} that concern `sensor`, its own and the reference's."""
-        return {e.name: values[self.slices[e.sensor, e.name]] for e in self.effects if e.sensor in (sensor, 'reference')}
+        return {e.name: values[self.slices[e.key]] for e in self.effects if e.sensor in (sensor, 'reference')}
 
     def with_effect(self, sensor, name):
         """Return the model extended by one effect."""
         return replace(self, **{sensor: getattr(self, sensor) + (name,)})
 
-    def without(self, sensor, name):
-        """Return the model without one effect."""
-        return replace(self, **{sensor: tuple(known for known in getattr(self, sensor) if known != name)})
+    def with_role(self, sensor, role):
+        """Return the model extended by the catalogue's effect for a place of a sensor's equation."""
+        effects = self.catalogue.effects(self.joint_names).values()
+        return self.with_effect(sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role))
+
+    def with_reference_temperature(self, temperature_c):
+        """Return the model whose thermal effects vanish at the whole degree nearest to a temperature."""
+        return replace(self, temperature_ref_c=float(round(temperature_c)))
+
+    def without(self, sensor, *names):
+        """Return the model without some effects of a sensor."""
+        return replace(self, **{sensor: tuple(known for known in getattr(self, sensor) if known not in names)})
+
+    def without_arms(self):
+        """Return the model without lever arms."""
+        return self.without('accelerometer', *(effect.name for effect in self.arms))
+
+    @property
+    def arms(self):
+        """Effects that are lever arms of the accelerometers."""
+        return [e for e in self.effects if e.role in (Role.ARMS, Role.ARM)]
 
     def concerning(self, sensor):
         """Return the effects that contribute columns to `sensor`."""
         return [e for e in self.effects if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on)]
 
     def groups(self, sensor):
-        """Return the column groups of `sensor` in order, each once: (name, width)."""
-        names = {}
-        for effect in self.concerning(sensor):
-            for group in effect.groups:
-                names.setdefault(group, WIDTH[group])
-            if effect.warp is not None:
-                names['warp:' + effect.name] = 3 * effect.size
-                if sensor == 'accelerometer' and effect.derivative is None and self.has_arms and self.folded_arms is None:
-                    names['warp_lever:' + effect.name] = 9 * effect.size
-        return list(names.items())
-
-    @property
-    def has_arms(self):
-        """Whether the accelerometers have lever arms, whose terms a warp changes too."""
-        return bool({'accel_size_effect', 'lever_arm'} & set(self.accelerometer))
+        """Return the columns of `sensor` in order: (group name, width)."""
+        return [(name, rows.stop - rows.start) for name, rows in self.layout(sensor).rows.items()]
 
     def layout(self, sensor):
-        """Return where the coefficients of each group stand (worked out once per sensor)."""
+        """
+        Return where the coefficients of each group stand (worked out once per sensor).
+
+        Raises
+        ------
+        InputError
+            When two effects call different columns by one name.
+
+        """
         if sensor not in self._layouts:
-            rows, start = {}, 0
-            for name, width in self.groups(sensor):
-                rows[name] = slice(start, start + width)
-                start += width
-            self._layouts[sensor] = Layout(tuple(self.concerning(sensor)), rows, start, self.full_point())
+            groups, widths = {}, {}
+            for effect in self.concerning(sensor):
+                for group in effect.groups:
+                    if groups.setdefault(group.name, group) != group:
+                        raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', which other columns are called; rename it")
+                    widths[group.name] = group.width
+                if effect.warp is not None:
+                    widths[WARP + effect.name] = 3 * effect.size
+                    if sensor == SENSORS[0] and effect.derivative is None and self.arms and self.folded_arms is None:
+                        widths[WARP_LEVER + effect.name] = 9 * effect.size
+            ends = np.cumsum([0, *widths.values()])
+            rows = {name: slice(int(a), int(b)) for name, a, b in zip(widths, ends, ends[1:])}
+            self._layouts[sensor] = Layout(tuple(self.concerning(sensor)), groups, rows, int(ends[-1]), self.full_point())
         return self._layouts[sensor]
 
     @cached_property
     def _layouts(self):
         return {}
 
-    def warp_point(self, effect):
-        """Return the values at which `effect`'s columns are taken."""
-        return np.atleast_1d(np.asarray(self.point.get(effect.name, start_values(effect, self.point)), float))
+    def columns_of(self, sensor, role):
+        """Return the slice of the columns that the effect in a place of a sensor's equation multiplies."""
+        return self.layout(sensor).rows[self.find(sensor, role).groups[0].name]
+
+    def point_of(self, effect):
+        """Return the values at which `effect`'s columns are taken: its prior's when nothing is known yet."""
+        known = self.point.get(effect.name)
+        return effect.prior_values() if known is None else np.atleast_1d(np.asarray(known, float))
 
     @property
     def relinearised(self):
         """Effects whose columns depend on their own value."""
-        return [e for e in self.effects if e.warp is not None or e.name.endswith('_bias_drift')]
+        return [e for e in self.effects if e.relinearised]
 
     def at(self, values):
         """Return the same model linearised at `values`."""
-        moved = {e.name: np.array(values[self.slices[e.sensor, e.name]], float) for e in self.relinearised}
+        moved = {e.name: np.array(values[self.slices[e.key]], float) for e in self.relinearised}
         return replace(self, point={**self.point, **moved})
 
     def full_point(self):
         """Return what the column groups need to know besides the reference."""
-        drifts = {e.name: start_values(e, self.point) for e in self.effects if e.name.endswith('_bias_drift')}
-        return {**drifts, **self.point, 'temperature_ref_c': self.temperature_ref_c}
+        settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
+        return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
 
 
-def prior_sds(effect):
-    """Return the prior standard deviations of an effect, shape (size,)."""
-    sds = np.full(effect.size, effect.prior_sd)
-    if effect.components[-1] == 'time_constant' and effect.size > 1:
-        sds[-1] = 1000.0
-    return sds
-
-
-def start_values(effect, point):
-    """Return where an effect is linearised when nothing is known yet."""
-    if effect.name in point:
-        return np.atleast_1d(np.asarray(point[effect.name], float))
-    values = effect.prior_values()
-    if effect.components[-1] == 'time_constant' and effect.size > 1:
-        values[-1] = 300.0
-    return values
-
-
-def parse_effects(sensor, text, joint_names=('outer', 'middle', 'inner')):
-    """
-    Return effect names from a named model or names joined by '+'.
-
-    Raises
-    ------
-    InputError
-        When a name is unknown or the model lacks bias or matrix.
-
-    """
-    names = NAMED_MODELS.get(text) or tuple(part.strip() for part in text.split('+'))
-    for name in names:
-        find_effect(sensor, name, joint_names)
-    if 'matrix' not in names or 'bias' not in names:
-        raise InputError(f"the {sensor} model must contain bias and matrix, got '{text}'; write bias+matrix+...")
-    return names
+def linear_names(sensor):
+    """Return the parameter names of a sensor's matrix, shape (3, 3)."""
+    model = SensorModel()
+    return np.array(model.param_names)[model.part(sensor, Role.LINEAR)].reshape(3, 3)

@@ -6,7 +6,6 @@ import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
-from imu_calibration.effects.regressors import GROUPS
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
@@ -18,15 +17,15 @@ def added_information(model, values, noise, motion, gravity):
     Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this session.
     """
     total = np.zeros((len(values), len(values)))
-    point = model.full_point()
     for piece in motion.make(gravity):
         for sensor in SENSORS:
-            total += _piece_information(model, sensor, values, noise[sensor], piece, point)
+            total += _piece_information(model, sensor, values, noise[sensor], piece)
     return total
 
 
-def _piece_information(model, sensor, values, noise, piece, point):
-    design = np.concatenate([_group(name, width, piece, point) for name, width in model.groups(sensor)], axis=1)
+def _piece_information(model, sensor, values, noise, piece):
+    layout = model.layout(sensor)
+    design = np.concatenate([_columns(layout, name, rows, piece) for name, rows in layout.rows.items()], axis=1)
     dc = coefficient_jacobian(model, sensor, values)
     static = len(piece) == 1
     count = 500.0 if static else 2.0 * len(piece)
@@ -41,9 +40,11 @@ def _piece_information(model, sensor, values, noise, piece, point):
     return information
 
 
-def _group(name, width, piece, point):
-    thermal = name.endswith('temperature') and piece.temperature_c is None
-    return np.zeros((len(piece), width)) if thermal or name not in GROUPS else GROUPS[name](piece, point)
+def _columns(layout, name, rows, piece):
+    """Return the columns of a group; zeros where the motion has no temperature, and for what a warp makes."""
+    group = layout.groups.get(name)
+    unknown = group is None or (piece.temperature_c is None and 'temperature' in group.uses)
+    return np.zeros((len(piece), rows.stop - rows.start)) if unknown else group.columns(piece, layout.point)
 
 
 def tolerance_scaled_singular_values(information, tolerances):

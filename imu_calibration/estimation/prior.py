@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 
 
@@ -29,17 +30,14 @@ def make_prior(model: SensorModel) -> Prior:
     """
     Return the prior of a model.
 
-    When both `accel_size_effect` and `lever_arm` are estimated, the arms of the size effect sum to zero: the origin is the
+    When an arm for each axis and a common one are estimated, the former sum to zero: the origin is the
     mean of the sensitive points.
     """
     mean, sd = model.prior()
     mean = np.where(np.isfinite(mean), mean, 0.0)
-    for effect in model.relinearised:
-        if effect.components[-1] == 'time_constant' and effect.size > 1:
-            mean[model.slices[effect.sensor, effect.name]][-1] = 300.0
     rows, gauge = [np.diag(1 / sd)], np.zeros((0, len(mean)))
-    if ('accelerometer', 'accel_size_effect') in model.slices and ('accelerometer', 'lever_arm') in model.slices:
-        arms = np.arange(len(mean))[model.slices['accelerometer', 'accel_size_effect']].reshape(3, 3)
+    if {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}:
+        arms = np.arange(len(mean))[model.part('accelerometer', Role.ARMS)].reshape(3, 3)
         gauge = np.zeros((3, len(mean)))
         for component in range(3):
             gauge[component, arms[:, component]] = 1 / GAUGE_SD

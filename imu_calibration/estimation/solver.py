@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
@@ -92,16 +92,15 @@ def start(system: WeightedSystem) -> np.ndarray:
     values = model.start()
     values = np.where(np.isfinite(values), values, 0.0)
     for sensor in SENSORS:
-        rows = model.layout(sensor).rows
-        matrix = rows['force' if sensor == 'accelerometer' else 'rate']
-        chosen = [rows['one'].start, *range(matrix.start, matrix.stop)]
+        every = np.arange(model.layout(sensor).width)
+        chosen = np.concatenate([every[model.columns_of(sensor, role)] for role in (Role.OFFSET, Role.LINEAR)])
         means = system.means[sensor]
         weight = np.sqrt(system.counts / system.counts.max())[:, None]
         penalty = 1e-6 * np.eye(4)
         target = np.concatenate([np.zeros((1, 3)), np.eye(3)])
         design = np.concatenate([weight * means[:, chosen], penalty])
         solution = np.linalg.lstsq(design, np.concatenate([weight * means[:, -3:], penalty @ target]), rcond=None)[0]
-        values[model.slices[sensor, 'bias']], values[model.slices[sensor, 'matrix']] = solution[0], solution[1:].T.ravel()
+        values[model.part(sensor, Role.OFFSET)], values[model.part(sensor, Role.LINEAR)] = solution[0], solution[1:].T.ravel()
     return values
 
 
@@ -164,7 +163,7 @@ def _session_biases(system, values, noises):
         noise = noises[sensor]
         if noise.session_variance > 0:
             misfit = system.misfit(sensor, system.means[sensor], values)
-            found[sensor] = values[system.model.slices[sensor, 'bias']] + predict_session_offsets(
+            found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + predict_session_offsets(
                 misfit, system.mean_variance(noise) + noise.offset_sd**2, system.times, system.sessions, noise)
     return found
 

@@ -6,10 +6,11 @@ from collections import Counter
 import numpy as np
 
 from imu_calibration.compensation.angular_acceleration import WARM_UP, CausalDerivative, StampedDerivative, typical_period
-from imu_calibration.compensation.compensate import arms_of, invertible, needs_temperature, saturation_level
+from imu_calibration.compensation.compensate import arms_of, invertible, saturation_level
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import derivative_for, late_ns
+from imu_calibration.effects.base import SENSORS, Role
 from msg_adapters.imu import find_imu_layout
 from msg_adapters.stamps import MessageError
 
@@ -50,12 +51,12 @@ class LiveCompensation:
         self.with_parameters = with_parameters
         self.counts = Counter()
         self.received, self.corrected, self.fastest_squared = 0, 0, 0.0
-        self.needs_temperature = needs_temperature(invertible(calibration.model))
+        self.needs_temperature = invertible(calibration.model).needs_temperature
         self.dt = None if self.needs_temperature else 0.0
         self.period, self._tracker, self._push, self._steps = None, None, None, []
         self.needs_slope = bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
         self._kernel = make_kernel(calibration, transfer)
-        self._zero = {s: calibration.value(s, 'bias').tolist() for s in ('accelerometer', 'gyroscope')}
+        self._zero = {s: calibration.of(s, Role.OFFSET).tolist() for s in SENSORS}
         self._levels = tuple(saturation_level(calibration, sensor) for sensor in ('accelerometer', 'gyroscope'))
         self._can_saturate = any(np.isfinite(self._levels))
         self._late_ns = late_ns(calibration, correct_stamps)

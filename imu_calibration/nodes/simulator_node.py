@@ -16,6 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.hints import HINTS
@@ -115,7 +116,7 @@ class SimulatorNode(Node):
         if settings.calibration_file:
             calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
             return calibration.model, calibration.values
-        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=self._table.joint_names)
+        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=self._table.joint_names)
         return model, random_values(model, settings.grade, settings.seed if settings.imu_seed < 0 else settings.imu_seed)
 
     def _options(self):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
@@ -14,7 +15,6 @@ RELATED = 0.5
 """Smallest squared correlation from which on factors and axes are looked at."""
 LEAST_RATE = 0.02
 """Rms of the reference's rates below which they say nothing, rad/s."""
-REFERENCE = {'accelerometer': 'force', 'gyroscope': 'rate'}
 WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'), 'gyroscope': ('angular rates', 'the rates of the joints')}
 
 
@@ -43,9 +43,9 @@ def against_joints(gathered, model, table=None):
 
 def _moments(accumulator, model, sensor):
     """Return sums of products (measured with reference, reference with itself, measured with itself), or None."""
-    part = model.layout(sensor).rows.get(REFERENCE[sensor])
+    part = model.columns_of(sensor, Role.LINEAR)
     rows = [row for row in accumulator.rows if sensor == 'gyroscope' or row.kind == 'static']
-    if part is None or not rows:
+    if not rows:
         return None
     weight = np.array([row.count if sensor == 'gyroscope' else 1.0 for row in rows])
     means = np.array([row.sensors[sensor].mean for row in rows])

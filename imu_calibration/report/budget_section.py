@@ -24,7 +24,7 @@ def budget_section(result):
 
 def _effects(result):
     model = result.calibration.model
-    return [(e, model.slices[e.sensor, e.name]) for e in model.effects if np.any(result.calibration.sd[model.slices[e.sensor, e.name]] > 0)]
+    return [(e, model.slices[e.key]) for e in model.effects if np.any(result.calibration.sd[model.slices[e.key]] > 0)]
 
 
 def _rows(result, budget):

@@ -1,7 +1,7 @@
 """The report of a calibration: the verdict first, then everything that supports it."""
 
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import judge, requested
+from imu_calibration.calibration.verdict import judge
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -39,9 +39,8 @@ def calibration_report(result):
 
 def tiles(result, errors, navigation):
     """Return the figures that matter most: what was determined, and the errors before and after."""
-    names = [name for name in result.calibration.param_names if requested(name)]
-    done = sum(status == DETERMINED for name, status in zip(result.calibration.param_names, result.calibration.status) if requested(name))
-    found = [_tile('parameters determined', f'{done} of {len(names)}', None, 'to their tolerances')]
+    asked = list(result.calibration.requested.values())
+    found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]
     for sensor in ('accelerometer', 'gyroscope'):
         after, before = (in_unit(errors.rms(sensor, which), UNIT[sensor]) for which in ('after', 'before'))
         found.append(_tile(f'{sensor} error', after, before, f'rms of {len(errors.time)} window means'))

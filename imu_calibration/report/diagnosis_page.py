@@ -111,13 +111,6 @@ def draw_over_time(result):
     return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, over), 'Residuals over time before and after the extension')
 
 
-CAUSES = (('thermal', ('temperature',)), ('drift', ('time',)), ('g_sensitivity', ('force',)), ('rate_product', ('rate',)),
-          ('encoder', ('angle',)), ('axis_non', ('angle',)), ('tilt', ('angle',)), ('accel_quadratic', ('force',)),
-          ('accel_cubic', ('force',)), ('accel_cross', ('force',)), ('accel_scale', ('force',)), ('gyro_quadratic', ('rate',)),
-          ('gyro_scale', ('rate',)))
-"""Part of an effect's name -> variables that are its cause; others are drawn against the effect's own signal."""
-
-
 def variables(traces):
     """Return {label: (kind, values)} of everything that a residual may be drawn against, in people's units."""
     found = {'time, s': ('time', traces.time)}
@@ -146,9 +139,7 @@ def cause_of(traces, finding):
     sensor = finding.gain.sensor
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
-    kinds = next((kinds for part, kinds in CAUSES if part in finding.effect), ())
-    if len(signal) < FEW:
-        kinds = ()  # a mean over bins of so few poses says nothing
+    kinds = finding.against if len(signal) >= FEW else ()  # a mean over bins of few poses says nothing
     best = max(((explained_share(values, signal[:, axis]), label, values)
                 for label, (kind, values) in variables(traces).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])

@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
 from imu_calibration.compensation.compensate import arms_of
 from imu_calibration.constants import DEG
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.report.figures import AXIS, GREY, INK, draw
 from imu_calibration.report.numbers import fixed, pair
 from imu_calibration.units import decimals
@@ -30,7 +30,7 @@ def _derived(found, nominal):
 
 def lever_section(result):
     """Return the drawing of the lever arms, or None when the model has none."""
-    if not result.calibration.has('accelerometer', 'accel_size_effect'):
+    if result.calibration.of('accelerometer', Role.ARMS) is None:
         return None
     gauge = result.calibration.gauge.get('origin')
     origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
@@ -43,7 +43,7 @@ class _Arms:
 
     def __init__(self, calibration):
         self.arms = arms_of(calibration) * 1e3
-        part = calibration.model.slices['accelerometer', 'accel_size_effect']
+        part = calibration.model.part('accelerometer', Role.ARMS)
         self.cov = calibration.covariance[part, part] * 1e6
 
     def __call__(self, figure):

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.effects.base import Role
 from imu_calibration.estimation.standard_motions import _attitudes
 from imu_calibration.navigation import strapdown
 from imu_calibration.reference.kinematics import reference_motion
@@ -169,9 +170,10 @@ def _moving_runs(result, window, length):
 
 def _at_origin(calibration, ref):
     """Return the reference at the origin of the calibration's arms, which the common lever arm leads to."""
-    if not calibration.has('accelerometer', 'lever_arm'):
+    arm = calibration.of('accelerometer', Role.ARM)
+    if arm is None:
         return ref
-    force = ref.force_s + lever_matrix(ref.rate_s, ref.alpha_s) @ calibration.value('accelerometer', 'lever_arm')
+    force = ref.force_s + lever_matrix(ref.rate_s, ref.alpha_s) @ arm
     return Reference(ref.time, ref.mat_sn, force, ref.rate_s, ref.alpha_s, ref.gravity)
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from imu_calibration.effects.base import SHORT
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text
 
-SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
 ROW = 0.155
 """Height of one bar, inches."""
 
@@ -55,7 +55,7 @@ def _correlation(calibration, live):
 def short_name(name):
     """Return a parameter or effect name that fits a figure."""
     sensor, _, rest = name.partition('.')
-    rest = rest.removeprefix('accel_').removeprefix('gyro_').replace('_', ' ').replace('.', ' ')
+    rest = rest.removeprefix(SHORT.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')
     return rest if sensor == 'reference' else f'{SHORT[sensor]} {rest}'
 
 

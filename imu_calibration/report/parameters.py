@@ -2,16 +2,11 @@
 
 import numpy as np
 
-from imu_calibration.calibration.document import IN_REFERENCE
 from imu_calibration.calibration.status import DETERMINED, HELD
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
-TITLES = {'bias': 'bias', 'matrix': 'matrix (scale factors and axis directions)',
-          'accel_size_effect': 'size effect: origin to the sensitive point of each axis',
-          'lever_arm': 'lever arm of the triad (the table’s business)', 'table_tilt': 'table tilt',
-          'earth_rate': 'Earth rate in the level frame'}
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
 USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
        'none': 'belongs to the table or the session, not removed'}
@@ -22,12 +17,10 @@ def parameter_groups(result):
     calibration, needs = result.calibration, motions_needed(result)
     groups = []
     for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.sensor, effect.name]
+        part = calibration.model.slices[effect.key]
         rows = [_row(result, index, effect.unit_of(k), effect.components[k], needs) for k, index in enumerate(range(part.start, part.stop))]
-        section = 'reference' if effect.name in IN_REFERENCE else effect.sensor
-        groups.append({'sensor': SENSOR_TITLES[section], 'title': TITLES.get(effect.name, effect.name.replace('_', ' ')),
-                       'name': effect.name, 'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows,
-                       'unit': effect.unit_of(0)})
+        groups.append({'sensor': SENSOR_TITLES[effect.section], 'title': effect.heading, 'name': effect.name,
+                       'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
     return groups
 
 

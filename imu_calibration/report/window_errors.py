@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.estimation.accumulator import restrict
 
@@ -43,24 +43,14 @@ def _on_table(result):
     found, calibration, rows = window_residuals(result), result.calibration, result.gathered.accumulator.rows
     kind, count = np.array(found['kind']), np.array(found['count'], float)
     parts = {name: {} for name in ('measured', 'true', 'before', 'after', 'floor')}
-    for sensor, group in zip(SENSORS, ('force', 'rate')):
-        start = _first_column(result.gathered_model, sensor, group)
-        true = np.array([row.sensors[sensor].mean[start:start + 3] for row in rows])
+    for sensor in SENSORS:
+        true = np.array([row.sensors[sensor].mean[result.gathered_model.columns_of(sensor, Role.LINEAR)] for row in rows])
         noise = result.solution.noise[sensor]
         parts['measured'][sensor], parts['true'][sensor] = found[sensor]['measured'], true
         parts['before'][sensor] = found[sensor]['before']
-        parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(calibration.value(sensor, 'matrix')).T
+        parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(calibration.of(sensor, Role.LINEAR)).T
         parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
     return WindowErrors(found['time'], kind, **parts)
-
-
-def _first_column(model, sensor, group):
-    start = 0
-    for name, width in model.groups(sensor):
-        if name == group:
-            return start
-        start += width
-    return None
 
 
 def _by_hand(result):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from imu_calibration.compensation.compensate import arms_of, compensate, invertible
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.report.numbers import fixed, text
@@ -16,10 +17,10 @@ def worked_sample(result):
     sample = _sample(result)
     force, rate, alpha = (getattr(sample, name) for name in ('force', 'rate', 'alpha'))
     corrected = compensate(calibration, force[None], rate[None], alpha[None], sample.temperature)
-    inverses = {s: np.linalg.inv(calibration.value(s, 'matrix')) for s in ('accelerometer', 'gyroscope')}
+    inverses = {s: np.linalg.inv(calibration.of(s, Role.LINEAR)) for s in SENSORS}
     arms = arms_of(calibration)
     return {
-        'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.value(s, 'bias')], 'unit': unit,
+        'matrices': [{'name': name, 'bias': [fixed(v, 6) for v in calibration.of(s, Role.OFFSET)], 'unit': unit,
                       'inverse': [[fixed(v, 7) for v in row] for row in inverses[s]]}
                      for name, s, unit in (('Accelerometer', 'accelerometer', 'm/s²'), ('Gyroscope', 'gyroscope', 'rad/s'))],
         'arms': [[fixed(v * 1e3, 3) for v in row] for row in arms] if np.any(arms) else None, 'further': further_effects(calibration),
@@ -29,13 +30,13 @@ def worked_sample(result):
 
 def further_effects(calibration):
     """Return the effects beside bias, matrix and size effect that compensation takes out."""
-    return [e.name for e in invertible(calibration.model).effects if e.name not in ('bias', 'matrix', 'accel_size_effect')]
+    return [effect.name for effect in invertible(calibration.model).further if effect.role is not Role.ARMS]
 
 
 def _steps(result, sample, corrected):
     calibration, arms = result.calibration, arms_of(result.calibration)
     turning = lever_matrix(corrected.rate, sample.alpha[None])[0]
-    felt = np.einsum('ij,jk,ik->i', calibration.value('accelerometer', 'matrix'), turning, arms)
+    felt = np.einsum('ij,jk,ik->i', calibration.of('accelerometer', Role.LINEAR), turning, arms)
     plain = not further_effects(calibration)
     steps = [('raw rate', 'rad/s', sample.rate, ''),
              ('corrected rate', 'rad/s', corrected.rate[0], 'M⁻¹ (raw − b), gyroscope' if plain else ''),
@@ -75,8 +76,8 @@ def _moving_sample(result, kept):
     best = int(np.argmax([speed.max() for speed in speeds]))
     window, index = kept[best], int(np.argmax(speeds[best]))
     ref = reference_motion(result.table, window.motion.select(slice(index, index + 1)))
-    arm = result.calibration.value('accelerometer', 'lever_arm') if result.calibration.has('accelerometer', 'lever_arm') else np.zeros(3)
-    true_force = ref.force_s[0] + lever_matrix(ref.rate_s, ref.alpha_s)[0] @ arm
+    arm = result.calibration.of('accelerometer', Role.ARM)
+    true_force = ref.force_s[0] + (0.0 if arm is None else lever_matrix(ref.rate_s, ref.alpha_s)[0] @ arm)
     temperature = _reference_temperature(result) if window.temperature_c is None else window.temperature_c[index:index + 1]
     alpha = ', '.join(fixed(a, 3) for a in ref.alpha_s[0])
     where = (f'the fastest sample that was kept, at {text(window.time[index], 4)} s, with the table’s angular acceleration '

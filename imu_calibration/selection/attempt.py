@@ -18,6 +18,7 @@ from imu_calibration.selection.parameter_space import counted_from_values, param
 from imu_calibration.selection.questions import Question, extended_model, time_constants
 from imu_calibration.selection.reduced_recording import ReducedRecording, mean_arms, reduce_recording
 from imu_calibration.selection.search import Search
+from imu_calibration.selection.time_constant_bank import make_bank
 from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
@@ -52,7 +53,7 @@ class Attempt:
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
-        recording = reduce_recording(windows, table, model, values, self.constants, progress)
+        recording = reduce_recording(windows, table, model, values, make_bank(effects, self.constants, model, values), progress)
         used = baseline_parameters(baseline, model)
         if point is None:
             recording = _at_baseline(recording, baseline, used)
@@ -104,27 +105,27 @@ class Attempt:
         """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         model = self.recording.model
-        return any(e.warp is not None and (e.sensor, e.name) not in kept and np.any(model.warp_point(e)) for e in model.effects)
+        return any(e.warp is not None and e.key not in kept and np.any(model.point_of(e)) for e in model.effects)
 
     def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
         """Return (model, values) at which the columns should be taken for this choice."""
         values = self.values(chosen)
         model = extended_model(self.baseline, self.effects)
         for question in chosen:
-            if question.name.endswith('_bias_drift'):
+            if question.effect.time_constant:
                 model = model.with_effect(question.sensor, question.name)
         start = model.start()
         for effect in model.effects:
-            known = self.recording.model.slices.get((effect.sensor, effect.name))
+            known = self.recording.model.slices.get(effect.key)
             if known is not None:
-                start[model.slices[effect.sensor, effect.name]] = values[known]
+                start[model.slices[effect.key]] = values[known]
         for question in chosen:
             if '@' in question.label:
                 start[model.slices[question.sensor, question.name]] = self._warm_up(chosen, question, values)
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         for effect in model.effects:
-            if (effect.sensor, effect.name) not in kept:
-                start[model.slices[effect.sensor, effect.name]] = 0.0
+            if effect.key not in kept:
+                start[model.slices[effect.key]] = 0.0
         return model.at(start), start
 
     def _warm_up(self, chosen, question, values):
@@ -151,7 +152,7 @@ def encoder_step(windows: Sequence[Window]) -> float:
 
 def baseline_parameters(baseline: SensorModel, model: SensorModel) -> tuple[int, ...]:
     """Return the indices of the baseline's parameters in an extended model."""
-    return tuple(k for e in baseline.effects for k in range(model.slices[e.sensor, e.name].start, model.slices[e.sensor, e.name].stop))
+    return tuple(k for e in baseline.effects for k in range(model.slices[e.key].start, model.slices[e.key].stop))
 
 
 def _start(baseline, effects):
@@ -162,7 +163,7 @@ def _start(baseline, effects):
 
 def _at_baseline(recording, baseline, used):
     """Move the residual to the baseline's own solution."""
-    for _ in range(2 if baseline.has_arms else 1):
+    for _ in range(2 if baseline.arms else 1):
         space = in_trusted_band(parameter_space(recording, baseline))
         values = recording.values.copy()
         values[list(used)] += solve_normal(normal_matrix(space, first_noise(space)), used, space.prior_sd, space.prior_mean)[0]
@@ -175,8 +176,8 @@ def _curvature(question, values, model):
     effect = question.effect
     value = values[list(question.parameters)]
     if effect.warp is not None:
-        moved = np.max(np.abs(value - model.warp_point(effect)))
+        moved = np.max(np.abs(value - model.point_of(effect)))
         return moved * (FASTEST if effect.unit == 's' else 1.0)
-    if effect.name.endswith('_bias_drift'):
-        return abs(np.log(max(value[3], 1e-3) / model.full_point()[effect.name][3]))
+    if effect.time_constant:
+        return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

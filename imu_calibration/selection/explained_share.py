@@ -74,7 +74,7 @@ def pruned(chosen: Sequence[Question], share: Callable) -> list[Question]:
 
 def needed_share(question: Question) -> float:
     """Return the share of the unexplained that a finding of this effect must remove."""
-    return LEAST_SHARE_SMOOTH if question.name.endswith(('_thermal_bias', '_bias_drift')) else LEAST_SHARE
+    return LEAST_SHARE_SMOOTH if question.effect.smooth else LEAST_SHARE
 
 
 def sensors_of(effect: Effect) -> tuple[str, ...]:

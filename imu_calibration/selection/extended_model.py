@@ -5,7 +5,7 @@ from typing import Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.band_misfit import WEIGHTLESS
 from imu_calibration.estimation.noise_model import NoiseModel
@@ -52,9 +52,8 @@ def _in_trusted_band(noise, slow_only):
 
 
 def _with_limit(solution, limit):
-    short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}[limit.sensor]
-    model = solution.model.with_effect(limit.sensor, f'{short}_saturation')
-    place = model.slices[limit.sensor, f'{short}_saturation'].start
+    model = solution.model.with_role(limit.sensor, Role.LIMIT)
+    place = model.part(limit.sensor, Role.LIMIT).start
 
     def grown(matrix, corner):
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)

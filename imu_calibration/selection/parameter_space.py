@@ -9,18 +9,15 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.questions import Question, special
+from imu_calibration.selection.questions import Question
 from imu_calibration.selection.reduced_recording import ReducedRecording
-
-BANK_PRIOR_SD = {'accelerometer': 0.5, 'gyroscope': 0.05}
-"""Of the amplitudes of warm-ups, m/s^2 and rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
     """
-    A reduced recording in the parameters that are asked about: those of the extended model, then the banks of warm-ups (time constant
-    by axis, per sensor).
+    A reduced recording in the parameters that are asked about: those of the extended model, then the amplitudes of the banks of time
+    constants, per sensor.
 
     Rows are ``[design | residual]`` of one axis; all their columns act on that axis.
     """
@@ -103,63 +100,68 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
         The model that is asked what it lacks.
 
     """
-    model, n_bank = recording.model, len(recording.constants)
+    model, bank = recording.model, [entry for sensor in SENSORS for entry in recording.bank[sensor]]
     prior, sd = model.prior()
     for effect in model.effects:
-        if effect.name.endswith('_bias_drift'):
-            prior[model.slices[effect.sensor, effect.name]][-1] = recording.values[model.slices[effect.sensor, effect.name]][-1]
+        if effect.time_constant:
+            prior[model.slices[effect.key]][-1] = recording.values[model.slices[effect.key]][-1]
     in_baseline = counted_from_values(model, baseline)
     shift = np.where(in_baseline, prior - recording.values, prior)
     removed = np.where(in_baseline, 0.0, recording.values)
-    names = [*model.param_names, *(f'{sensor}_warm_up.{k}.{axis}' for sensor in SENSORS for k in range(n_bank) for axis in 'xyz')]
+    names = [*model.param_names, *(name for entry in bank for name in entry.param_names)]
     index, join = {}, {}
-    for number, sensor in enumerate(SENSORS):
-        parts = [_join(model, sensor, axis, recording, removed, number) for axis in range(3)]
+    for sensor in SENSORS:
+        parts = [_join(model, sensor, axis, recording, removed, len(names)) for axis in range(3)]
         index[sensor], join[sensor] = map(list, zip(*parts))
-    bank_sd = np.repeat([BANK_PRIOR_SD[sensor] for sensor in SENSORS], 3 * n_bank)
-    return ParameterSpace(recording, tuple(names), np.concatenate([sd, bank_sd]), np.concatenate([shift, np.zeros(6 * n_bank)]), index, join)
+    sd = np.concatenate([sd, *(entry.prior_sd for entry in bank)])
+    return ParameterSpace(recording, tuple(names), sd, np.pad(shift, (0, len(names) - len(shift))), index, join)
 
 
-def _join(model, sensor, axis, recording, removed, number):
+def bank_places(recording: ReducedRecording) -> dict[str, slice]:
+    """Return label -> parameters of each entry of the banks."""
+    entries = [entry for sensor in SENSORS for entry in recording.bank[sensor]]
+    ends = np.cumsum([len(recording.model.param_names), *(len(entry.param_names) for entry in entries)])
+    return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
+
+
+def _join(model, sensor, axis, recording, removed, size):
     """Return (parameters that act on an axis, matrix that joins columns to them)."""
-    n_bank, n_model = len(recording.constants), len(model.param_names)
+    bank, places = recording.bank[sensor], bank_places(recording)
     jacobian = coefficient_jacobian(model, sensor, recording.values)[:, axis]
-    p = len(jacobian)
-    full = np.zeros((p + n_bank + 3, n_model + 6 * n_bank + 1))
+    p, n_model = jacobian.shape
+    ends = np.cumsum([p, *(len(entry.slopes) for entry in bank)])
+    full = np.zeros((ends[-1] + 3, size + 1))
     full[:p, :n_model] = jacobian
-    full[p + np.arange(n_bank), n_model + 3 * n_bank * number + 3 * np.arange(n_bank) + axis] = 1.0
+    for entry, a, b in zip(bank, ends, ends[1:]):
+        full[a:b, places[entry.label]] = entry.slopes[:, axis]
     full[:p, -1] = jacobian @ removed
-    full[p + n_bank + axis, -1] = 1.0
+    full[ends[-1] + axis, -1] = 1.0
     used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
     return used, full[:, np.append(used, -1)]
 
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
-    """Return a mask of the parameters that count from the linearisation: the baseline's, and time constants of warm-ups."""
-    masks = [np.full(e.size, (e.sensor, e.name) in baseline.slices) for e in model.effects]
+    """Return a mask of the parameters that count from the linearisation: the baseline's, and time constants."""
+    masks = [np.full(e.size, e.key in baseline.slices) for e in model.effects]
     for effect, mask in zip(model.effects, masks):
-        if effect.name.endswith('_bias_drift'):
+        if effect.time_constant:
             mask[-1] = True
     return np.concatenate(masks)
 
 
 def questions(space: ParameterSpace, effects: Sequence[Effect]) -> list[Question]:
-    """Return a Question for each effect; a warm-up gives one per time constant of the bank."""
-    model, constants = space.recording.model, space.recording.constants
-    n_bank, n_model = len(constants), len(model.param_names)
-    asked = []
+    """Return a Question for each effect; one with a time constant gives one per time constant of the bank."""
+    model, places, asked = space.recording.model, bank_places(space.recording), []
     for effect in effects:
-        if (effect.sensor, effect.name) in model.slices:
-            part = model.slices[effect.sensor, effect.name]
-            asked.append(Question(effect, tuple(range(part.start, part.stop)), effect.size, effect.name))
-        elif special(effect) and effect.name.endswith('_bias_drift'):
-            first = n_model + 3 * n_bank * SENSORS.index(effect.sensor)
-            for k in range(n_bank):
-                asked.append(Question(effect, tuple(range(first + 3 * k, first + 3 * k + 3)), 4, f'{effect.name}@{k}'))
+        if effect.key in model.slices:
+            found = {effect.name: model.slices[effect.key]}
+        else:
+            found = {entry.label: places[entry.label] for entry in space.recording.bank.get(effect.sensor, ()) if entry.effect is effect}
+        asked += [Question(effect, tuple(range(part.start, part.stop)), effect.size, label) for label, part in found.items()]
     return asked
 
 
 def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
-    """Return sensor -> list of the parameters of effects that are smooth in time: thermal bias and warm-ups."""
-    smooth = [q for q in asked if q.name.endswith(('_thermal_bias', '_bias_drift'))]
+    """Return sensor -> list of the parameters of effects that are smooth in time."""
+    smooth = [q for q in asked if q.effect.smooth]
     return {sensor: [q.parameters for q in smooth if q.sensor == sensor] for sensor in SENSORS}

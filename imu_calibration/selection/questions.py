@@ -5,8 +5,7 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.effects.catalogue import catalogue
+from imu_calibration.effects.base import SECTIONS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
@@ -57,7 +56,7 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     """
     kinds = {window.kind for window in windows}
     span = _temperature_span(windows)
-    have = {(e.sensor, e.name) for e in model.effects}
+    have = {e.key for e in model.effects}
     return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span))
 
 
@@ -68,8 +67,8 @@ def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], l
     ``why_not(effect)`` gives (why, needs), or None for what can be asked about.
     """
     known, lacking = [], []
-    have = {(e.sensor, e.name) for e in model.effects}
-    for key, effect in catalogue(model.joint_names).items():
+    have = {e.key for e in model.effects}
+    for key, effect in model.catalogue.effects(model.joint_names).items():
         if key in have:
             continue
         why = why_not(effect)
@@ -97,12 +96,9 @@ def _why_not(effect, have, table, kinds, span):
         return 'the recording has no rotation', 'spin and swing the table'
     if 'dynamic' in effect.needs and not moving:
         return 'the recording has no motion', 'swing the table at several frequencies'
-    if effect.name == 'lever_arm' and ('accelerometer', 'accel_size_effect') in have:
-        return 'the size effect of the model contains it', 'leave the size effect out of the model'
-    if effect.name == 'earth_rate' and table.latitude is not None and table.azimuth_deg is not None:
-        return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
-                'leave the azimuth out of the table description')
-    return None
+    if (effect.sensor, effect.contained_in) in have:
+        return f'the {effect.contained_in} of the model contains it', f'leave {effect.contained_in} out of the model'
+    return effect.moot(table) if effect.moot else None
 
 
 def time_constants(duration: float) -> np.ndarray:
@@ -113,15 +109,15 @@ def time_constants(duration: float) -> np.ndarray:
 def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
     """Return the model with all these effects, but for those that are asked otherwise (warm-ups, saturation)."""
     kept = [e for e in effects if e.warp is not None or not special(e)]
-    added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SENSORS + ('reference',)}
+    added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SECTIONS}
     return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
 
 
 def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
     """Return the effects that are asked about by columns."""
-    return [effect for effect in effects if not effect.name.endswith('_saturation')]
+    return [effect for effect in effects if effect.role is not Role.LIMIT]
 
 
 def special(effect: Effect) -> bool:
     """Return whether an effect has no columns of its own here: saturation is censoring, a warm-up has a bank of time constants."""
-    return effect.name.endswith('_saturation') or effect.name.endswith('_bias_drift')
+    return effect.role is Role.LIMIT or effect.time_constant

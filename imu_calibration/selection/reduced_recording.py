@@ -8,13 +8,14 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
-from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.forward_equations import all_arms, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.time_constant_bank import BankEntry
 
 CHUNK = 16384
 """Samples whose columns are held at once."""
@@ -22,14 +23,14 @@ CHUNK = 16384
 
 @dataclass(frozen=True, eq=False)
 class ReducedRecording:
-    """Windows of one recording as statistics of ``[columns of the model | bank of warm-ups | output]``, and a point to take residuals at."""
+    """Windows of one recording as statistics of ``[columns of the model | bank of time constants | output]``, and a point to take residuals at."""
 
     model: SensorModel
     """Every effect that is asked about, linearised at its point."""
     values: np.ndarray
     """Parameters that residuals belong to."""
-    constants: np.ndarray
-    """Time constants of the bank of warm-ups, s, shape (n_constants,)."""
+    bank: dict[str, list[BankEntry]]
+    """Sensor -> effects with a time constant, at each of some; their columns come last."""
     windows: tuple[WindowStatistics, ...]
     """Reduced as for a calibration, kept one by one."""
     describe: dict[str, np.ndarray]
@@ -119,10 +120,10 @@ class ReducedRecording:
         return accumulator
 
 
-def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, constants: np.ndarray,
+def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, bank: dict[str, list[BankEntry]],
                      progress: Callable | None = None) -> ReducedRecording:
     """
-    Reduce windows with the columns of a model and a bank of warm-ups.
+    Reduce windows with the columns of a model and a bank of time constants.
 
     Parameters
     ----------
@@ -132,15 +133,16 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
     model : SensorModel
     values : array, shape (n_params,)
         Parameters that residuals belong to.
-    constants : array, shape (n_constants,)
-        Time constants of the bank, s.
+    bank : dict
+        Sensor -> list of BankEntry (`make_bank`).
     progress : callable, optional
         Called with the share that is done, in [0, 1].
 
     """
     def with_bank(model, sensor, table, motion, temperature_c=None, references: References | None = None):
-        bank = -np.expm1(-motion.time[:, None] / np.asarray(constants)[None, :])
-        return np.concatenate([columns(model, sensor, table, motion, temperature_c, references), bank], axis=1)
+        references = references or References(model, table, motion, temperature_c)
+        ref = references.at(sensor)
+        return np.concatenate([columns(model, sensor, table, motion, temperature_c, references), *(entry.columns(ref) for entry in bank[sensor])], axis=1)
 
     reduced = []
     for part in _pieces(windows):
@@ -148,7 +150,7 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
         if progress:
             progress(len(reduced) / len(windows))
     descriptions = [_describe(window) for window in windows]
-    return ReducedRecording(model, values, np.asarray(constants), tuple(reduced), {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
+    return ReducedRecording(model, values, bank, tuple(reduced), {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
 
 
 def _pieces(windows):
@@ -181,8 +183,4 @@ def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     Their differences change the derivative of a delay little where they are millimetres, and bend it where a recording does not show them
     and they come out as centimetres.
     """
-    arms = np.zeros((3, 3))
-    for name in ('lever_arm', 'accel_size_effect'):
-        if ('accelerometer', name) in model.slices:
-            arms += values[model.slices['accelerometer', name]].reshape(-1, 3).mean(axis=0)
-    return arms
+    return np.tile(all_arms(model, values).mean(axis=0), (3, 1))

@@ -18,14 +18,10 @@ TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
 ABSURD = 50.0
 """A size beyond this many times the largest that the catalogue knows of is no explanation."""
-KNOWN = {'earth_rate': 1.0}
-"""Effects whose size is known: times the largest that the catalogue holds."""
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
 """Members of a class of effects that are not told apart, the named one included."""
-CONTAINS = {'lever_arm': 'accel_size_effect'}
-"""Effects that are special cases of others; the simpler one that does as well wins, and is no rival of the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +82,13 @@ class Search:
         values, covariance = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
         value, sd = values[places], np.sqrt(np.diag(covariance)[places])
-        if question.effect.name.endswith('_bandwidth') and value[0] < 0:
+        if question.effect.nonnegative and value[0] < 0:
             return False
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
         if question.effect.unit == 'rad' and np.all(np.abs(value) < 0.5 * self.encoder_step):
             return False
-        largest = max((limit for _, limit, _ in question.effect.plausible), default=np.inf)
-        return bool(np.all(np.abs(value) - 3 * sd < KNOWN.get(question.name, ABSURD) * largest))
+        largest = question.effect.largest * (1.0 if question.effect.known_size else ABSURD)
+        return bool(np.all(np.abs(value) - 3 * sd < largest))
 
     def run(self) -> list[Question]:
         """Return the chosen questions in the order in which they were found."""
@@ -152,8 +148,8 @@ class Search:
         for other in self.others(chosen):
             trial = chosen[:place] + [other] + chosen[place + 1:]
             difference = self.cost(trial) - cost
-            if CONTAINS.get(question.name) == other.name:
-                continue
+            if question.effect.contained_in == other.name:
+                continue  # a special case that does as well as the whole wins, and the whole is no rival of it
             if difference < TIE and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)

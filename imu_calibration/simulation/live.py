@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import warped_reference
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.reference.reference_motion import lever_matrix
@@ -94,8 +94,9 @@ class LiveSimulation:
     def _truth(self, stamps, motion):
         felt = [warped_reference(self.model, sensor, self.table, motion) for sensor in SENSORS]
         force = felt[0].force_s
-        if ('accelerometer', 'lever_arm') in self.model.slices:
-            force = force + lever_matrix(felt[0].rate_s, felt[0].alpha_s) @ self.values[self.model.slices['accelerometer', 'lever_arm']]
+        arm = self.model.value('accelerometer', Role.ARM, self.values)
+        if arm is not None:
+            force = force + lever_matrix(felt[0].rate_s, felt[0].alpha_s) @ arm
         return ImuSamples(stamps, force, felt[1].rate_s, self.options.frame_id)
 
     def _joints(self, until):

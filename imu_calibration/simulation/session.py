@@ -4,10 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import owner_of
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders
@@ -48,31 +46,30 @@ def random_values(model, grade='industrial', seed=0):
     rng, grade = np.random.default_rng([seed, 7]), GRADES[grade]
     values = model.start()
     for effect in model.effects:
-        part = model.slices[effect.sensor, effect.name]
-        if effect.name == 'bias':
+        part = model.slices[effect.key]
+        if effect.role is Role.OFFSET:
             values[part] += rng.normal(0.0, grade.accel_bias if effect.sensor == 'accelerometer' else grade.gyro_bias, 3)
-        elif effect.name == 'matrix':
+        elif effect.role is Role.LINEAR:
             spread = np.where(np.eye(3), grade.scale, grade.misalignment).ravel()
             values[part] += rng.normal(0.0, 1.0, 9) * spread
-        elif effect.name == 'accel_size_effect':
+        elif effect.role is Role.ARMS:
             arms = rng.normal(0.0, grade.arm, (3, 3))
             values[part] = (arms - arms.mean(axis=0)).ravel()
     return values
 
 
-def hidden_effect(name, joint_names, seed=0, share=0.3):
-    """Return (sensor, values) of an effect at a share of its plausible size, with random signs and spread."""
-    sensor = owner_of(name, joint_names)
-    model = SensorModel(joint_names=joint_names).with_effect(sensor, name)
-    effect = next(e for e in model.effects if (e.sensor, e.name) == (sensor, name))
+def hidden_effect(model, name, seed=0, share=0.3):
+    """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size, with random signs and spread."""
+    sensor = model.catalogue.owner_of(name, model.joint_names)
+    effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
         raise InputError(f"effect '{name}' cannot be simulated by name; simulate with a calibration that contains it", key='calibration')
     rng = np.random.default_rng([seed, 11])
-    values = share * effect.plausible[-1][1] * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
-    if name.endswith('_bandwidth'):
+    values = share * effect.largest * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
+    if effect.nonnegative:
         values = np.abs(values)
-    if effect.components[-1] == 'time_constant' and effect.size > 1:
-        values[-1] = 240.0
+    if effect.time_constant:
+        values[-1] = 0.8 * effect.prior_values()[-1]
     return sensor, values
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from imu_calibration import documents, files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
@@ -89,7 +90,7 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed)
     for name in effects:
-        model, values = _with_effect(model, values, name, *hidden_effect(name, mover.joint_names, seed, size))
+        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
     options = SimulationOptions(imu_rate, joint_rate, noise, temperature_start_c=25.0 if warm else None)
@@ -104,7 +105,7 @@ def _truth(table, calibration, grade, seed):
     """Return (model, values) of the true IMU."""
     names = table.joint_names
     if calibration is None:
-        model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=names)
+        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=names)
         return model, random_values(model, grade, seed)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     if known.model.reference and set(known.model.joint_names) != set(names):
@@ -117,8 +118,6 @@ def _truth(table, calibration, grade, seed):
 def _with_effect(model, values, name, sensor, hidden):
     """Return (model, values) with one more effect, whose values are `hidden`."""
     wider = model.with_effect(sensor, name)
-    extended = wider.start()
-    for effect in model.effects:
-        extended[wider.slices[effect.sensor, effect.name]] = values[model.slices[effect.sensor, effect.name]]
+    extended = wider.start_from(model, values)
     extended[wider.slices[sensor, name]] = hidden
     return replace(wider, point={}), extended

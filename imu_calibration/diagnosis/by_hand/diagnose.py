@@ -8,12 +8,14 @@ from imu_calibration.by_hand.calibrate import ByHandSettings, HandCalibration, s
 from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
 from imu_calibration.diagnosis.by_hand.result import as_solution, rest_of, traces_of
-from imu_calibration.diagnosis.by_hand.rows import BASE, build_rows
+from imu_calibration.diagnosis.by_hand.rows import build_rows
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import candidates_of
 from imu_calibration.diagnosis.separating_motion import motions_of
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import NotObservableError
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
 from imu_calibration.selection.gain import Gain, reduction_interval
@@ -40,7 +42,7 @@ class _Inquiry:
     """Rows of a recording, the evidence on some of its poses, and the search."""
 
     def __init__(self, blocks, space, questions, baseline):
-        smooth = [k for q in questions if q.name.endswith('_thermal_bias') for k in q.parameters]
+        smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
         self.blocks, self.space, self.questions = blocks, space, questions
         self.evidence = HandEvidence(blocks, space, smooth, baseline)
         self.search = Search(self.evidence, baseline, questions)
@@ -66,7 +68,8 @@ class _Inquiry:
         return removed / (removed + rest) if removed > 0 else 0.0
 
 
-def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), tolerances=None, accelerometer=BASE, gyroscope=BASE, progress=None):
+def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), tolerances=None, accelerometer=BASE, gyroscope=BASE, progress=None,
+                     catalogue=CATALOGUE):
     """
     Say what a calibration by hand gets wrong, and why.
 
@@ -87,6 +90,8 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
         The baseline.
     progress : callable, optional
         Called with the share that is done.
+    catalogue : Catalogue
+        The effects that there are.
 
     Returns
     -------
@@ -103,7 +108,8 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
     if len(poses.start) < 9 + SPARE:
         raise NotObservableError(f'a diagnosis by hand needs at least {9 + SPARE} poses held still, so that some can be held out, '
                                  f'{len(poses.start)} were found; hold the IMU still in more attitudes')
-    baseline = solve_by_hand(poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope)
+    baseline = solve_by_hand(poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope,
+                             catalogue=catalogue)
     effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants)
@@ -131,7 +137,7 @@ def _held(hand):
 
 
 def _why_not(effect, poses, turns):
-    if effect.name.endswith('_saturation'):
+    if effect.role is Role.LIMIT:
         return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
@@ -139,7 +145,7 @@ def _why_not(effect, poses, turns):
         return 'no temperature was recorded', 'record imu/temperature'
     if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
         return f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only', 'record while the sensor warms up by at least some kelvins'
-    moving = effect.sensor == 'gyroscope' and any('rate_' in group for group in effect.groups)
+    moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
     if moving and len([t for t in turns if t.rotation is None]) < 6:
         return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
     return None
@@ -217,7 +223,7 @@ def _extended(baseline, data, named, gravity_sd, settings, tolerances, constants
             amplitude = [values[used.index(k)] for k in question.parameters]
             point[question.name] = np.array([*amplitude, constants[int(question.label.split('@')[1])]])
     return solve_by_hand(baseline.poses, data.turns, baseline.gravity, gravity_sd, settings, data.statistics, tolerances, names['accelerometer'],
-                         names['gyroscope'], point)
+                         names['gyroscope'], point, baseline.model.model.catalogue)
 
 
 def _assembled(baseline, hand, inquiry, named, held_out, not_testable):

@@ -8,11 +8,9 @@ from imu_calibration.by_hand.equations import tangent
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import SensorModel, prior_sds
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.reference.reference_motion import skew
 from imu_calibration.selection.bias_process_search import NATURAL
-
-BASE = ('bias', 'matrix')
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +67,13 @@ def build_rows(hand, turns, effects, constants):
         Time constants at which warm-ups are asked about, s.
 
     """
-    sets = [(effect, effect.name, None) for effect in effects if not effect.name.endswith('_bias_drift')]
-    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.name.endswith('_bias_drift') for k, tau in enumerate(constants)]
+    sets = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
+    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
     base = hand.model.size
-    sizes = [3 if tau is not None else effect.size for effect, _, tau in sets]
+    sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
     ends = np.cumsum([base] + sizes)
     space = HandSpace(tuple(label for _, label, _ in sets), {s[1]: slice(a, b) for s, a, b in zip(sets, ends, ends[1:])},
-                      np.concatenate([1e3 * hand.model.priors, *(prior_sds(s[0])[:n] for s, n in zip(sets, sizes))]), int(ends[-1]))
+                      np.concatenate([1e3 * hand.model.priors, *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))]), int(ends[-1]))
     at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
                                hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label, tau in sets}
     sensor_of = {label: effect.sensor for effect, label, _ in sets}
@@ -89,10 +87,9 @@ def build_rows(hand, turns, effects, constants):
 
 def _columns(hand, effect, tau, force, rate, time, temperature_c):
     """Return what the effect's parameters add to its sensor's output, shape (m, 3, p), at the baseline's solution."""
-    point = {} if tau is None else {effect.name: np.array([0.0, 0.0, 0.0, tau])}
+    point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
-    reference = hand.model.model.temperature_ref_c
-    model = HandModel(SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=reference, point=point), hand.gravity)
+    model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
     known = dict(zip(hand.model.param_names, hand.state.values))
     values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
     return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]

@@ -1,0 +1,86 @@
+"""A column group: functions of the true motion that effects multiply with their coefficients, declared as text."""
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, array_function, names_in, products, read
+
+STEP = 1e-30
+"""Complex step of the derivative by a time constant."""
+
+
+@dataclass(frozen=True)
+class ColumnGroup:
+    """
+    Columns that belong together, by one text for each.
+
+    The texts (`effects.expressions`) are all that anybody knows of them: arrays of columns, the compensation of a single sample and what
+    data the columns need follow from them. A group with a time constant `tau` has each column twice: itself, and its derivative by `tau`.
+    """
+
+    name: str
+    """Effects of one sensor that name the same group share its columns."""
+    text: tuple
+    """One expression for each column."""
+    owner: str = ''
+    """The effect whose last value is `tau`, where the text holds it."""
+
+    def __reduce__(self):
+        """Travel without what was worked out: code cannot be sent."""
+        return ColumnGroup, tuple(getattr(self, f.name) for f in fields(self))
+
+    @cached_property
+    def _trees(self):
+        return [read(text) for text in self.text]
+
+    @cached_property
+    def names(self):
+        """Names of `expressions.PLACES` in the texts."""
+        return frozenset().union(*map(names_in, self._trees))
+
+    @cached_property
+    def uses(self):
+        """Quantities of `expressions.QUANTITIES` that the columns are made of."""
+        return frozenset(QUANTITY_OF[name] for name in self.names)
+
+    @cached_property
+    def width(self):
+        """Number of columns."""
+        return len(self.text) * (2 if 'tau' in self.names else 1)
+
+    @cached_property
+    def _function(self):
+        return array_function(self._trees)
+
+    @cached_property
+    def _places(self):
+        return [(name, field, (slice(None), *index)) for name in sorted(self.names) for field, *index in [PLACES[name]] if field]
+
+    def columns(self, ref, point):
+        """
+        Return the columns, shape (n, width).
+
+        Parameters
+        ----------
+        ref : Reference
+            The true motion.
+        point : dict
+            'temperature_ref_c', and effect name -> values where columns depend on them (``SensorModel.full_point``).
+
+        """
+        values = {name: getattr(ref, field)[index] for name, field, index in self._places}
+        values['temperature_ref_c'] = point.get('temperature_ref_c', 25.0)
+        result, count = np.empty((len(ref), self.width)), len(self.text)
+        if 'tau' in self.names:
+            values['tau'] = point[self.owner][-1] + 1j * STEP
+        for k, column in enumerate(self._function(values)):
+            result[:, k] = column.real if self.width > count else column
+            if self.width > count:
+                result[:, count + k] = column.imag / STEP
+        return result
+
+    def products(self, known):
+        """Return each column as a sum of products (`expressions.products`)."""
+        return [products(tree, known) for tree in self._trees]

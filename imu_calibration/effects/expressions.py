@@ -1,0 +1,169 @@
+"""
+Columns as text: plain arithmetic in the true motion, read by this module alone.
+
+One text serves two purposes: it is worked out on arrays, as columns of a least-squares system, and taken apart into sums of products,
+from which the compensation of one sample is written. Text may come from a document, so that nothing but arithmetic passes.
+"""
+
+import ast
+import math
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+
+QUANTITIES = {
+    'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
+    'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
+    'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
+    'attitude': {f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')},
+    'time': {'time': ('time',)},
+    'temperature': {'temperature_c': ('temperature_c',)},
+    'reference temperature': {'temperature_ref_c': (None,)},
+    'time constant': {'tau': (None,)},
+}
+"""Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s."""
+PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
+QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
+FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
+LONGEST, HIGHEST_POWER, MOST_PRODUCTS = 400, 9, 200
+"""Characters, exponents and products at most, so that no document costs more than arithmetic should."""
+OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
+SIGNS = (ast.UAdd, ast.USub)
+
+
+def read(text):
+    """
+    Return the syntax tree of a column.
+
+    Raises
+    ------
+    InputError
+        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument.
+
+    """
+    try:
+        if len(text) > LONGEST:
+            raise ValueError
+        tree = ast.parse(text.strip(), mode='eval').body
+        _check(tree)
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
+        raise InputError(f'a column must be arithmetic of at most {LONGEST} characters in {", ".join(PLACES)} with {", ".join(FUNCTIONS)} and powers up to '
+                         f'{HIGHEST_POWER}, got {str(text)[:60]!r}; correct it') from error
+    return tree
+
+
+def _check(node):
+    match node:
+        case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
+            if isinstance(op, ast.Pow) and not (isinstance(right, ast.Constant) and right.value in range(HIGHEST_POWER + 1)):
+                raise ValueError
+            _check(left)
+            _check(right)
+        case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
+            _check(operand)
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
+            _check(argument)
+        case ast.Name(id=name) if name in PLACES:
+            pass
+        case ast.Constant(value=value) if type(value) in (int, float) and math.isfinite(value):
+            pass
+        case _:
+            raise ValueError
+
+
+def names_in(tree):
+    """Return the names of quantities in a tree."""
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in PLACES}
+
+
+def array_function(trees):
+    """Return ``function({name: array or number}) -> tuple of arrays``, one for each tree."""
+    source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
+    code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
+    known = {'__builtins__': {}, **{name: getattr(np, name) for name in FUNCTIONS}}
+    return lambda values: eval(code, known, values)   # the trees hold arithmetic alone: see `read`
+
+
+def products(tree, known):
+    """
+    Return a column as a sum of products, {factors: coefficient}, factors a sorted tuple of Python expressions in plain floats.
+
+    Parameters
+    ----------
+    known : dict
+        Name -> the sum of products that stands for it.
+
+    Raises
+    ------
+    InputError
+        When it holds a name that is not known, or far too many products.
+
+    """
+    match node := tree:
+        case ast.Constant():
+            return {(): float(node.value)}
+        case ast.Name():
+            if node.id not in known:
+                raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), which is not known there; "
+                                 "declare the effect with compensation 'none'")
+            return known[node.id]
+        case ast.UnaryOp():
+            return scaled(products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0)
+        case ast.Call():
+            argument = as_text(products(node.args[0], known))
+            inline = node.func.id == 'sign' and argument.isidentifier()   # a call costs more than all the arithmetic
+            return {(f'(({argument} > 0) - ({argument} < 0))' if inline else f'{node.func.id}({argument})',): 1.0}
+    left = products(node.left, known)
+    if isinstance(node.op, ast.Pow):
+        result = {(): 1.0}
+        for _ in range(node.right.value):
+            result = _multiplied(result, left)
+        return result
+    right = products(node.right, known)
+    if isinstance(node.op, ast.Mult):
+        return _multiplied(left, right)
+    if isinstance(node.op, ast.Div):
+        divisor = right[()] if right.keys() == {()} else 0.0
+        return scaled(left, 1.0 / divisor) if divisor else {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
+    return added(left, right if isinstance(node.op, ast.Add) else scaled(right, -1.0))
+
+
+def added(*sums):
+    """Return the sum of sums of products; what cancels is left out."""
+    total = {}
+    for terms in sums:
+        for factors, coefficient in terms.items():
+            total[factors] = total.get(factors, 0.0) + coefficient
+    return {factors: coefficient for factors, coefficient in total.items() if coefficient != 0.0}
+
+
+def scaled(terms, factor):
+    """Return a multiple of a sum of products."""
+    return {factors: factor * coefficient for factors, coefficient in terms.items() if factor * coefficient != 0.0}
+
+
+def _multiplied(left, right):
+    if len(left) * len(right) > MOST_PRODUCTS:
+        raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; write it shorter')
+    return added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
+
+
+def as_text(terms):
+    """Return a sum of products as a Python expression, coefficients of one left out."""
+    texts = [' * '.join([*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]) for factors, coefficient in terms.items()]
+    return ' + '.join(texts) or '0.0'
+
+
+def _or_nan(function):
+    def careful(*arguments):
+        try:
+            return function(*arguments)
+        except (ValueError, OverflowError, ZeroDivisionError):
+            return math.nan
+    return careful
+
+
+SCALAR_FUNCTIONS = {'abs': abs, 'sign': lambda x: (x > 0) - (x < 0), 'divided': _or_nan(lambda a, b: a / b),
+                    **{name: _or_nan(getattr(math, name)) for name in FUNCTIONS if hasattr(math, name)}}
+"""What the expressions of `products` call: of plain floats, NaN where there is no value."""

@@ -1,0 +1,54 @@
+"""Models with a name, the models that are taken when nobody asks, and models as users write them."""
+
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.catalogue import CATALOGUE, JOINTS
+from imu_calibration.errors import InputError
+
+BASE = ('bias', 'matrix')
+"""Effects that every sensor has."""
+NAMED_MODELS = {
+    'axial': BASE,
+    'pendulous': (*BASE, 'accel_cross_product'),
+    'size_effect': (*BASE, 'accel_size_effect'),
+    'rate': BASE,
+    'extended_rate': (*BASE, 'gyro_rate_product'),
+}
+"""Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10."""
+G_SENSITIVE = (*BASE, 'gyro_g_sensitivity')
+"""What is asked of the gyroscope by hand when the poses demand it."""
+BARE = 'axial'
+"""Name of the model from which a diagnosis starts: what was not asked for has to prove itself."""
+DEFAULT = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
+"""What is asked of a recording on a table when nobody says more."""
+
+
+def parse_effects(sensor, text, joint_names=JOINTS, catalogue=CATALOGUE):
+    """
+    Return effect names from a named model or names joined by '+'.
+
+    Raises
+    ------
+    InputError
+        When a name is unknown or the model lacks bias or matrix.
+
+    """
+    names = NAMED_MODELS.get(text) or tuple(part.strip() for part in text.split('+'))
+    for name in names:
+        catalogue.find(sensor, name, joint_names)
+    if not set(BASE) <= set(names):
+        raise InputError(f"the {sensor} model must contain bias and matrix, got '{text}'; write bias+matrix+...")
+    return names
+
+
+def parse_reference(text, table):
+    """Return effect names of table and clock from names joined by '+' or 'none'; None: the tilt, and the Earth's rate where the table does not tell it."""
+    if text is not None:
+        return tuple(name for name in text.split('+') if name not in ('', 'none'))
+    return tuple(name for name in ('table_tilt', 'earth_rate') if CATALOGUE.find('reference', name).moot is None
+                 or CATALOGUE.find('reference', name).moot(table) is None)
+
+
+def with_common_arm(model):
+    """Return the model with a common lever arm beside the arms of the size effect; without a size effect as it is."""
+    lacks = model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM)
+    return model.with_effect('accelerometer', 'lever_arm') if lacks else model

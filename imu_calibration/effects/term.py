@@ -1,0 +1,88 @@
+"""Effects made of plain data: a column as text, and what a person has to say of it. They travel in documents and to other processes."""
+
+from imu_calibration.effects.base import AXES, SENSORS, VECTOR, Effect
+from imu_calibration.effects.coefficients import Amplitudes
+from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.errors import InputError
+
+MOTIONS = (('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
+           ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
+"""Standard motions that show a quantity; the first that a column uses is taken."""
+DRAWN_AGAINST = ('temperature', 'time', 'force', 'rate')
+MANY = 100.0
+"""Tolerances in the prior's standard deviation, where nobody says more."""
+
+
+def term(name, *, sensor, column, unit, tolerance, text, tolerance_reason='', prior_sd=None, largest=None, time_constant=300.0):
+    """
+    Return an effect ``output_i += value_i column``, with one value for each axis.
+
+    It is defined by this plain data alone, which `from_definition` reads again.
+
+    Parameters
+    ----------
+    name : str
+        Published name.
+    sensor : str
+        'accelerometer' or 'gyroscope'.
+    column : str or sequence of three str
+        Arithmetic of the true motion (`effects.expressions`): one column for all axes, or one for each. With `tau` in it the effect has a
+        time constant as its last value.
+    unit : str
+        SI unit of the values.
+    tolerance : float
+        Standard deviation up to which a value counts as determined.
+    text : str
+        One sentence that explains it.
+    tolerance_reason : str
+        Where the tolerance comes from.
+    prior_sd : float, optional
+        Standard deviation of the prior about zero; a hundred tolerances.
+    largest : float, optional
+        Largest plausible size.
+    time_constant : float
+        Where the time constant starts, s.
+
+    Raises
+    ------
+    InputError
+        When a column is no arithmetic, or the sensor is unknown.
+
+    """
+    given = {key: value for key, value in locals().items() if key != 'name' and value is not None}
+    if sensor not in SENSORS:
+        raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it")
+    columns = (column,) if isinstance(column, str) else tuple(column)
+    if len(columns) not in (1, 3):
+        raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it")
+    group = ColumnGroup(name, columns, name)
+    settles, thermal = 'time constant' in group.uses, 'temperature' in group.uses
+    spread = MANY * tolerance if prior_sd is None else prior_sd
+    needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration'})
+    shape = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
+    if settles:
+        shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
+                 'prior': (0.0, 0.0, 0.0, time_constant), 'prior_sd': (spread, spread, spread, 10 * time_constant / 3)}
+    return Effect(
+        name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason, explanation=text, needs=needs,
+        motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
+        compensation='none' if group.uses & {'time', 'attitude'} else 'exact', groups=(group,),
+        coefficients=Amplitudes(name, name, len(columns) == 3, settles), smooth=not group.uses & {'force', 'rate', 'angular acceleration'},
+        plausible=(('such', largest, 'its definition'),) if largest else (), definition=given,
+        against=tuple(quantity for quantity in DRAWN_AGAINST if quantity in group.uses)[:1])
+
+
+def from_definition(name, definition):
+    """
+    Return the effect that plain data define.
+
+    Raises
+    ------
+    InputError
+        When something is missing, or there is something that does not belong there.
+
+    """
+    try:
+        return term(name, **definition)
+    except TypeError as error:
+        raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); correct it") from error

@@ -1,0 +1,59 @@
+"""Effects with a time constant are asked about at each of a bank of time constants: there their columns are linear in the amplitudes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import effect_slopes
+
+
+@dataclass(frozen=True, eq=False)
+class BankEntry:
+    """One effect at one time constant."""
+
+    effect: object
+    """The Effect."""
+    number: int
+    """Number of the time constant."""
+    point: dict
+    """Where its columns are taken."""
+    used: tuple
+    """(ColumnGroup, columns that the amplitudes multiply), ..."""
+    slopes: np.ndarray
+    """d(coefficients) / d(amplitudes), shape (n_columns, 3, n_amplitudes)."""
+    label: str
+    """Effect name and number of the time constant."""
+
+    @property
+    def param_names(self):
+        """Names of the amplitudes."""
+        return [f'{self.label}.{component}' for component in self.effect.amplitudes(self.effect.components)]
+
+    @property
+    def prior_sd(self):
+        """Standard deviations of the amplitudes before any data."""
+        return self.effect.amplitudes(self.effect.prior_sds())
+
+    def columns(self, ref):
+        """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
+        return np.concatenate([group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1)
+
+
+def make_bank(effects, constants, model, values):
+    """Return sensor -> list of BankEntry for those of `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
+    bank = {sensor: [] for sensor in SENSORS}
+    for effect in effects:
+        if effect.time_constant:
+            bank[effect.sensor] += [_entry(effect, number, constant, model, values) for number, constant in enumerate(constants)]
+    return bank
+
+
+def _entry(effect, number, constant, model, values):
+    own = effect.at_time_constant(constant)
+    point = {**model.full_point(), effect.name: own}
+    slopes = effect_slopes(effect, {**model.values_of(effect.sensor, values), effect.name: own}, point)[1]
+    amplitudes = {name: effect.amplitudes(np.moveaxis(block, -1, 0)) for name, block in slopes.items()}
+    used = [(group, np.flatnonzero(np.any(amplitudes[group.name] != 0, axis=(0, 2)))) for group in effect.groups]
+    joined = np.concatenate([amplitudes[group.name][:, rows] for group, rows in used], axis=1)
+    return BankEntry(effect, number, point, tuple(used), np.moveaxis(joined, 0, -1), f'{effect.name}@{number}')
