@@ -63,8 +63,8 @@ def integrate_turn(time, rate_measured, bias, matrix, further=None):
     slope = slopes[1][:, None] * rate
     slope[1:] += slopes[0][1:, None] * rate[:-1]
     slope[:-1] += slopes[2][:-1, None] * rate[1:]
-    bend = np.cross(first, second) - np.diff(slope, axis=0)
-    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * bend
+    commutator = np.cross(first, second) - np.diff(slope, axis=0)
+    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * commutator
     forward = _prefix_product(_quaternion(vectors))
     mat_ki = _matrix_to_sensor(forward)
     to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)

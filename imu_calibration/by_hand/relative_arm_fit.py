@@ -57,7 +57,7 @@ class Fit:
     """Left-hand side minus prediction, m/s^2, shape (n, 3)."""
     weights: np.ndarray
     """Weight of each window, shape (n,)."""
-    bend: np.ndarray
+    weight_fall: np.ndarray
     """How fast each weight falls with the square of its residual, shape (n,)."""
     hessian: np.ndarray
     """Derivative of the estimating equations by the values, shape (8, 8)."""
@@ -67,7 +67,7 @@ class Fit:
     def weighted(self, index):
         """Return design' times the derivative of the weighted residual by the residual, for some windows, shape (n, p, 3)."""
         turned, residual = np.swapaxes(self.design[index], 1, 2), self.residual[index]
-        along = np.einsum('npi,ni->np', turned, residual) * self.bend[index, None]
+        along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
 
     def curvature(self, index):
@@ -100,7 +100,7 @@ def fit_arm(rows):
         clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
         design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), *clocks], axis=2)
         used = design if number else design[:, :, :-1]
-        values, weights, bend, excess = _robust_fit(used, rows.difference, rows.alpha_noise)
+        values, weights, weight_fall, excess = _robust_fit(used, rows.difference, rows.alpha_noise)
         arm = values[:3]
     normal, raw = _normal(design, weights, excess), _normal(design, weights, 0.0)
     try:
@@ -108,7 +108,7 @@ def fit_arm(rows):
     except np.linalg.LinAlgError as error:
         raise NotObservableError('the motion must show the whole arm, it leaves a direction without any sign; '
                                  'twist fast about all axes') from error
-    partial = Fit(values, design, rows.difference - design @ values, weights, bend, normal, seen)
+    partial = Fit(values, design, rows.difference - design @ values, weights, weight_fall, normal, seen)
     hessian = partial.curvature(slice(None)) + (normal - raw)
     return replace(partial, hessian=hessian)
 
@@ -129,24 +129,24 @@ def _normal(design, weights, excess):
 
 def _robust_fit(design, target, alpha_noise):
     """
-    Student-t regression by reweighting; returns (values, weights, how the weights bend, excess of the normal matrix).
+    Student-t regression by reweighting; returns (values, weights, how the weights fall, excess of the normal matrix).
 
     The weight falls as the residual grows, so that a weighted residual answers to a change by less than its weight:
-    by ``weight - bend residual^2``. This much of the noise in the columns biases the values.
+    by ``weight - weight_fall residual^2``. This much of the noise in the columns biases the values.
     """
-    weights, bend, size = np.ones(len(design)), np.zeros(len(design)), np.zeros(len(design))
+    weights, weight_fall, size = np.ones(len(design)), np.zeros(len(design)), np.zeros(len(design))
     flat, values = design.reshape(-1, design.shape[2]), np.full(design.shape[2], np.inf)
     for _ in range(30):
-        excess = 2 * alpha_noise * np.sum(weights - bend * size / 3)
+        excess = 2 * alpha_noise * np.sum(weights - weight_fall * size / 3)
         right = flat.T @ (target * weights[:, None]).ravel()
         before, values = values, np.linalg.solve(_normal(design, weights, excess), right)
         size = np.sum((target.ravel() - flat @ values).reshape(-1, 3)**2, axis=1)
         scale = np.median(size) / 2.366 + 1e-300  # the median of chi-square with three degrees of freedom
         weights = (TAIL_DOF + 3) / (TAIL_DOF + size / scale)
-        bend = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
+        weight_fall = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
         if np.all(np.abs(values - before) <= 1e-9 * np.abs(values)):
             break
-    return values, weights, bend, excess
+    return values, weights, weight_fall, excess
 
 
 def jackknife_covariance(fit, centres, cluster):

@@ -127,21 +127,21 @@ def fit_triad(runs, readings):
 def _reduce(runs, readings):
     """Return Q, R and Q'y of the system with columns 1, f_j and W_jk; products m_j r_k are its last nine unknowns."""
     force, arm_matrix, noise = stack_runs(runs)
-    lifted = np.column_stack([np.ones(len(force)), force, arm_matrix.reshape(len(force), 9)]) / noise[:, None]
-    orthogonal, factor = np.linalg.qr(lifted)
+    design = np.column_stack([np.ones(len(force)), force, arm_matrix.reshape(len(force), 9)]) / noise[:, None]
+    orthogonal, factor = np.linalg.qr(design)
     return orthogonal, factor, orthogonal.T @ (readings / noise[:, None])
 
 
 def _linearise(factor, target, values):
     n_draws, matrix, arm = len(values), values[:, 1:4], values[:, 4:]
-    lifted = np.concatenate([values[:, :4], np.einsum('nj,nk->njk', matrix, arm).reshape(n_draws, 9)], axis=1)
+    linear = np.concatenate([values[:, :4], np.einsum('nj,nk->njk', matrix, arm).reshape(n_draws, 9)], axis=1)
     slope = np.zeros((n_draws, 13, 7))
     slope[:, :4, :4] = np.eye(4)
     for j in range(3):
         rows = slice(4 + 3 * j, 7 + 3 * j)
         slope[:, rows, 1 + j] = arm
         slope[:, rows, 4:] = matrix[:, j, None, None] * np.eye(3)
-    return factor @ slope, target.T - lifted @ factor.T
+    return factor @ slope, target.T - linear @ factor.T
 
 
 def _solve_stack(slope, rest):

@@ -95,7 +95,7 @@ class JointSettings:
     robustness: float = setting(0.7, '1', 'guard against rough fits when the smoothing is chosen; 1 is plain cross-validation', (0.05, 1.0),
                                 'too large: rough accelerations now and then; too small: sharp ramps are rounded')
     velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
-                                    'too large: filtered velocities bend the reference')
+                                    'too large: filtered velocities distort the reference')
     velocity_lag: float = setting(2e-4, 's', 'joint velocities are used when their lag behind the positions stays below this', (0.0, 0.1),
                                   'too large: late velocities look like a time offset of the IMU')
 

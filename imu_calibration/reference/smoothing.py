@@ -52,7 +52,7 @@ class PenalisedSpline:
     def __init__(self, design, bands, n_kinds=1):
         self.design, self.bands, self.penalty = design, bands, penalty_bands(np.ones(design.shape[1] - 3))
         self.n_rows, self.n_coefficients = design.shape
-        # Splines are worst at the ends, which callers keep out: the ends have no say in the noise or the penalty.
+        # Splines are worst at the ends, which callers keep out: the ends have weight zero in the noise and the penalty.
         interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
