@@ -180,7 +180,7 @@ def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
     Return the mean lever arm of the accelerometers for each of them, zero where a model has none, shape (3, 3).
 
-    Their differences change the derivative of a delay little where they are millimetres, and bend it where a recording does not show them
+    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not show them
     and they come out as centimetres.
     """
     return np.tile(all_arms(model, values).mean(axis=0), (3, 1))
