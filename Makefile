@@ -90,9 +90,10 @@ $(STAMP)-validate: $(STAMP) constraints/validate.txt
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/validate.txt
 	@touch $@
 
-# The parameter files of the nodes from what the nodes declare.
+# The parameter files of the nodes from what the nodes declare, the tolerances from the catalogue of effects.
 config: $(STAMP)
 	@$(PY) -m imu_calibration.nodes.parameter_files
+	@$(PY) -m imu_calibration.effects.tolerance_file
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

@@ -10,6 +10,7 @@ from stat import S_ISDIR
 
 from imu_calibration import documents
 from imu_calibration.calibration.document import calibration_from_text, checked_tolerances
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 
@@ -57,9 +58,9 @@ def read_table(path):
     return Table.from_mapping(read_mapping(path, 'table description'))
 
 
-def read_tolerances(path):
+def read_tolerances(path, catalogue=CATALOGUE):
     """Return the tolerances in a YAML file: {section: {effect: tolerance}}."""
-    return read_mapping(path, 'tolerance file', checked_tolerances)
+    return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
 
 
 def read_calibration(path):

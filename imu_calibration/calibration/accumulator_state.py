@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 
 from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError
 from imu_calibration.estimation.accumulator import Accumulator
@@ -32,6 +33,7 @@ def to_bytes(gathered, model):
     """
     rows, accumulator = gathered.accumulator.rows, gathered.accumulator
     header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')} | {'joint_errors': model.joint_names.errors},
+              'effects': model.definitions,
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
@@ -81,7 +83,8 @@ def saved_model(data):
 def _model(header):
     point = {name: np.array(value, float) for name, value in header['point'].items()}
     effects, names = (tuple(header['model'][name]) for name in _MODEL), header['model']['joint_names']
-    return SensorModel(*effects, JointNames.of(names, header['model'].get('joint_errors')), header['temperature_ref_c'], point)
+    return SensorModel(*effects, JointNames.of(names, header['model'].get('joint_errors')), header['temperature_ref_c'], point,
+                       catalogue=Catalogue.from_definitions(header.get('effects', {})))
 
 
 def _check(header, model):
@@ -89,7 +92,7 @@ def _check(header, model):
         raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {header.get('format')!r}; remove it, or start without resume")
     known = _model(header)
     same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL)
-    same = same and known.joint_names == model.joint_names and known.temperature_ref_c == model.temperature_ref_c
+    same = same and known.joint_names == model.joint_names and known.definitions == model.definitions and known.temperature_ref_c == model.temperature_ref_c
     if not same or known.point.keys() != model.point.keys() or any(np.any(known.point[n] != model.point[n]) for n in known.point):
         raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
                             f'asked for is {_text(model)}; start without resume, or with the old model')

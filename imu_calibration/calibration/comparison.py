@@ -86,7 +86,7 @@ def _notes(first, second):
         notes.append(f"note: the frames differ: '{first.frame_id}' and '{second.frame_id}'")
     if first.gauge != second.gauge:
         notes.append(f'note: the conventions of origin or axes differ: {first.gauge} and {second.gauge}')
-    if first.model.temperature_ref_c != second.model.temperature_ref_c and any('thermal' in n for n in first.param_names):
+    if first.model.temperature_ref_c != second.model.temperature_ref_c and first.model.needs_temperature:
         notes.append('note: the reference temperatures differ, so the biases need not agree')
     return notes
 

@@ -148,9 +148,8 @@ def checked_tolerances(mapping, catalogue=CATALOGUE):
 def to_mapping(calibration):
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
-    definitions = calibration.model.catalogue.definitions({effect.name for effect in calibration.model.effects})
-    if definitions:
-        document['effects'] = _plain(definitions)
+    if calibration.model.definitions:
+        document['effects'] = _plain(calibration.model.definitions)
     for section in SECTIONS:
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)

@@ -78,7 +78,7 @@ KNOWN = {
     **{section: _SECTION for section in SECTIONS}, 'covariance': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
-    'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
+    'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
     'verdict': lambda value: value in ('good', 'weak', 'bad'), 'verdict_reasons': _is_list_of(_is_text),

@@ -98,6 +98,11 @@ class SensorModel:
         return None if effect is None else values[self.slices[effect.key]].reshape(effect.shape)
 
     @property
+    def definitions(self):
+        """Plain data of those effects that somebody added to the catalogue, by name: what a document needs beside the names."""
+        return self.catalogue.definitions({effect.name for effect in self.effects})
+
+    @property
     def further(self):
         """Effects that are neither offset nor linear response."""
         return [e for e in self.effects if e.role not in (Role.OFFSET, Role.LINEAR)]

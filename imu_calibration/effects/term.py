@@ -1,5 +1,7 @@
 """Effects made of plain data: a column as text, and what a person has to say of it. They travel in documents and to other processes."""
 
+import math
+
 from imu_calibration.effects.base import AXES, SENSORS, VECTOR, Effect
 from imu_calibration.effects.coefficients import Amplitudes
 from imu_calibration.effects.column_group import ColumnGroup
@@ -49,14 +51,24 @@ def term(name, *, sensor, column, unit, tolerance, text, tolerance_reason='', pr
         When a column is no arithmetic, or the sensor is unknown.
 
     """
-    given = {key: value for key, value in locals().items() if key != 'name' and value is not None}
     if sensor not in SENSORS:
         raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it")
+    numbers = {'tolerance': tolerance, 'prior_sd': prior_sd, 'largest': largest, 'time_constant': time_constant}
+    for key, value in numbers.items():
+        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf):
+            raise InputError(f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it")
+    for key, value in {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}.items():
+        if not isinstance(value, str):
+            raise InputError(f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it")
     columns = (column,) if isinstance(column, str) else tuple(column)
     if len(columns) not in (1, 3):
         raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it")
     group = ColumnGroup(name, columns, name)
     settles, thermal = 'time constant' in group.uses, 'temperature' in group.uses
+    definition = {'sensor': sensor, 'column': column if isinstance(column, str) else list(columns), 'unit': unit, 'text': text,
+                  'tolerance_reason': tolerance_reason or None, **numbers}
+    if not settles:
+        del definition['time_constant']
     spread = MANY * tolerance if prior_sd is None else prior_sd
     needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration'})
     shape = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
@@ -68,7 +80,8 @@ def term(name, *, sensor, column, unit, tolerance, text, tolerance_reason='', pr
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude'} else 'exact', groups=(group,),
         coefficients=Amplitudes(name, name, len(columns) == 3, settles), smooth=not group.uses & {'force', 'rate', 'angular acceleration'},
-        plausible=(('such', largest, 'its definition'),) if largest else (), definition=given,
+        plausible=(('such', largest, 'its definition'),) if largest else (),
+        definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(quantity for quantity in DRAWN_AGAINST if quantity in group.uses)[:1])
 
 

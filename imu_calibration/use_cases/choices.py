@@ -7,6 +7,7 @@ from typing import Any, TypedDict
 from imu_calibration import files
 from imu_calibration.calibration.document import checked_tolerances
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError
 from imu_calibration.resources import config_file
 from imu_calibration.samples import NominalScaling
@@ -36,6 +37,8 @@ class Choices(TypedDict, total=False):
     """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
     nominal: str | PathLike | NominalScaling | None
     """File or scaling of recordings in volts or counts."""
+    catalogue: Catalogue
+    """The effects that there are; default the package's own."""
     setting: Sequence[str] | Mapping[str, float]
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
 
@@ -58,10 +61,12 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
 
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     """Return what to estimate and how to judge it."""
+    catalogue = choices.get('catalogue', CATALOGUE)
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
-    tolerances = checked_tolerances(tolerances) if isinstance(tolerances, Mapping) else files.read_tolerances(tolerances)
-    return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
-                              tolerances, window_settings(choices.get('setting') or ()), nominal_of(choices.get('nominal')))
+    read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
+    models = (choices.get(name) for name in ('accelerometer_model', 'gyroscope_model', 'reference_model'))
+    return CalibrationOptions(*models, read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
+                              nominal_of(choices.get('nominal')), catalogue)
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from imu_calibration import documents, files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
@@ -52,7 +53,7 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
              calibration: str | PathLike | Calibration | None = None, effects: Sequence[str] = (), size: float = 0.3,
              grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None, duration: float | None = None, imu_rate: float = 100.0,
              joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0, stamp_jitter_us: float = 0.0,
-             temperature: bool = False) -> Simulated:
+             temperature: bool = False, catalogue: Catalogue = CATALOGUE) -> Simulated:
     """
     Simulate a session on a turntable.
 
@@ -78,6 +79,8 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
         Step of the joint positions, deg; standard deviation of the IMU stamps, microseconds.
     temperature : bool
         Whether there is a temperature, which warms up from 25 C; thermal effects bring it too.
+    catalogue : Catalogue
+        The effects that a random IMU may have.
 
     Raises
     ------
@@ -88,7 +91,7 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
     given = table if isinstance(table, Table) else files.read_table(table or config_file('table_three_axis.yaml'))
     motion = make_profile(profile, seed, given, duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
-    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed)
+    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue)
     for name in effects:
         model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
@@ -101,11 +104,11 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
     return Simulated(samples, mover, truth, motion.duration)
 
 
-def _truth(table, calibration, grade, seed):
+def _truth(table, calibration, grade, seed, catalogue):
     """Return (model, values) of the true IMU."""
     names = table.joint_names
     if calibration is None:
-        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=names)
+        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=names, catalogue=catalogue)
         return model, random_values(model, grade, seed)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     if known.model.reference and set(known.model.joint_names) != set(names):

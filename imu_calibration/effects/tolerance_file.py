@@ -1,0 +1,42 @@
+"""The file of tolerances that users copy and change, written from the catalogue: ``make config``."""
+
+from pathlib import Path
+
+from imu_calibration.effects.base import SECTIONS
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+
+HEAD = """\
+# Standard deviation up to which a parameter counts as determined; above it the parameter is called weak.
+# One number per effect, SI, for each of its components. Copy this file, change what your use needs, and pass it with --tolerances.
+# The reasons speak of a navigation-grade use of a MEMS or tactical IMU on a robot.
+"""
+COMMENT_AT = 35
+"""Column at which the reasons begin."""
+
+
+def rendered(catalogue: Catalogue = CATALOGUE) -> str:
+    """Return the text of the file: every effect's tolerance as it is declared, with its unit and reason."""
+    lines = [HEAD]
+    for section in SECTIONS:
+        effects = [effect for effect in catalogue.effects().values() if effect.sensor == section]
+        lines += [f'{section}:', *(f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT}}# {e.unit_of(0)}: {e.tolerance_reason}' for e in effects), '']
+    return '\n'.join(lines[:-1]) + '\n'
+
+
+def _number(value):
+    """Return a number so that YAML reads a number."""
+    mantissa, exponent = f'{value:.5e}'.split('e')
+    mantissa = mantissa.rstrip('0')
+    return f'{mantissa}0e{int(exponent)}' if mantissa.endswith('.') else f'{mantissa}e{int(exponent)}'
+
+
+def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
+    """Write the file, and say whether it has changed."""
+    path = folder / 'tolerances.yaml'
+    if not path.exists() or path.read_text() != rendered():
+        path.write_text(rendered())
+        print(f'written: {path}')
+
+
+if __name__ == '__main__':
+    main()
