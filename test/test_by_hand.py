@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.calibrate import ByHandSettings, KnownTurn, calibrate_by_hand
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.by_hand.model import unpack
+from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
 from imu_calibration.by_hand.poses import g_sensitivity_evidence
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.errors import InputError, NotObservableError
@@ -122,7 +123,7 @@ def test_scatter_is_found_beside_the_noise():
 
 def test_noise_free_recording_gives_the_truth():
     imu, ranges, truth = simulate(5, force_sd=1e-9, rate_sd=1e-9, still=0.5, period=0.005, duration=1.0)
-    error, _ = differences(calibrate_by_hand(imu, GRAVITY, ranges), truth)
+    error, _ = differences(calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), truth)
     assert np.max(np.abs(error[:9])) < 1e-7  # poses alone: only the 1e-9 noise
     assert np.max(np.abs(error[9:])) < 1e-6  # the integration's error at 5 ms
 
@@ -139,7 +140,7 @@ def test_reported_sd_are_honest(seeds, sensitivity):
     normalised, inside = [], []
     for seed in range(seeds):
         imu, ranges, truth = simulate(seed, n_poses=14, pose_sd=0.003, drift_sd=3e-4, sensitivity=sensitivity)
-        error, covariance = differences(calibrate_by_hand(imu, GRAVITY, ranges), truth)
+        error, covariance = differences(calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), truth)
         normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
         inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
     print(f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %')
@@ -151,16 +152,16 @@ def test_counts_give_the_same_as_si():
     imu, ranges, _ = simulate(6)
     nominal = NominalScaling(32768, 415, (32768, 32000, 33000), 4770)
     counts = ImuSamples(imu.stamp_ns, imu.force_s * 415 + 32768, imu.rate_s * 4770 + np.array([32768, 32000, 33000]))
-    found = calibrate_by_hand(counts, GRAVITY, ranges, nominal=nominal)
-    np.testing.assert_allclose(found.values, calibrate_by_hand(imu, GRAVITY, ranges).values, atol=1e-8)
+    found = calibrate_by_hand(nominal.apply(counts), HandOptions(GRAVITY), ranges)
+    np.testing.assert_allclose(found.values, calibrate_by_hand(imu, HandOptions(GRAVITY), ranges).values, atol=1e-8)
 
 
 def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
     imu, ranges, _ = simulate(7)
-    right, wrong = calibrate_by_hand(imu, GRAVITY, ranges), calibrate_by_hand(imu, 1.01 * GRAVITY, ranges)
+    right, wrong = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(imu, HandOptions(1.01 * GRAVITY), ranges)
     np.testing.assert_allclose(wrong.accelerometer[1] * 1.01, right.accelerometer[1], atol=1e-6)
     np.testing.assert_allclose(wrong.gyroscope[1], right.gyroscope[1], atol=1e-5)
-    unsure = calibrate_by_hand(imu, GRAVITY, ranges, gravity_sd=0.02)
+    unsure = calibrate_by_hand(imu, HandOptions(GRAVITY, 0.02), ranges)
     np.testing.assert_allclose(unsure.sd_of('accelerometer.matrix.xx')**2 - right.sd_of('accelerometer.matrix.xx')**2,
                                (0.02 / GRAVITY * right.value('accelerometer.matrix.xx'))**2, rtol=1e-6)
     assert unsure.sd_of('accelerometer.bias.x') == right.sd_of('accelerometer.bias.x')
@@ -168,7 +169,7 @@ def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
 
 def test_axes_follow_the_gauge():
     imu, ranges, _ = simulate(8)
-    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     assert found.gauge['axes'] == 'accelerometer_lower_triangular'
     for name in ('xy', 'xz', 'yz'):
         assert found.value(f'accelerometer.matrix.{name}') == 0.0 and found.sd_of(f'accelerometer.matrix.{name}') == 0.0
@@ -189,7 +190,7 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
     """Without the turns, that is: the angles between the faces as the gyroscope saw them do say something."""
     truth = NOMINAL.copy()
     imu, ranges, _ = simulate(9, n_poses=6, attitudes=face_attitudes(FACES), truth=truth)
-    found = calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(turn_maximum=0.5))
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(turn_maximum=0.5)), ranges)
     status = dict(zip(found.param_names, found.statuses))
     for name in ('yx', 'zx', 'zy'):
         full = f'accelerometer.matrix.{name}'
@@ -204,7 +205,7 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
 def test_turns_about_one_axis_leave_the_others_weak_or_held():
     tilts = [Rotation.from_rotvec([angle, 0, 0]) for angle in np.linspace(0, 5.5, 12)]
     imu, ranges, _ = simulate(10, attitudes=tilts)
-    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     status = dict(zip(found.param_names, found.statuses))
     assert status['gyroscope.matrix.xx'] == 'determined'
     assert status['accelerometer.matrix.xx'] != 'determined'
@@ -214,15 +215,15 @@ def test_turns_about_one_axis_leave_the_others_weak_or_held():
 def test_too_few_attitudes_are_refused_with_their_number():
     imu, ranges, _ = simulate(11, n_poses=3)
     with pytest.raises(NotObservableError, match=r'at least 4 different attitudes .* got 3 in 3 intervals'):
-        calibrate_by_hand(imu, GRAVITY, ranges)
+        calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     with pytest.raises(NotObservableError, match='no interval at rest'):
-        calibrate_by_hand(imu, GRAVITY, [])
+        calibrate_by_hand(imu, HandOptions(GRAVITY), [])
 
 
 def test_unknown_choice_for_g_sensitivity_is_refused():
     imu, ranges, _ = simulate(11, n_poses=5)
     with pytest.raises(InputError, match='g_sensitivity'):
-        calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(g_sensitivity='maybe'))
+        calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(g_sensitivity='maybe')), ranges)
 
 
 def test_clipped_and_torn_turns_are_left_out():
@@ -230,7 +231,7 @@ def test_clipped_and_torn_turns_are_left_out():
     rate, stamp_ns = np.clip(imu.rate_s, -2.2, 2.2), imu.stamp_ns.copy()
     middle = (ranges[4].stop + ranges[5].start) // 2
     stamp_ns[middle:] += 10**9
-    found = calibrate_by_hand(ImuSamples(stamp_ns, imu.force_s, rate), GRAVITY, ranges)
+    found = calibrate_by_hand(ImuSamples(stamp_ns, imu.force_s, rate), HandOptions(GRAVITY), ranges)
     dropped = found.statistics['turns_dropped']
     assert dropped['clipped'] >= 1 and dropped['gap'] == 1
     error, covariance = differences(found, truth)
@@ -241,14 +242,14 @@ def test_clipped_and_torn_turns_are_left_out():
 
 def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
     imu, ranges, truth = simulate(13, sensitivity=5e-4, drift_sd=1e-4)
-    found = calibrate_by_hand(imu, GRAVITY, ranges)
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     assert 'gyroscope.gyro_g_sensitivity.xx' in found.param_names
     error, covariance = differences(found, truth)
     assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(covariance)))
-    without = calibrate_by_hand(imu, GRAVITY, ranges, settings=ByHandSettings(g_sensitivity='off'))
+    without = calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(g_sensitivity='off')), ranges)
     assert without.statistics['drift_scatter_sd'] > 5 * found.statistics['drift_scatter_sd']
     quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 25)]
-    assert not any('gyroscope.gyro_g_sensitivity.xx' in calibrate_by_hand(imu, GRAVITY, r).param_names for imu, r in quiet)
+    assert not any('gyroscope.gyro_g_sensitivity.xx' in calibrate_by_hand(imu, HandOptions(GRAVITY), r).param_names for imu, r in quiet)
 
 
 def test_g_sensitivity_test_keeps_its_level():
@@ -270,7 +271,7 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
                        np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)), rate @ matrix_w.T + bias_w)
     both = ImuSamples.concatenate([imu, extra])
     turn = KnownTurn(len(imu), len(both), (0, 0, 1), 2 * np.pi)
-    before, after = calibrate_by_hand(imu, GRAVITY, ranges), calibrate_by_hand(both, GRAVITY, ranges, known_turns=[turn])
+    before, after = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(both, HandOptions(GRAVITY), ranges, known_turns=[turn])
     name = 'gyroscope.matrix.zz'
     assert before.sd_of(name) > 5 * after.sd_of(name)
     assert abs(after.value(name) - truth[PARAM_NAMES.index(name)]) < 4 * after.sd_of(name)
@@ -288,7 +289,7 @@ def load(recordings, name, topic=None):
 def heldout_norm_rms(imu, ranges, gravity, **options):
     """Rms of ``|compensated force| - gravity`` over every third pose, after a calibration with the others."""
     kept = [r for k, r in enumerate(ranges) if k % 3]
-    found = calibrate_by_hand(imu, gravity, kept, **options)
+    found = calibrate_by_hand(imu, HandOptions(gravity), kept, **options)
     left_out = np.array([imu.force_s[r].mean(0) for r in ranges[::3]])
     return float(np.sqrt(np.mean(found.norm_residuals(left_out)**2)))
 
@@ -304,7 +305,7 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     nominal = NominalScaling(32768, 415, 32768, 4770)
     imu = nominal.apply(load(recordings, 'xsens_counts'))
     ranges = find_still(imu)
-    found = calibrate_by_hand(imu, 9.81744, ranges)
+    found = calibrate_by_hand(imu, HandOptions(9.81744), ranges)
     (bias_f, matrix_f), (bias_w, matrix_w, _) = found.accelerometer, found.gyroscope
     offset_f = 32768 + 415 * bias_f - [33123, 33276, 32360]
     scale_f = 415 * np.linalg.norm(matrix_f, axis=1) / [415, 413, 415] - 1
@@ -325,7 +326,7 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     assert s['norm_chi2_per_dof'] > 5  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
     assert held_out < 0.002
     # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out of the turns, which took no part
-    without = calibrate_by_hand(imu, 9.81744, ranges, settings=ByHandSettings(g_sensitivity='off'))
+    without = calibrate_by_hand(imu, HandOptions(9.81744, settings=ByHandSettings(g_sensitivity='off')), ranges)
     assert s['turn_scatter_sd'] < 0.4 * without.statistics['turn_scatter_sd']
     assert s['g_sensitivity_heldout_ratio'] < 0.5
 
@@ -336,7 +337,7 @@ def test_mpu9150_by_hand(recordings, name):
     """Published biases within 10 mm/s^2; the site's gravity is unknown, which biases do not feel. Scales within the data sheet's 3 %."""
     imu = load(recordings, name)
     ranges = find_still(imu)
-    found = calibrate_by_hand(imu, stills=ranges, gravity_sd=0.02)
+    found = calibrate_by_hand(imu, HandOptions(gravity_sd=0.02), ranges)
     bias, matrix = found.accelerometer
     held_out = heldout_norm_rms(imu, ranges, found.gravity)
     print(f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)} m/s^2, '

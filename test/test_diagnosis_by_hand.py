@@ -1,11 +1,13 @@
 """Diagnosis without a table: causes hidden in recordings by hand by their physics, and recordings that hide nothing."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.calibrate import ByHandSettings, gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
@@ -34,7 +36,7 @@ def stops(force, rate, time, pose):
 
 def diagnosed(seed, spoil=None, n_poses=36, **options):
     imu, ranges, _ = simulate(seed, n_poses=n_poses, spoil=spoil, **options)
-    return diagnose_by_hand(gather_by_hand(imu, ranges), GRAVITY)
+    return diagnose_by_hand(gather_by_hand(imu, ranges), HandOptions(GRAVITY))
 
 
 @pytest.fixture(scope='module')
@@ -66,12 +68,13 @@ def test_the_turns_tell_apart_what_is_one_to_the_norm():
         return 15 * MG / 9.8**2 * np.stack([f[:, 1] * f[:, 2], 0 * t, 0 * t], axis=1), NOTHING
     imu, ranges, _ = simulate(36, n_poses=36, spoil=spoil)
     data = gather_by_hand(imu, ranges)
-    result = diagnose_by_hand(data, GRAVITY)
+    result = diagnose_by_hand(data, HandOptions(GRAVITY))
     assert result.diagnosis.findings[0].effect == 'accel_cross_product'
     for name, true in (('x_yz', 15 * MG / 9.8**2), ('y_xz', 0.0), ('z_xy', 0.0)):
         full = f'accelerometer.accel_cross_product.{name}'
         assert abs(result.hand.value(full) - true) < 4.5 * result.hand.sd_of(full) and result.hand.sd_of(full) < 2 * MG / 9.8**2
-    alone = solve_by_hand(data.poses, [], GRAVITY, 0.0, ByHandSettings(), data.statistics, accelerometer=('bias', 'matrix', 'accel_cross_product'))
+    products = HandOptions(GRAVITY, accelerometer=('bias', 'matrix', 'accel_cross_product'))
+    alone = solve_by_hand(replace(data, turns=[]), products)
     assert alone.sd_of('accelerometer.accel_cross_product.x_yz') > 10 * result.hand.sd_of('accelerometer.accel_cross_product.x_yz')
 
 
@@ -102,7 +105,7 @@ def test_the_document_and_the_extended_model_go_together(responding):
 def test_too_few_poses_are_refused_with_their_number():
     imu, ranges, _ = simulate(35, n_poses=10)
     with pytest.raises(NotObservableError, match='at least 12 poses .* 10 were found'):
-        diagnose_by_hand(gather_by_hand(imu, ranges), GRAVITY)
+        diagnose_by_hand(gather_by_hand(imu, ranges), HandOptions(GRAVITY))
 
 
 @pytest.mark.real_data
@@ -114,7 +117,7 @@ def test_xsens_counts_tells_no_stories(recordings):
     from msg_adapters.bag import open_recording
     options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
-        found = diagnose_without_table(recording.blocks, options, 9.81744).diagnosis
+        found = diagnose_without_table(recording.blocks, replace(options, gravity=9.81744)).diagnosis
     assert [f.effect for f in found.findings] == ['gyro_g_sensitivity']
     gain = found.findings[0].gain
     rest = found.unexplained['accelerometer']

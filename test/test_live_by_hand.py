@@ -1,5 +1,7 @@
 """By hand while it goes on: the live answer is that of the recording, poses are counted, what is missing is named. No ROS here."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_by_hand import GRAVITY, load, simulate
@@ -33,7 +35,7 @@ def run(live, imu, seed=0):
 
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
-    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], gravity=gravity)
+    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], CalibrationOptions(gravity=gravity))
 
 
 def assert_same(live, expected, share=1e-6):
@@ -140,11 +142,11 @@ def test_residuals_of_poses_are_what_the_model_leaves(session, expected):
     assert live.residuals(poses) is None
     live.solve(pending=True)
     residuals = live.residuals(poses)
-    norms = expected.solution.norm_residuals()[:len(poses)]
+    norms = expected.hand.norm_residuals()[:len(poses)]
     along = np.linalg.norm(residuals.force_s, axis=1)
     np.testing.assert_allclose(along, np.abs(norms), rtol=0.1, atol=1e-6)
     assert set(residuals.stamp_ns) <= set(session.stamp_ns)
-    assert np.all(np.abs(residuals.rate_s) < 5 * np.max(expected.solution.poses.rate_sem))
+    assert np.all(np.abs(residuals.rate_s) < 5 * np.max(expected.hand.poses.rate_sem))
 
 
 def paused(first, second, seconds=100.0):
@@ -219,6 +221,6 @@ def test_further_effects_are_estimated_as_offline(session):
     options = CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
     live = LiveByHand(options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0)
     run(live, session)
-    expected = calibrate_without_table([lambda: iter([SampleBlock(session)])], options, GRAVITY)
+    expected = calibrate_without_table([lambda: iter([SampleBlock(session)])], replace(options, gravity=GRAVITY))
     assert any('accel_quadratic' in name for name in expected.calibration.param_names)
     assert_same(live.solve(pending=True), expected)

@@ -20,7 +20,6 @@ from imu_calibration.report.navigation_section import expected_growth, motion_gr
 from imu_calibration.report.numbers import fixed, text
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import autocorrelation
-from imu_calibration.report.window_errors import window_errors
 from imu_calibration.report.worked_sample import worked_sample
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
@@ -151,7 +150,7 @@ def test_the_worked_sample_can_be_followed_with_the_printed_numbers(on_table):
 
 def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_hand):
     for result in (on_table, by_hand):
-        errors = window_errors(result)
+        errors = result.window_errors()
         for sensor in ('accelerometer', 'gyroscope'):
             ratio = np.sqrt(np.mean((errors.after[sensor] / errors.floor[sensor])**2))
             assert 0.3 < ratio < 1.3  # by hand two of three components of each pose are fitted
@@ -159,7 +158,7 @@ def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_han
 
 
 def test_readings_at_one_g_are_zhangs_tables(on_table):
-    at_rest, moving = reading_tables(on_table, window_errors(on_table))
+    at_rest, moving = reading_tables(on_table, on_table.window_errors())
     assert [line['position'] for line in at_rest] == ['+x', '+y', '+z', '−x', '−y', '−z']
     for line in at_rest:
         assert all(float(cell['error_after']) < 0.6 for cell in line['cells'])  # mg; noise of a mean over 2 s is below 0.1
@@ -169,7 +168,7 @@ def test_readings_at_one_g_are_zhangs_tables(on_table):
 
 def test_expected_drift_at_rest_is_that_of_simulated_runs(on_table):
     """Noise and constant errors, integrated by the strapdown equations themselves."""
-    errors = window_errors(on_table)
+    errors = on_table.window_errors()
     _, parts = expected_growth(on_table, errors)
     rng, period, seconds = np.random.default_rng(3), 0.05, 50.0
     time = np.arange(0.0, seconds + period / 2, period)

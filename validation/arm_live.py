@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.relative_arm import clipped, estimate_arm
-from imu_calibration.by_hand.workflow import calibrate_recording_by_hand
+from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
 from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.nodes.processes import NodeProcesses, local_environment
@@ -66,7 +66,8 @@ def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
     found = []
     for topic in topics:
         with open_recording(folder / name, topic, want_joints=False) as recording:
-            found.append(calibrate_recording_by_hand(recording.blocks())[:2])
+            result = calibrate_without_table([recording.blocks])
+            found.append((result.calibration, result.hand))
     arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
     a, b = imus
     part = a.select(a.stamp_ns > a.stamp_ns[-1] - int(seconds * 1e9))

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import KnownTurn, calibrate_by_hand
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.options import HandOptions, KnownTurn
 from validation.recordings import load, reference
 from validation.second_opinions import FACES, TURNS, accelerometer_of, ferraris, installed
 from validation.section import Section, text
@@ -25,7 +26,7 @@ def calibrate_sections(imu, sections, angle):
     """Return our calibration from the six faces, the way between them, and the full turns."""
     faces = [slice(*sections[name]) for name in FACES]
     order = np.argsort([face.start for face in faces])
-    return calibrate_by_hand(imu, GRAVITY, [faces[k] for k in order], known_turns=known_turns(imu, sections, angle)), order
+    return calibrate_by_hand(imu, HandOptions(GRAVITY), [faces[k] for k in order], known_turns=known_turns(imu, sections, angle)), order
 
 
 def angles_between(matrix):

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import t
 
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.segmentation.static_detector import find_still
 from validation.ferraris import GRAVITY, RATE_HZ, calibrate_sections, known_turns
 from validation.ferraris import NAME as FERRARIS
@@ -36,7 +37,7 @@ def without(imu, ranges, left_out):
 def ours(imu, ranges, left_out, gravity):
     """Return our accelerometer from the other poses and the turns between them."""
     rest, kept = without(imu, ranges, left_out)
-    return Forward(*calibrate_by_hand(rest, gravity, kept).accelerometer)
+    return Forward(*calibrate_by_hand(rest, HandOptions(gravity), kept).accelerometer)
 
 
 def errors_of_splits(imu, ranges, gravity, splits):

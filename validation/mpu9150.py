@@ -3,6 +3,7 @@
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.segmentation.static_detector import find_still
 from validation.recordings import load, reference
 from validation.section import Section, listed, text
@@ -13,7 +14,7 @@ NAME = 'mpu9150_0'
 def figures(folder):
     """Return (HandCalibration, bias difference from the published ones in m/s^2)."""
     imu = load(folder, NAME)
-    found = calibrate_by_hand(imu, stills=find_still(imu), gravity_sd=0.02)
+    found = calibrate_by_hand(imu, HandOptions(gravity_sd=0.02), find_still(imu))
     return found, found.accelerometer[0] - reference(folder, NAME)['published']['accelerometer_bias']
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.segmentation.static_detector import find_still
 from validation.recordings import gravity_of, load, nominal_of, reference
 from validation.section import Section, listed, text
@@ -21,7 +22,7 @@ def figures(folder):
     """Return (HandCalibration, {sensor: (offset difference in counts, relative scale difference)})."""
     nominal, factory = nominal_of(folder, NAME), reference(folder, NAME)['factory']
     imu = load(folder, NAME)
-    found = calibrate_by_hand(imu, gravity_of(folder, NAME), find_still(imu))
+    found = calibrate_by_hand(imu, HandOptions(gravity_of(folder, NAME)), find_still(imu))
     differences = {}
     for sensor in ('accelerometer', 'gyroscope'):
         offset, scale = in_counts(found, nominal, sensor)

@@ -1,5 +1,6 @@
 """Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
+from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
 from imu_calibration.by_hand.poses import (
     average_poses,
     collect_turns,
@@ -16,14 +18,13 @@ from imu_calibration.by_hand.poses import (
     noise_statistics,
 )
 from imu_calibration.by_hand.solver import solve_joint
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.calibration.status import DETERMINED, statuses
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.settings import setting
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
@@ -39,41 +40,6 @@ G_SENSITIVITY_P = 1e-3
 """The response of the gyroscope to attitude enters the model when chance would show it less often."""
 POSES_FULL = 9
 """The nine accelerometer parameters take one equation per attitude."""
-
-
-@dataclass(frozen=True)
-class ByHandSettings:
-    """Numbers for calibration by hand."""
-
-    pose_apart: float = setting(0.2, 'rad', 'attitudes closer than this count as one pose', (0.001, 1.5), '')
-    turn_maximum: float = setting(30.0, 's', 'longer stretches between two poses are not used for the gyroscope', (0.5, 3600.0),
-                                  'too small: few turns; too large: gyroscope drift and clipping enter')
-    gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
-                         'too large: rotation is lost in holes and shows as turn scatter')
-    pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
-    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it',
-                                   (0.0, 1.0), '')
-    turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
-    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0),
-                                   'too small: scales too sure')
-    known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
-                                   'too small: misalignments too sure')
-    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it",
-                                 symptom="off: it shows as drift and turn scatter")
-
-
-@dataclass(frozen=True)
-class KnownTurn:
-    """A turn of known angle about a body axis that stays put."""
-
-    start: int
-    """First sample."""
-    stop: int
-    """After the last sample."""
-    axis: tuple
-    """Unit vector in the sensor frame; turns counter-clockwise seen from its tip."""
-    angle: float
-    """rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,36 +111,27 @@ class HandCalibration:
         return self.model.norm_rows(self.state.values, force)[0]
 
 
-def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHandSettings(), nominal=None, gravity_sd=0.0, known_turns=(),
-                      tolerances=None, accelerometer=None, gyroscope=None, temperature_c=None, catalogue=CATALOGUE):
+def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
+                      known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandCalibration:
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
     One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
     pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
-    drifts and turns is estimated along. A wrong `gravity` is the same as a common scale of the accelerometer.
+    drifts and turns is estimated along. A wrong gravity is the same as a common scale of the accelerometer.
 
     Parameters
     ----------
     imu : ImuSamples
-        In SI units, or in counts with `nominal`; stamps must not go backwards.
-    gravity, gravity_sd : float
-        Local gravity and its sd, m/s^2.
+        Stamps must not go backwards.
+    options : HandOptions
+        Reference, effects, tolerances.
     stills : sequence of slices or (start, stop), optional
-        Intervals at rest; found by `windows.find_still` when not given.
-    settings : ByHandSettings
-    nominal : gathering.NominalScaling, optional
-        Conversion from counts; the result then refers to the converted values.
+        Intervals at rest; found by `static_detector.find_still` when not given.
     known_turns : sequence of KnownTurn
         Full turns by hand, beside what gravity says.
-    tolerances : dict, optional
-        {sensor: {effect: sd that is good enough}}; the catalogue's where not given.
-    accelerometer, gyroscope : tuple of str, optional
-        Effects to estimate; bias and matrix, and the g-sensitivity when the settings and the poses say so, where not given.
     temperature_c : array, optional
-        Temperature at the samples, shape (n,).
-    catalogue : Catalogue
-        Where the effects are declared.
+        Temperature at the samples, degrees Celsius, shape (n,).
 
     Returns
     -------
@@ -186,10 +143,8 @@ def calibrate_by_hand(imu, gravity=STANDARD_GRAVITY, stills=None, settings=ByHan
         With fewer than four different attitudes.
 
     """
-    imu = imu if nominal is None else nominal.apply(imu)
-    data = gather_by_hand(imu, stills, settings, known_turns, temperature_c)
-    return solve_by_hand(data.poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope,
-                         catalogue=catalogue)
+    data = gather_by_hand(imu, stills, options.settings, known_turns=known_turns, temperature_c=temperature_c)
+    return solve_by_hand(data, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +159,8 @@ class HandData:
     """Attitudes, turns left out, noise and period of the samples."""
 
 
-def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), temperature_c=None):
+def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
+                   known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
@@ -218,31 +174,33 @@ def gather_by_hand(imu, stills=None, settings=ByHandSettings(), known_turns=(), 
     return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
 
 
-def solve_by_hand(poses, turns, gravity, gravity_sd, settings, statistics, tolerances=None, accelerometer=None, gyroscope=None,
-                  point=None, catalogue=CATALOGUE):
+def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = None) -> HandCalibration:
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
+    poses, turns, settings = data.poses, data.turns, options.settings
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
     default, evidence = _gyroscope_effects(poses, settings)
     reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
-    model = HandModel(SensorModel(accelerometer or BASE, gyroscope or default, temperature_ref_c=reference_c, point=point or {}, catalogue=catalogue), gravity)
+    sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
+                          catalogue=options.catalogue)
+    model = HandModel(sensors, options.gravity)
     _check_temperature(model, poses)
     for _ in range(PASSES):
-        found = solve_joint(model, poses, turns, gravity_sd=gravity_sd, fallback=fallback)
+        found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
         if settled:
             break
-    goals = model.tolerances(tolerances or {})
-    statuses = _statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
+    goals = model.tolerances(options.tolerances)
+    status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
-    advice = missing_motion(model, found.factor, found.state.values, statuses, goals, pose_sd, turn_sd)
-    statistics = {**statistics, **evidence, **_statistics(model, found, poses, turns)}
+    advice = missing_motion(model, found.factor, found.state.values, status, goals, pose_sd, turn_sd)
+    statistics = {**data.statistics, **evidence, **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
     index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
     return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
-                           tuple((*statuses, 'determined')[k] for k in index), np.append(goals, goals[3])[index],
-                           np.append(model.priors, 0.0)[index], gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
+                           tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
+                           np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
                            found.factor.T @ found.factor)
 
 
@@ -271,10 +229,6 @@ def _gyroscope_effects(poses, settings):
     wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
                                                 and evidence['g_sensitivity_heldout_ratio'] < 1)
     return G_SENSITIVE if wanted else BASE, evidence
-
-
-def _statuses(sd, held, tolerances):
-    return tuple('held' if h else 'determined' if s <= t else 'weak' for s, h, t in zip(sd, held, tolerances))
 
 
 def _statistics(model, found, poses, turns):

@@ -8,14 +8,14 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import POSES_LEAST
 from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
-from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, result_by_hand
-from imu_calibration.calibration.effect_states import hand_group_states, waiting_groups
+from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand
+from imu_calibration.calibration.effect_states import group_states, waiting_groups
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.named_models import BASE, parse_effects
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.samples import ImuSamples
@@ -70,10 +70,8 @@ class LiveByHand:
     """
 
     def __init__(self, options, settings, by_hand=LiveByHandSettings(), saved=None, clock=time.monotonic):
-        self.options, self.settings, self._clock = options, settings, clock
-        self._names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
-                       for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
-        self._gravity = by_hand.gravity or None
+        self.options, self.settings, self._clock = replace(options, gravity=by_hand.gravity or None), settings, clock
+        self._asked = hand_options(self.options)
         _check_model(self.model)
         self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
         if saved is not None:
@@ -85,7 +83,8 @@ class LiveByHand:
     @property
     def model(self):
         """The model, as far as it is known before a solution."""
-        return SensorModel(*(names or BASE for names in self._names.values()), catalogue=self.options.catalogue)
+        asked = self._asked
+        return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
 
     @property
     def n_windows(self):
@@ -137,7 +136,7 @@ class LiveByHand:
 
     def solve(self, pending=False, provenance=None):
         """
-        Solve what was gathered and return the CalibrationResult, which stays in `result`.
+        Solve what was gathered and return the HandResult, which stays in `result`.
 
         Parameters
         ----------
@@ -164,9 +163,7 @@ class LiveByHand:
                                      'check the topic')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
-        solved = calibrate_samples_by_hand(recording, self._gravity, self.options.tolerances, provenance, *self._names.values(),
-                                           stills=self.found.rests, catalogue=self.options.catalogue)
-        self.result = result_by_hand(*solved, self.options)
+        self.result = calibrate_samples_by_hand(recording, self.options, provenance, stills=self.found.rests)
         return self.result
 
     def needs_linearising(self):
@@ -186,7 +183,7 @@ class LiveByHand:
         """
         if self.result is None or not poses:
             return None
-        mean, hand = ImuSamples.concatenate(poses), self.result.solution
+        mean, hand = ImuSamples.concatenate(poses), self.result.hand
         true, _ = hand.compensate(mean.force_s, mean.rate_s)
         bias, matrix = hand.accelerometer
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
@@ -198,14 +195,14 @@ class LiveByHand:
         """Return the GroupState of every effect."""
         if self.result is None:
             return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
-        return hand_group_states(self.result)
+        return group_states(self.result)
 
     def question(self):
         """Return None: what the model gets wrong is asked of recordings."""
 
     def status(self, hints=None):
         """Return the HandStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result and self.result.calibration, self._gravity is None, hints)
+        status = hand_status(self.found, self.result and self.result.calibration, self.options.gravity is None, hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 

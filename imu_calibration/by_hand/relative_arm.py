@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import ByHandSettings, calibrate_by_hand
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, make_windows
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.relative_arm_fit import Rows, fit_arm, jackknife_covariance, lever_rows, response
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import linear_names
@@ -163,7 +164,7 @@ def clipped(values):
 
 def _calibrate(imu, gravity):
     try:
-        return calibrate_by_hand(imu, gravity, find_still(imu), ByHandSettings())
+        return calibrate_by_hand(imu, HandOptions(gravity), find_still(imu))
     except NotObservableError:
         return None
 

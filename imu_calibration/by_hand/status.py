@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST, ByHandSettings
+from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST
+from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes
 from imu_calibration.calibration.effect_states import Progress
 from imu_calibration.calibration.status import DETERMINED

@@ -1,22 +1,20 @@
 """A calibration by hand as the same document and result that a calibration on a table gives."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 import imu_calibration
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.result import HandResult
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import HELD, statuses, tolerances_of
 from imu_calibration.calibration.verdict import judged
-from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.named_models import parse_effects
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_force
@@ -80,71 +78,17 @@ def read_imu(blocks):
     return recording.imu, recording.counts
 
 
-def calibrate_recording_by_hand(blocks, gravity=None, nominal=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None,
-                                catalogue=CATALOGUE):
+def calibrate_without_table(sources, options=CalibrationOptions(), provenance=None):
     """
-    Calibrate a recording without a table and return (Calibration, HandCalibration, Gathered, tolerances).
+    Calibrate by hand and return the HandResult: gravity is the reference (see `calibrate_by_hand`).
 
     Parameters
     ----------
-    blocks : iterable of SampleBlock
-    gravity : float, optional
-        Local gravity, m/s^2; default the standard gravity, with a warning's worth of uncertainty (0.02 m/s^2).
-    nominal : NominalScaling of `gathering`, optional
-        Conversion from counts or volts.
-    tolerances : dict, optional
-        {section: {effect: tolerance}}.
-    accelerometer, gyroscope : tuple of str, optional
-        Effects to estimate, see `calibrate_by_hand`.
-    catalogue : Catalogue
-        Where they are declared.
-
-    """
-    recording = read_by_hand(blocks, nominal)
-    return calibrate_samples_by_hand(recording, gravity, tolerances, provenance, accelerometer, gyroscope, catalogue=catalogue)
-
-
-def calibrate_samples_by_hand(recording, gravity=None, tolerances=None, provenance=None, accelerometer=None, gyroscope=None, stills=None,
-                              catalogue=CATALOGUE):
-    """Calibrate a HandRecording; `stills` as in `calibrate_by_hand`, the rest and what is returned as in `calibrate_recording_by_hand`."""
-    gravity, gravity_sd = reference_gravity(gravity)
-    hand = calibrate_by_hand(recording.imu, gravity, stills, gravity_sd=gravity_sd, accelerometer=accelerometer, gyroscope=gyroscope,
-                             temperature_c=recording.temperature_c, catalogue=catalogue)
-    gathered = recording.gathered
-    calibration, limits = document_of_hand(hand, gathered, len(recording.imu), tolerances, provenance)
-    return calibration, hand, gathered, limits
-
-
-def reference_gravity(gravity):
-    """Return (gravity, its sd): as given, or the standard one with what it may be off by, m/s^2."""
-    return (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if gravity is None else (gravity, 0.0)
-
-
-def document_of_hand(hand, gathered, n_samples, tolerances=None, provenance=None):
-    """Return (Calibration, tolerances) of a HandCalibration; arguments as in `calibrate_recording_by_hand`."""
-    model = hand.model.model
-    order = [hand.param_names.index(name) for name in model.param_names]
-    covariance = hand.covariance[np.ix_(order, order)]
-    sd, held = np.sqrt(np.diag(covariance)), np.array([hand.statuses[k] == HELD for k in order])
-    limits = tolerances_of(model, tolerances)
-    calibration = Calibration(model, hand.values[order], covariance, statuses(sd, held, limits), gathered.frame_id, dict(hand.gauge),
-                              tuple(dict(item) for item in hand.advice), _statistics(hand, gathered.counts, n_samples), {}, {
-                                  'software': imu_calibration.__version__, **(provenance or {})})
-    return calibration, limits
-
-
-def _statistics(hand, counts, n_samples):
-    found = hand.statistics
-    keys = {'accelerometer': ('force_noise_sd', 'pose_scatter_sd'), 'gyroscope': ('rate_noise_sd', 'drift_scatter_sd')}
-    per_sensor = {s: {'noise_sd': [float(v) for v in found[keys[s][0]]], 'between_window_sd': float(found[keys[s][1]]), 'wander_sd': 0.0}
-                  for s in SENSORS}
-    return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
-            'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}
-
-
-def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None, provenance=None):
-    """
-    Calibrate by hand: gravity is the reference (see `by_hand`).
+    sources : sequence of callables
+        One, which returns an iterator of SampleBlock.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
 
     Raises
     ------
@@ -154,17 +98,46 @@ def calibrate_without_table(sources, options=CalibrationOptions(), gravity=None,
     """
     if len(sources) != 1:
         raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
-    names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
-             for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
-    preflight = Preflight(gravity, options.nominal)
-    result = result_by_hand(*calibrate_recording_by_hand(preflight.watch(sources[0]()), gravity, options.nominal, options.tolerances, provenance, **names,
-                                                          catalogue=options.catalogue), options)
-    result.gathered.findings = preflight.findings
-    return replace(result, calibration=replace(result.calibration, statistics=result.calibration.statistics | preflight_statistics(preflight.findings)))
+    preflight = Preflight(options.gravity, options.nominal)
+    recording = read_by_hand(preflight.watch(sources[0]()), options.nominal)
+    return calibrate_samples_by_hand(recording, options, provenance, findings=preflight.findings)
 
 
-def result_by_hand(calibration, hand, gathered, tolerances, options=CalibrationOptions()):
-    """Return the CalibrationResult of a calibration by hand, after a look at its units."""
+def calibrate_samples_by_hand(recording, options=CalibrationOptions(), provenance=None, *, stills=None, findings=()):
+    """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a look at the recording."""
+    hand = calibrate_by_hand(recording.imu, hand_options(options), stills, temperature_c=recording.temperature_c)
+    return hand_result(hand, recording, options, provenance, findings=findings)
+
+
+def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, *, findings=()):
+    """
+    Return a HandCalibration as the result that reports and documents know.
+
+    Raises
+    ------
+    InputError
+        When the specific force at rest is plainly in another unit.
+
+    """
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
-    calibration = judged(replace(calibration, conditions=conditions(gathered, None) | {'gravity': hand.gravity}), tolerances)
-    return CalibrationResult(calibration, hand, gathered, None, calibration.model, calibration.model, tolerances, options)
+    model, gathered = hand.model.model, recording.gathered
+    gathered.findings = findings
+    order = [hand.param_names.index(name) for name in model.param_names]
+    covariance = hand.covariance[np.ix_(order, order)]
+    held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
+    statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings)
+    calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
+                              gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
+                              conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})})
+    needed = {name: (item['needs'], float('nan')) for item in reversed(hand.advice) for name in item['parameters']}
+    return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
+                      options=options, hand=hand)
+
+
+def _statistics(hand, counts, n_samples):
+    found = hand.statistics
+    keys = {'accelerometer': ('force_noise_sd', 'pose_scatter_sd'), 'gyroscope': ('rate_noise_sd', 'drift_scatter_sd')}
+    per_sensor = {s: {'noise_sd': [float(v) for v in found[keys[s][0]]], 'between_window_sd': float(found[keys[s][1]]), 'wander_sd': 0.0}
+                  for s in SENSORS}
+    return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
+            'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}

@@ -2,12 +2,12 @@
 
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.from_solution import document
+from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.gathered import join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
-from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import restrict
@@ -37,7 +37,7 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
 
     Returns
     -------
-    CalibrationResult
+    TableResult
 
     Raises
     ------
@@ -77,8 +77,10 @@ def finish(gathered, model, table, options=CalibrationOptions(), provenance=None
         smaller = narrow.without_arms()
         solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
     tolerances = tolerances_of(narrow, options.tolerances)
-    calibration = document(solution, tolerances, table, gathered, provenance)
-    return CalibrationResult(calibration, solution, gathered, table, narrow, model, tolerances, options)
+    needed = motions_needed(solution, tolerances, table)
+    calibration = document(solution, tolerances, table, gathered, needed, provenance)
+    return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
+                       table=table, model=narrow, gathered_model=model)
 
 
 def _size_effect_unseen(solution):

@@ -5,8 +5,6 @@ from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.estimation import observability
-from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 
@@ -46,15 +44,14 @@ class GroupState:
 
 def group_states(result):
     """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
-    calibration, prior_sd = result.calibration, make_prior(result.model).sd
-    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value, prior_sd)
-    names, sd, states = calibration.param_names, calibration.sd, []
+    calibration, states = result.calibration, []
+    names, sd = calibration.param_names, calibration.sd
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        status = calibration.status[part]
-        state = group_status(status)
-        text, predicted = needed.get(names[worst], ('', float('nan'))) if state != Progress.DETERMINED else ('', float('nan'))
+        state = group_status(calibration.status[part])
+        known = [] if state == Progress.DETERMINED else [result.needed[name] for name in (names[worst], *names[part]) if name in result.needed]
+        text, predicted = known[0] if known else ('', float('nan'))
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), text, predicted))
     return states
@@ -70,18 +67,3 @@ def waiting_groups(model):
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
     return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
             for e in model.effects]
-
-
-def hand_group_states(result):
-    """Return the GroupState of every effect of a calibration by hand."""
-    calibration, states = result.calibration, []
-    names, sd = calibration.param_names, calibration.sd
-    for effect in calibration.model.effects:
-        part = calibration.model.slices[effect.key]
-        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        state = group_status(calibration.status[part])
-        own = set(names[part]) if state != Progress.DETERMINED else set()
-        needs = next((item['needs'] for item in calibration.undetermined if own & set(item['parameters'])), '')
-        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
-                                 effect.unit_of(worst - part.start), needs))
-    return states

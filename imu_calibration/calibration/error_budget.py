@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.constants import ARCMIN, STANDARD_GRAVITY
+from imu_calibration.constants import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns, warped_reference
 from imu_calibration.effects.forward_equations import coefficient_jacobian, sensor_output
@@ -55,19 +55,17 @@ class ErrorBudget:
 
 def error_budget(result, errors=ReferenceErrors()):
     """
-    Return the ErrorBudget of a calibration on a table, or by hand (noise and gravity only).
+    Return the ErrorBudget of a calibration on a table.
 
     First order, around the solution; weights as the solver takes them. Windows at rest enter all, moving windows as far as their
     samples were kept.
 
     Parameters
     ----------
-    result : CalibrationResult
+    result : TableResult
     errors : ReferenceErrors
 
     """
-    if result.table is None:
-        return _budget_by_hand(result, errors)
     gravity_sd = result.table.gravity_sd if result.table.gravity_sd is not None else errors.gravity
     causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
     declared = _causes(result, errors, gravity_sd)
@@ -227,15 +225,3 @@ def _known(model, motion, temperature):
 
 def _output(model, sensor, values, table, motion, temperature):
     return sensor_output(model, sensor, values, warped_reference(model, sensor, table, motion, temperature))
-
-
-def _budget_by_hand(result, errors):
-    """Return noise and gravity: without a table there is no other reference. The gravity of a default value is in the sd already."""
-    solution, model = result.solution, result.model
-    causes, texts = {'noise': result.calibration.sd}, {'noise': 'noise, scatter of poses and turns, as this recording shows them'}
-    if solution.gravity == STANDARD_GRAVITY:
-        return ErrorBudget(tuple(model.param_names), causes, {'noise': texts['noise'] + ', and the gravity, which was not given'})
-    part = model.part('accelerometer', Role.LINEAR)
-    gravity = np.zeros(len(result.calibration.values))
-    gravity[part] = np.abs(result.calibration.values[part]) * errors.gravity / solution.gravity
-    return ErrorBudget(tuple(model.param_names), causes | {'gravity': gravity}, texts | {'gravity': f'gravity known to {errors.gravity:.2g} m/s²'})

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.result import exit_code, summary
+from imu_calibration.calibration.result import exit_code
 from imu_calibration.calibration.status import HELD
 from imu_calibration.errors import ImuCalibrationError, InputError
 
@@ -72,7 +72,7 @@ class FleetStep:
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         if self.report is not None:
             texts['report.html'] = self.report(result)
-        return UnitResult(unit.name, result.calibration, summary(result)[0], exit_code(result), files=texts)
+        return UnitResult(unit.name, result.calibration, result.verdict.word, exit_code(result.calibration), files=texts)
 
 
 @dataclass(frozen=True)

@@ -15,20 +15,23 @@ from imu_calibration.preflight.checks import unusable, warnings
 from imu_calibration.segmentation.window_cutter import dropped
 
 
-def document(solution, tolerances, table, gathered, provenance=None):
+def motions_needed(solution, tolerances, table):
+    """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
+    return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd)
+
+
+def document(solution, tolerances, table, gathered, needed, provenance=None):
     """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
     sd = np.sqrt(np.diag(covariance))
-    prior = make_prior(model)
     status = statuses(sd, solution.held, tolerances)
-    needed = observability.needed_motions(solution, tolerances, table.gravity_value, prior.sd)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
     centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
-                              statistics(solution, gathered), conditions(gathered, table), {'software': imu_calibration.__version__, **(provenance or {})})
+                              statistics(solution, gathered), conditions(gathered, table.gravity_value), {'software': imu_calibration.__version__, **(provenance or {})})
     return judged(calibration, tolerances)
 
 
@@ -75,8 +78,8 @@ def _finite(value):
     return float(value) if np.isfinite(value) else None
 
 
-def conditions(gathered, table):
+def conditions(gathered, gravity):
     """Return the conditions section."""
     date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
     return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,
-            'gravity': table.gravity_value if table is not None else None, 'duration_s': gathered.duration, 'date': date}
+            'gravity': gravity, 'duration_s': gathered.duration, 'date': date}

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.samples import NominalScaling
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 
@@ -22,8 +23,10 @@ class CalibrationOptions:
     """{section: {effect: tolerance}}."""
     windows: WindowSettings = WindowSettings()
     """How windows are found."""
-    nominal: object | None = None
-    """NominalScaling for recordings in volts or counts."""
+    nominal: NominalScaling | None = None
+    """For recordings in volts or counts."""
+    gravity: float | None = None
+    """Local gravity where there is no table, m/s^2; None: the standard gravity, with what it may be off by."""
     catalogue: Catalogue = CATALOGUE
     """The effects that there are."""
 

@@ -1,51 +1,87 @@
-"""A finished calibration with what a report needs beside it, its summary and its exit code."""
+"""A finished calibration with what a report needs beside it, whatever its reference was; its summary and its exit code."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import judge
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.calibration.verdict import Verdict, judge
+from imu_calibration.calibration.window_errors import WindowErrors
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationResult:
-    """A calibration with what a report needs beside it."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrationResult(ABC):
+    """A calibration with what a report needs beside it: on a table a `TableResult`, by hand a `by_hand.result.HandResult`."""
 
     calibration: Calibration
     """The document's content."""
-    solution: object
-    """The Solution, or the HandCalibration of a recording without a table."""
     gathered: Gathered
     """Windows, counts, kept samples."""
-    table: object
-    """The Table, or None."""
-    model: SensorModel
-    """The model that was solved."""
-    gathered_model: SensorModel
-    """The model whose columns were gathered; it may have more effects."""
     tolerances: np.ndarray
     """Tolerance of each parameter."""
+    needed: dict[str, tuple[str, float]]
+    """Parameter that is not determined -> (the motion that would serve it best, its sd after a minute of that motion, NaN when unknown)."""
     options: CalibrationOptions = CalibrationOptions()
     """What was asked for."""
 
+    observations: ClassVar[str]
+    """What the data consist of: 'windows' or 'poses'."""
 
-def summary(result, hints=None):
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Good, weak or bad, with reasons."""
+        return judge(self.calibration, self.tolerances)
+
+    @property
+    @abstractmethod
+    def reference(self) -> str:
+        """What the sensor was compared with, in a few words."""
+
+    @property
+    @abstractmethod
+    def gravity(self) -> float:
+        """Gravity of the reference, m/s^2."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """Sampling period, s."""
+
+    @property
+    @abstractmethod
+    def singular_values(self) -> np.ndarray:
+        """Singular values of the design in units of the tolerances, descending; none where they are not known."""
+
+    @abstractmethod
+    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean specific force and rate of the first pose at rest, each shape (3,)."""
+
+    @abstractmethod
+    def window_errors(self) -> WindowErrors:
+        """Return the errors of window means before and after."""
+
+    @abstractmethod
+    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+        """Return the standard deviation of each parameter by cause."""
+
+
+def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> tuple[str, list[str]]:
     """
     Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people (see `verdict`).
 
     `hints` as for `errors.with_hint`.
     """
-    found = judge(result.calibration, result.tolerances)
-    return found.word, found.lines(hints)
+    return result.verdict.word, result.verdict.lines(hints)
 
 
-def exit_code(result):
+def exit_code(calibration: Calibration) -> int:
     """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
-    calibration = result.calibration
     lacking = any(status != DETERMINED for status in calibration.requested.values())
     return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0

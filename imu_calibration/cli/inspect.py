@@ -157,4 +157,4 @@ def _judge(options, settings, table, out, topic):
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
     for direction in result.calibration.undetermined:
         out.print(f'needs: {direction["needs"]}  ({", ".join(direction["parameters"])})', soft_wrap=True)
-    return exit_code(result)
+    return exit_code(result.calibration)

@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import gather_by_hand
-from imu_calibration.by_hand.workflow import document_of_hand, read_by_hand, reference_gravity, result_by_hand
+from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.workflow import hand_result, read_by_hand
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.from_solution import document, preflight_statistics
+from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.named_models import BARE, parse_effects
+from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.units import for_people, significant
@@ -30,12 +30,12 @@ class DiagnosisResult:
     """What was found."""
     calibration: Calibration
     """The extended calibration; the baseline's when nothing was found."""
-    solution: object
-    """Solution of the extended model."""
-    table: object
-    """The Table."""
     tolerances: np.ndarray
     """Tolerance of each parameter of the extended model."""
+    needed: dict[str, tuple[str, float]]
+    """As in `CalibrationResult`."""
+    observations: str
+    """What the data consist of: 'windows' or 'poses'."""
     options: CalibrationOptions
     """What was asked for."""
 
@@ -75,8 +75,9 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     windows = collect_windows(source(), table, options)
     diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
     tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
-    calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, provenance)
-    return DiagnosisResult(diagnosis, calibration, diagnosis.solution, table, tolerances, options)
+    needed = motions_needed(diagnosis.solution, tolerances, table)
+    calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, needed, provenance)
+    return DiagnosisResult(diagnosis, calibration, tolerances, needed, baseline.observations, options)
 
 
 def baseline_options(options):
@@ -84,7 +85,7 @@ def baseline_options(options):
     return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
 
 
-def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, provenance=None, progress=None):
+def diagnose_without_table(source, options=CalibrationOptions(), provenance=None, progress=None):
     """
     Calibrate a recording by hand, say what the model gets wrong and why, and extend it (see `diagnosis.by_hand`).
 
@@ -94,8 +95,6 @@ def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, p
         Returns an iterator of SampleBlock.
     options : CalibrationOptions
         The model to start from; where nothing is asked for, bias and matrix alone.
-    gravity : float, optional
-        Local gravity, m/s^2.
     provenance, progress : optional
         As in `diagnose_recording`.
 
@@ -104,17 +103,13 @@ def diagnose_without_table(source, options=CalibrationOptions(), gravity=None, p
     DiagnosisResult
 
     """
-    preflight = Preflight(gravity, options.nominal)
+    options = replace(options, accelerometer_model=options.accelerometer_model or BARE, gyroscope_model=options.gyroscope_model or BARE)
+    preflight = Preflight(options.gravity, options.nominal)
     recording = read_by_hand(preflight.watch(source()), options.nominal)
-    value, spread = reference_gravity(gravity)
     data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-    names = {sensor: parse_effects(sensor, text or BARE, catalogue=options.catalogue) for sensor, text in zip(SENSORS, (options.accelerometer_model, options.gyroscope_model))}
-    found = diagnose_by_hand(data, value, spread, tolerances=options.tolerances, **names,
-                             catalogue=options.catalogue, progress=_percent(progress) if progress else None)
-    document_of, limits = document_of_hand(found.hand, recording.gathered, len(recording.imu), options.tolerances, provenance)
-    calibration = result_by_hand(document_of, found.hand, recording.gathered, limits, options).calibration
-    calibration = replace(calibration, statistics=calibration.statistics | preflight_statistics(preflight.findings))
-    return DiagnosisResult(found.diagnosis, calibration, found.hand, None, limits, options)
+    found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
+    result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings)
+    return DiagnosisResult(found.diagnosis, result.calibration, result.tolerances, result.needed, result.observations, options)
 
 
 def collect_windows(blocks, table, options=CalibrationOptions()):

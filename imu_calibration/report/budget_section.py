@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from imu_calibration.calibration.error_budget import error_budget
 from imu_calibration.report.figures import INK, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.report.observability_section import short_name
@@ -15,7 +14,7 @@ LOWEST = 1e-5
 
 def budget_section(result):
     """Return the figure, the rows (largest component of each effect) and what was assumed."""
-    budget = error_budget(result)
+    budget = result.error_budget()
     return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget),
                            'Error budget of each effect by cause, in tolerances'),
             'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],

@@ -1,7 +1,6 @@
 """The report of a calibration: the verdict first, then everything that supports it."""
 
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import judge
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -12,7 +11,6 @@ from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import UNIT, residual_section
-from imu_calibration.report.window_errors import window_errors
 from imu_calibration.report.worked_sample import worked_sample
 
 
@@ -27,14 +25,14 @@ def calibration_report(result):
     result : CalibrationResult
 
     """
-    errors = window_errors(result)
+    errors = result.window_errors()
     at_rest, moving = reading_tables(result, errors)
     navigation = navigation_section(result, errors)
-    return render('calibration.html', title='IMU calibration', verdict=judge(result.calibration, result.tolerances),
+    return render('calibration.html', title='IMU calibration', verdict=result.verdict,
                   facts=recording_facts(result), tiles=tiles(result, errors, navigation), groups=parameter_groups(result),
                   sample=worked_sample(result), derived=derived_section(result), residuals=residual_section(result, errors),
                   observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
-                  moving=moving, budget=budget_section(result), origin=origin_section(result), by_hand=result.table is None)
+                  moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
 
 
 def tiles(result, errors, navigation):

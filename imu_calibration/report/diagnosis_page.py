@@ -14,6 +14,8 @@ from imu_calibration.units import for_people
 BINS = 16
 FEW = 200
 """Below this number of points the effect is drawn against its own prediction, with points that can be seen."""
+SPAN = {'windows': 'over 0.25 s', 'poses': 'of each pose'}
+"""What a point of a residual over time stands for."""
 CLEAR = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
@@ -29,14 +31,13 @@ def diagnosis_report(result):
     """
     diagnosis = result.diagnosis
     rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
-    by_hand = result.table is None
     word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
     return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests),
                   lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
                   traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
                   rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], not_testable=list(diagnosis.not_testable),
-                  groups=parameter_groups(result), by_hand=by_hand, windows=diagnosis.windows, locked=diagnosis.locked,
+                  groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
 
 
@@ -107,8 +108,8 @@ def draw_finding(diagnosis, finding, number):
 
 def draw_over_time(result):
     """Return the size of the residuals over time, before and after the extension, as SVG."""
-    over = 'of each pose' if result.table is None else 'over 0.25 s'
-    return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, over), 'Residuals over time before and after the extension')
+    return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, SPAN[result.observations]),
+                'Residuals over time before and after the extension')
 
 
 def variables(traces):

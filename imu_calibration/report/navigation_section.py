@@ -119,12 +119,9 @@ def _constant_growth(time, variances, gravity):
 
 def noise_densities(result):
     """Return the densities of accelerometer and gyroscope noise at low frequency, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
-    if result.table is None:
-        period = float(result.solution.statistics['period'])
-    else:
-        period = float(np.median([row.duration / max(row.count - 1, 1) for row in result.gathered.accumulator.rows]))
     found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
-    return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * period)) for f in found]
+    return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * result.period))
+            for f in found]
 
 
 def _growth(time, runs):
@@ -138,8 +135,6 @@ def motion_growth(result):
 
     The truth is that of the table, carried to the origin that the calibration compensates to. Noise is included.
     """
-    if result.table is None:
-        return None
     windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= SHORTEST][:MOST_POSES]
     if not windows:
         return None

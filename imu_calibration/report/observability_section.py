@@ -3,8 +3,6 @@
 import numpy as np
 
 from imu_calibration.effects.base import SHORT
-from imu_calibration.estimation.observability import tolerance_scaled_singular_values
-from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text
 
@@ -19,17 +17,10 @@ def observability_section(result):
     figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live),
                             'Standard deviation over tolerance of every parameter'),
                'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), 'Correlation between the parameters')}
-    if result.table is not None:
-        singular = singular_values(result)
-        figures['singular'] = draw('singular', (8.6, 2.5), _Singular(singular), 'Singular values of the design in units of the tolerances')
+    if len(result.singular_values):
+        figures['singular'] = draw('singular', (8.6, 2.5), _Singular(result.singular_values),
+                                   'Singular values of the design in units of the tolerances')
     return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
-
-
-def singular_values(result):
-    """Return the tolerance-scaled singular values of the design; directions that the gauge fixes by convention are left out."""
-    convention = make_prior(result.solution.model).root[len(result.tolerances):]
-    values = tolerance_scaled_singular_values(result.solution.information + convention.T @ convention, result.tolerances)
-    return values[len(convention):]
 
 
 def directions(calibration):

@@ -1,6 +1,9 @@
 """Where the calibration comes from: recording, table, settings, what was used and what was dropped."""
 
+from functools import singledispatch
+
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.report.numbers import fixed, in_unit, text
 from imu_calibration.settings import describe
 
@@ -12,18 +15,12 @@ def recording_facts(result):
     facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'),
              ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
              ('length', _duration(conditions.get('duration_s'))), ('frame', calibration.frame_id or 'not named'),
-             ('reference', _reference(result.table))]
+             ('reference', result.reference)]
     if conditions.get('largest_rate'):
         facts.append(('fastest turn', in_unit(conditions['largest_rate'], 'rad/s')))
     if conditions.get('temperature_range_c'):
         facts.append(('temperature', ' to '.join(fixed(t, 1) for t in conditions['temperature_range_c']) + ' °C'))
     return facts
-
-
-def _reference(table):
-    if table is None:
-        return 'gravity, by hand'
-    return f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})'
 
 
 def _duration(seconds):
@@ -43,7 +40,7 @@ def origin_section(result):
     bags = [(bag['name'], bag['sha256']) for bag in calibration.provenance.get('bags') or []]
     return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()),
             'warnings': [found['text'] for found in statistics.get('preflight') or []], 'settings': _settings(result.options),
-            'table': _table(result.table), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
+            'table': table_rows(result), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
             'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing')
                       for sensor in ('accelerometer', 'gyroscope', 'reference')]}
 
@@ -55,9 +52,15 @@ def _settings(options):
             for name, default, unit, meaning, _, _ in describe(options.windows)]
 
 
-def _table(table):
-    if table is None:
-        return []
+@singledispatch
+def table_rows(_result):
+    """Return (what, value) of the table; nothing for a calibration without one."""
+    return []
+
+
+@table_rows.register
+def _(result: TableResult):
+    table = result.table
     rows = [(f'joint {joint.name}', f'axis ({", ".join(text(a) for a in joint.axis)})' +
              (f', at ({", ".join(text(a) for a in joint.xyz)}) m' if any(joint.xyz) else '')) for joint in table.joints]
     rows += [('up', f'({", ".join(text(a) for a in table.up)})'),

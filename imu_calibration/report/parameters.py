@@ -3,8 +3,6 @@
 import numpy as np
 
 from imu_calibration.calibration.status import DETERMINED, HELD
-from imu_calibration.estimation import observability
-from imu_calibration.estimation.prior import make_prior
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
@@ -59,16 +57,9 @@ def _why(calibration, index, share, needs):
 
 def motions_needed(result):
     """Return parameter name -> the motion that would serve it best, for all that are not determined."""
-    calibration = result.calibration
-    if all(status == DETERMINED for status in calibration.status):
-        return {}
-    if result.table is None:
-        return {name: d['needs'] for d in calibration.undetermined for name in d['parameters']}
-    needed = observability.needed_motions(result.solution, result.tolerances, result.table.gravity_value,
-                                          make_prior(result.solution.model).sd)
     return {name: motion if not np.isfinite(sd)
             else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'
-            for name, (motion, sd) in needed.items()}
+            for name, (motion, sd) in result.needed.items()}
 
 
 def _tolerance(result, name):

@@ -11,7 +11,7 @@ LEVEL = 0.02
 
 def reading_tables(result, errors):
     """Return two lists of lines: at rest (Table 2) and in rotation (Table 4)."""
-    gravity = result.table.gravity_value if result.table is not None else result.solution.gravity
+    gravity = result.gravity
     true = errors.true['accelerometer']
     chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL) & (errors.kind != 'dynamic')
     lines = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],

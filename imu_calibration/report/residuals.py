@@ -67,10 +67,10 @@ def autocorrelation(result):
 
     Each window's residual is taken about its own mean; windows are weighted by their length.
     """
-    model, values, table = result.solution.model, result.solution.values, result.table
     windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:
         return {}
+    model, values, table = result.solution.model, result.solution.values, result.table
     typical = np.median([len(w) for w in windows])
     windows = [w for w in windows if len(w) >= typical][:MOST_WINDOWS]
     period = float(np.median([w.period for w in windows]))

@@ -54,15 +54,10 @@ def _steps(result, sample, corrected):
 
 def _sample(result):
     """Return the sample that is carried through: the fastest of the kept ones, else a pose."""
-    kept = [window for window in result.gathered.kept if len(window.motion) == len(window.time)] if result.table is not None else []
+    kept = [window for window in result.gathered.kept if len(window.motion) == len(window.time)]
     if kept:
         return _moving_sample(result, kept)
-    rows = result.solution.poses if result.table is None else None
-    if rows is not None:
-        force, rate = rows.force[0], rows.rate[0]
-    else:
-        row = result.gathered.accumulator.rows[0]
-        force, rate = (row.sensors[s].mean[-3:] for s in ('accelerometer', 'gyroscope'))
+    force, rate = result.first_rest()
     return SimpleNamespace(force=force, rate=rate, alpha=np.zeros(3), temperature=_reference_temperature(result), true_force=None,
                            true_rate=None, where='the mean of the first pose at rest')
 

@@ -13,7 +13,7 @@ from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.calibrate import calibrate as calibrate_on_table
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code
-from imu_calibration.calibration.verdict import Verdict, judge
+from imu_calibration.calibration.verdict import Verdict
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
@@ -35,21 +35,20 @@ class Calibrated:
         """The calibration: compensates arrays, and is what `save` writes."""
         return self.result.calibration
 
-    @cached_property
+    @property
     def verdict(self) -> Verdict:
         """'good', 'weak' or 'bad' with reasons and next steps."""
-        return judge(self.calibration, self.result.tolerances)
+        return self.result.verdict
 
     @property
     def exit_code(self) -> int:
         """0 when every requested parameter is determined and nothing was lost, else 3."""
-        return exit_code(self.result)
+        return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:
         """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
         from imu_calibration.report.residuals import draw_windows
-        from imu_calibration.report.window_errors import window_errors
-        return Drawing(draw_windows(window_errors(self.result), sensor))
+        return Drawing(draw_windows(self.result.window_errors(), sensor))
 
     @cached_property
     def report(self) -> str:
@@ -111,7 +110,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: str | 
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
         provenance = hashing.submit(provenance_of, recordings, kept(choices))
         if table is None:
-            result = calibrate_without_table(sources, options, choices.get('gravity'))
+            result = calibrate_without_table(sources, options)
         else:
             result = _side_by_side(sources, table, options, recordings, jobs)
         calibration = result.calibration

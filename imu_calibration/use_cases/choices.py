@@ -64,9 +64,9 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     catalogue = choices.get('catalogue', CATALOGUE)
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
-    models = (choices.get(name) for name in ('accelerometer_model', 'gyroscope_model', 'reference_model'))
-    return CalibrationOptions(*models, read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
-                              nominal_of(choices.get('nominal')), catalogue)
+    return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
+                              read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
+                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue)
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class Diagnosed:
     @property
     def exit_code(self) -> int:
         """0 when every requested parameter is determined and nothing was lost, else 3."""
-        return exit_code(self.result)
+        return exit_code(self.calibration)
 
     def plot(self, number: int = 1) -> Drawing:
         """Return the residual against the cause of a finding, before and after; 0, or without findings: residuals over time."""
@@ -102,5 +102,5 @@ def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Ta
     provenance = provenance_of([recording], kept(choices))
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:
-            return Diagnosed(diagnose_without_table(source, options, choices.get('gravity'), provenance, advance))
+            return Diagnosed(diagnose_without_table(source, options, provenance, advance))
         return Diagnosed(diagnose_recording(source, table, options, provenance, advance))

@@ -1,11 +1,12 @@
 """What the model of a calibration by hand gets wrong: the same search, on poses and turns instead of windows on a table."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import ByHandSettings, HandCalibration, solve_by_hand
+from imu_calibration.by_hand.calibrate import HandCalibration, solve_by_hand
 from imu_calibration.by_hand.model import possible_by_hand
+from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
 from imu_calibration.diagnosis.by_hand.result import as_solution, rest_of, traces_of
 from imu_calibration.diagnosis.by_hand.rows import build_rows
@@ -14,7 +15,6 @@ from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import candidates_of
 from imu_calibration.diagnosis.separating_motion import motions_of
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import NotObservableError
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
@@ -68,8 +68,7 @@ class _Inquiry:
         return removed / (removed + rest) if removed > 0 else 0.0
 
 
-def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), tolerances=None, accelerometer=BASE, gyroscope=BASE, progress=None,
-                     catalogue=CATALOGUE):
+def diagnose_by_hand(data, options=HandOptions(), progress=None):
     """
     Say what a calibration by hand gets wrong, and why.
 
@@ -81,17 +80,10 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
     ----------
     data : HandData
         From `gather_by_hand`.
-    gravity, gravity_sd : float
-        Reference, m/s^2.
-    settings : ByHandSettings
-    tolerances : dict, optional
-        As in `calibrate_by_hand`.
-    accelerometer, gyroscope : tuple of str
-        The baseline.
+    options : HandOptions
+        Reference, tolerances, and the effects of the baseline: bias and matrix where none are asked for.
     progress : callable, optional
         Called with the share that is done.
-    catalogue : Catalogue
-        The effects that there are.
 
     Returns
     -------
@@ -108,8 +100,8 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
     if len(poses.start) < 9 + SPARE:
         raise NotObservableError(f'a diagnosis by hand needs at least {9 + SPARE} poses held still, so that some can be held out, '
                                  f'{len(poses.start)} were found; hold the IMU still in more attitudes')
-    baseline = solve_by_hand(poses, data.turns, gravity, gravity_sd, settings, data.statistics, tolerances, accelerometer, gyroscope,
-                             catalogue=catalogue)
+    options = replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE)
+    baseline = solve_by_hand(data, options)
     effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants)
@@ -126,7 +118,7 @@ def diagnose_by_hand(data, gravity, gravity_sd=0.0, settings=ByHandSettings(), t
         if not poor:
             break
         named.remove(poor[-1])
-    hand = _extended(baseline, data, named, gravity_sd, settings, tolerances, constants, inquiry)
+    hand = _extended(baseline, data, named, options, constants, inquiry)
     result = _assembled(baseline, hand, inquiry, named, held_out, not_testable)
     report(1.0)
     return HandDiagnosis(result, hand)
@@ -211,7 +203,7 @@ def _gain(inquiry, held_out, before, after, sensor):
     return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))
 
 
-def _extended(baseline, data, named, gravity_sd, settings, tolerances, constants, inquiry):
+def _extended(baseline, data, named, options, constants, inquiry):
     if not named:
         return baseline
     names = {s: getattr(baseline.model.model, s) + tuple(q.name for q in named if q.sensor == s) for s in SENSORS}
@@ -222,8 +214,7 @@ def _extended(baseline, data, named, gravity_sd, settings, tolerances, constants
             values = inquiry.evidence.fit(used)[0]
             amplitude = [values[used.index(k)] for k in question.parameters]
             point[question.name] = np.array([*amplitude, constants[int(question.label.split('@')[1])]])
-    return solve_by_hand(baseline.poses, data.turns, baseline.gravity, gravity_sd, settings, data.statistics, tolerances, names['accelerometer'],
-                         names['gyroscope'], point, baseline.model.model.catalogue)
+    return solve_by_hand(data, replace(options, **names), point)
 
 
 def _assembled(baseline, hand, inquiry, named, held_out, not_testable):

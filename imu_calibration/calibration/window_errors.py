@@ -1,10 +1,10 @@
-"""Errors of window means before and after calibration, on a table and by hand: what most of the report is drawn from."""
+"""Errors of window means before and after calibration: what most of the report is drawn from."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.estimation.accumulator import restrict
 
@@ -32,41 +32,6 @@ class WindowErrors:
         """Return the root mean square error of 'before' or 'after', over windows of one kind or all."""
         errors = getattr(self, which)[sensor][(self.kind == kind) if kind else slice(None)]
         return float(np.sqrt(np.mean(errors**2))) if errors.size else float('nan')
-
-
-def window_errors(result):
-    """Return the WindowErrors of a calibration."""
-    return _by_hand(result) if result.table is None else _on_table(result)
-
-
-def _on_table(result):
-    found, calibration, rows = window_residuals(result), result.calibration, result.gathered.accumulator.rows
-    kind, count = np.array(found['kind']), np.array(found['count'], float)
-    parts = {name: {} for name in ('measured', 'true', 'before', 'after', 'floor')}
-    for sensor in SENSORS:
-        true = np.array([row.sensors[sensor].mean[result.gathered_model.columns_of(sensor, Role.LINEAR)] for row in rows])
-        noise = result.solution.noise[sensor]
-        parts['measured'][sensor], parts['true'][sensor] = found[sensor]['measured'], true
-        parts['before'][sensor] = found[sensor]['before']
-        parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(calibration.of(sensor, Role.LINEAR)).T
-        parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
-    return WindowErrors(found['time'], kind, **parts)
-
-
-def _by_hand(result):
-    hand = result.solution
-    poses, force, rate = hand.poses, hand.poses.force, hand.poses.rate
-    true = hand.gravity * hand.state.up
-    corrected_force, corrected_rate = hand.compensate(force, rate)
-    duration = result.gathered.duration
-    samples = max(int(poses.stop[-1]), 1)
-    time = (poses.start + poses.stop) / 2 * duration / max(samples - 1, 1)
-    scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]
-    zero = np.zeros_like(rate)
-    return WindowErrors(time, np.full(len(force), 'static'), {'accelerometer': force, 'gyroscope': rate},
-                        {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
-                        {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
-                        {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
 
 
 def window_residuals(result):

@@ -1,0 +1,82 @@
+"""What a calibration by hand estimates, from which reference, and its numbers."""
+
+from dataclasses import dataclass, field
+
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+from imu_calibration.effects.named_models import parse_effects
+from imu_calibration.settings import setting
+
+
+@dataclass(frozen=True)
+class ByHandSettings:
+    """Numbers for calibration by hand."""
+
+    pose_apart: float = setting(0.2, 'rad', 'attitudes closer than this count as one pose', (0.001, 1.5), '')
+    turn_maximum: float = setting(30.0, 's', 'longer stretches between two poses are not used for the gyroscope', (0.5, 3600.0),
+                                  'too small: few turns; too large: gyroscope drift and clipping enter')
+    gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
+                         'too large: rotation is lost in holes and shows as turn scatter')
+    pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
+    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it',
+                                   (0.0, 1.0), '')
+    turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
+    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0),
+                                   'too small: scales too sure')
+    known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
+                                   'too small: misalignments too sure')
+    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it",
+                                 symptom="off: it shows as drift and turn scatter")
+
+
+@dataclass(frozen=True)
+class KnownTurn:
+    """A turn of known angle about a body axis that stays put."""
+
+    start: int
+    """First sample."""
+    stop: int
+    """After the last sample."""
+    axis: tuple
+    """Unit vector in the sensor frame; turns counter-clockwise seen from its tip."""
+    angle: float
+    """rad."""
+
+
+@dataclass(frozen=True)
+class HandOptions:
+    """What is handed down from the use cases to the equations."""
+
+    gravity: float = STANDARD_GRAVITY
+    """Local gravity, m/s^2."""
+    gravity_sd: float = 0.0
+    """Its standard deviation, m/s^2."""
+    settings: ByHandSettings = ByHandSettings()
+    """Numbers."""
+    tolerances: dict = field(default_factory=dict)
+    """{sensor: {effect: sd that is good enough}}; the catalogue's where not given."""
+    accelerometer: tuple[str, ...] | None = None
+    """Effects to estimate; None: bias and matrix."""
+    gyroscope: tuple[str, ...] | None = None
+    """The same; None: bias and matrix, and the g-sensitivity when the settings and the poses say so."""
+    catalogue: Catalogue = CATALOGUE
+    """Where the effects are declared."""
+
+
+def hand_options(options: CalibrationOptions) -> HandOptions:
+    """
+    Return what is asked for, by hand: the standard gravity with what it may be off by where the local one is not known.
+
+    Raises
+    ------
+    InputError
+        When an effect does not exist.
+
+    """
+    asked = (options.accelerometer_model, options.gyroscope_model)
+    names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
+             for sensor, text in zip(SENSORS, asked, strict=True)}
+    gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, 0.0)
+    return HandOptions(gravity, spread, tolerances=options.tolerances, **names, catalogue=options.catalogue)

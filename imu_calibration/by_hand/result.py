@@ -1,0 +1,74 @@
+"""The result of a calibration by hand."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import HandCalibration
+from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import Role
+from imu_calibration.segmentation.window import WindowKind
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandResult(CalibrationResult):
+    """A calibration by hand with what a report needs beside it."""
+
+    hand: HandCalibration
+    """Parameters, poses, noise and residuals."""
+
+    observations: ClassVar[str] = 'poses'
+
+    @property
+    def reference(self) -> str:
+        """Gravity."""
+        return 'gravity, by hand'
+
+    @property
+    def gravity(self) -> float:
+        """The reference, m/s^2."""
+        return self.hand.gravity
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        return float(self.hand.statistics['period'])
+
+    @property
+    def singular_values(self) -> np.ndarray:
+        """None: the directions of the poses are estimated along."""
+        return np.zeros(0)
+
+    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean specific force and rate of the first pose, each shape (3,)."""
+        return self.hand.poses.force[0], self.hand.poses.rate[0]
+
+    def window_errors(self) -> WindowErrors:
+        """Return the errors of the poses before and after: beside gravity along its estimated direction, and beside rest."""
+        hand, poses = self.hand, self.hand.poses
+        force, rate = poses.force, poses.rate
+        true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
+        corrected_force, corrected_rate = hand.compensate(force, rate)
+        samples = max(int(poses.stop[-1]), 1)
+        time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
+        scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]
+        return WindowErrors(time, np.full(len(force), WindowKind.STATIC), {'accelerometer': force, 'gyroscope': rate},
+                            {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
+                            {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
+                            {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
+
+    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+        """Return noise and gravity: there is no other reference. The gravity of a default value is in the sd already."""
+        model, values = self.calibration.model, self.calibration.values
+        noise = 'noise, scatter of poses and turns, as this recording shows them'
+        if self.gravity == STANDARD_GRAVITY:
+            noise += ', and the gravity, which was not given'
+            return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.sd}, {'noise': noise})
+        part, gravity = model.part('accelerometer', Role.LINEAR), np.zeros(len(values))
+        gravity[part] = np.abs(values[part]) * errors.gravity / self.gravity
+        return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.sd, 'gravity': gravity},
+                           {'noise': noise, 'gravity': f'gravity known to {errors.gravity:.2g} m/s²'})
