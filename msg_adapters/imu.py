@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imu_calibration.samples import ImuSamples
-from msg_adapters.layout import Layout, overlapping
+from msg_adapters.layout import MessageLayout, overlapping
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -71,11 +71,11 @@ def patch_imu(data, frame_id=None, **fields):
 
 
 def find_imu_layout(data):
-    """Return the Layout of a serialized Imu message (raises MessageError)."""
+    """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
     header, body = _open_message(data)
     offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
-    return Layout(header.order, len(data), bytes(data), fixed, offsets, (header.frame.decode(errors='replace'),))
+    return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame.decode(errors='replace'),))
 
 
 def decode_imu(layout, packed):
@@ -96,7 +96,7 @@ def patch_imu_group(layout, packed, fields, frame_id=None):
 
     Parameters
     ----------
-    layout, packed : Layout, Packed
+    layout, packed : MessageLayout, Packed
         The messages.
     fields : dict
         Field name -> values, shape (n, count).

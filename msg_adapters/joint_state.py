@@ -5,7 +5,7 @@ import struct
 import numpy as np
 
 from imu_calibration.samples import JointSamples
-from msg_adapters.layout import Layout
+from msg_adapters.layout import MessageLayout
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, header_stamp_ns, open_header
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
@@ -16,7 +16,7 @@ NO_POSITION = 'JointState without a position for every name'
 
 def find_joint_layout(data):
     """
-    Return the Layout of a serialized JointState message; `names` are the joint names.
+    Return the MessageLayout of a serialized JointState message; `names` are the joint names.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def find_joint_layout(data):
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
-    return Layout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
+    return MessageLayout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
 
 
 def decode_joints(layout, packed, joint_names):

@@ -47,7 +47,7 @@ class Packed:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class MessageLayout:
     """Where the numbers of a message lie, and which bytes must be equal for another message to share it."""
 
     order: str
@@ -98,11 +98,11 @@ def group_by_layout(packed, find_layout):
     packed : Packed
         Messages of one topic.
     find_layout : callable
-        Message bytes -> Layout; raises MessageError when the bytes are not such a message.
+        Message bytes -> MessageLayout; raises MessageError when the bytes are not such a message.
 
     Returns
     -------
-    groups : list of (Layout, index, Packed)
+    groups : list of (MessageLayout, index, Packed)
         Integer indices in ascending order per group, and these messages.
     rest : ndarray
         Indices of the messages that no group holds: broken ones, and what is left after `MAX_LAYOUTS`.

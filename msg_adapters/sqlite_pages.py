@@ -1,7 +1,7 @@
 """
 Table leaves of an SQLite file, many pages at once.
 
-Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). Rows that do not fit
+Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). MessageRows that do not fit
 into one page are left to SQL; a damaged page costs its own rows only.
 """
 
@@ -23,8 +23,8 @@ MARGIN = 64
 """Zeros behind the pages, so that six varints never reach behind the buffer."""
 
 
-class Rows(NamedTuple):
-    """Rows of the table `messages`, in the order of their ids."""
+class MessageRows(NamedTuple):
+    """MessageRows of the table `messages`, in the order of their ids."""
 
     buffer: np.ndarray
     """Pages, uint8."""
@@ -109,7 +109,7 @@ class PageReader:
             sensible &= self._ascending(rows.row_id, sensible)   # other tables, and old copies of pages
         else:
             self.damaged_rows += int((~sensible).sum())
-        return rows if sensible.all() else Rows(buffer, *(column[sensible] for column in rows[1:]))
+        return rows if sensible.all() else MessageRows(buffer, *(column[sensible] for column in rows[1:]))
 
     def _ascending(self, row_id, sensible):
         """Return where the row ids go on behind the largest one before."""
@@ -181,7 +181,7 @@ def _read_into(descriptor, target, offset):
 
 
 def _parse_cells(buffer, cell, page_end, largest):
-    """Return (Rows, mask of the sensible ones) for the table cells at `cell`, which must end before `page_end`."""
+    """Return (MessageRows, mask of the sensible ones) for the table cells at `cell`, which must end before `page_end`."""
     payload_size, position = _varint(buffer, cell)
     row_id, position = _varint(buffer, position)
     header_size, field = _varint(buffer, position)
@@ -198,7 +198,7 @@ def _parse_cells(buffer, cell, page_end, largest):
     inside = payload_size <= largest
     sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (field == value) & (value <= page_end)
     sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
-    return Rows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]), sensible
+    return MessageRows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]), sensible
 
 
 def _varint(buffer, position):

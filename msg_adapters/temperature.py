@@ -3,20 +3,21 @@
 import numpy as np
 
 from imu_calibration.samples import TemperatureSamples
-from msg_adapters.layout import Layout
+from msg_adapters.layout import MessageLayout
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 
 
 def find_temperature_layout(data):
-    """Return the Layout of a serialized Temperature message (raises MessageError)."""
+    """Return the MessageLayout of a serialized Temperature message (raises MessageError)."""
     header = open_header(data)
     body = aligned(header.end, 8)
     if len(data) < body + 16:
         raise MessageError(f'a Temperature message with its doubles at byte {body} has {body + 16} bytes, got {len(data)}')
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
-    return Layout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)}, (header.frame.decode(errors='replace'),))
+    return MessageLayout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)},
+                         (header.frame.decode(errors='replace'),))
 
 
 def decode_temperature(layout, packed):

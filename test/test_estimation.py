@@ -17,7 +17,7 @@ from imu_calibration.samples import SampleBlock
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, gauss_markov
+from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -32,7 +32,7 @@ FULL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect', 'lever_
 def session():
     """Windows of a short full session, without noise; their outputs are replaced by each test."""
     profile = make_profile('quick', 0, TABLE)
-    quiet = NoiseModel(accel_density=1e-5, gyro_density=1e-6)
+    quiet = SimulatedNoise(accel_density=1e-5, gyro_density=1e-6)
     imu, joints, _ = simulate(SensorModel(), SensorModel().start(), TABLE, profile, SimulationOptions(noise=quiet), 0)
     gatherer = MotionGatherer(TABLE)
     return gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()

@@ -138,6 +138,15 @@ def test_every_package_says_what_comes_in_what_goes_out_and_what_to_read_first()
             assert 'In: ' in text and 'Out: ' in text and 'Read `' in text, folder.name
 
 
+def test_a_class_name_means_one_thing():
+    homes = {}
+    for path in [*modules('imu_calibration'), *modules('msg_adapters')]:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                homes.setdefault(node.name, []).append(module_name(path))
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
+
+
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
     assert {'imu_calibration.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names

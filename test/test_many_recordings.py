@@ -14,7 +14,7 @@ from imu_calibration.samples import SampleBlock
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import NoiseModel
+from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -29,7 +29,7 @@ SDS = {'accelerometer': 0.01, 'gyroscope': 0.001}
 def motion():
     """Windows of a short session and their columns; each trial puts outputs on them."""
     profile = make_profile('quick', 0, TABLE)
-    options = SimulationOptions(noise=NoiseModel(accel_density=1e-5, gyro_density=1e-6))
+    options = SimulationOptions(noise=SimulatedNoise(accel_density=1e-5, gyro_density=1e-6))
     imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile, options, 0)
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()

@@ -5,7 +5,7 @@ import pytest
 
 from imu_calibration.simulation.sensor_noise import (
     GRADES,
-    NoiseModel,
+    SimulatedNoise,
     add_imu_noise,
     gauss_markov,
     jitter_stamps,
@@ -16,7 +16,7 @@ from imu_calibration.simulation.sensor_noise import (
 
 
 def test_white_noise_integrates_to_a_random_walk_of_its_density():
-    model = NoiseModel(accel_density=2e-3, gyro_density=1e-4)
+    model = SimulatedNoise(accel_density=2e-3, gyro_density=1e-4)
     force, rate = add_imu_noise(np.zeros((40000, 3)), np.zeros((40000, 3)), model, 200.0, np.random.default_rng(1))
     for noise, density in ((force, 2e-3), (rate, 1e-4)):
         # 1200 integrals over 0.5 s: 2 % sampling error of their sd.
@@ -36,9 +36,9 @@ def test_bias_wander_is_stationary_with_its_correlation_time():
 
 def test_no_noise_changes_nothing():
     force = np.random.default_rng(3).normal(size=(10, 3))
-    for got in add_imu_noise(force, force, NoiseModel(), 100.0, np.random.default_rng(4)):
+    for got in add_imu_noise(force, force, SimulatedNoise(), 100.0, np.random.default_rng(4)):
         np.testing.assert_array_equal(got, force)
-    np.testing.assert_array_equal(read_encoders(force, NoiseModel(), np.random.default_rng(4)), force)
+    np.testing.assert_array_equal(read_encoders(force, SimulatedNoise(), np.random.default_rng(4)), force)
 
 
 def test_resolution():

@@ -14,7 +14,7 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.joint_trajectory import TableMotion, trajectory_from
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import NoiseModel
+from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, simulate
 from msg_adapters.write import write_session
 
@@ -72,7 +72,7 @@ def test_a_profile_that_repeats_and_a_trajectory_that_takes_over_leave_no_jump()
 
 def test_blocks_without_noise_are_the_offline_simulation():
     _, _, values, model = make_session(2, 100.0, seconds=1.0)
-    options = SimulationOptions(100.0, 50.0, NoiseModel(), temperature_start_c=20.0)
+    options = SimulationOptions(100.0, 50.0, SimulatedNoise(), temperature_start_c=20.0)
     profile = make_profile('quick', 1, TABLE)
     expected = simulate(model, values, TABLE, profile, options)
     live = LiveSimulation(model, values, TABLE, TableMotion(profile, 3), options, start_ns=int(expected[0].stamp_ns[0]))
@@ -89,7 +89,7 @@ def test_blocks_without_noise_are_the_offline_simulation():
 
 def test_the_wander_goes_on_from_block_to_block():
     _, _, values, model = make_session(2, 100.0, seconds=1.0)
-    options = SimulationOptions(50.0, 1.0, NoiseModel(gyro_instability=1e-3, correlation_time=5.0))
+    options = SimulationOptions(50.0, 1.0, SimulatedNoise(gyro_instability=1e-3, correlation_time=5.0))
     live = LiveSimulation(model, values, TABLE, TableMotion(None, 3), options, seed=4)
     rate = np.concatenate([live.take(until).imu.rate_s for until in np.arange(5.0, 601.0, 5.0)])
     drift = rate - rate.mean(axis=0)

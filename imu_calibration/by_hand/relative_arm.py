@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, make_windows
 from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.relative_arm_fit import Rows, fit_arm, jackknife_covariance, lever_rows, response
+from imu_calibration.by_hand.relative_arm_fit import ArmRows, fit_arm, jackknife_covariance, lever_rows, response
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import InputError, NotObservableError
@@ -270,7 +270,7 @@ def _build_rows(a, b, rotation, delay, settings):
     # half of the difference of two gyroscopes is the error of their mean, as far as they err independently
     noise = np.mean((alpha_b - alpha_a)[keep]**2) / 4
     force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
-    return Rows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
+    return ArmRows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
                 (later - sooner) / (2 * lag), _products(rate_a.select(keep).slope, a.rate), force_a.select(keep).slope(a.force),
                 force, float(noise), float(np.mean(~free[moving])), length)
 

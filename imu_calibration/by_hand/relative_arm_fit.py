@@ -13,7 +13,7 @@ TAIL_DOF = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ArmRows:
     """Integrated equations of the windows that show the arm."""
 
     centres: np.ndarray
@@ -82,7 +82,7 @@ def fit_arm(rows):
 
     Parameters
     ----------
-    rows : Rows
+    rows : ArmRows
 
     Returns
     -------

@@ -17,7 +17,7 @@ LOOSE = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class HandSolution:
     """Joint estimate."""
 
     state: State
@@ -34,7 +34,7 @@ class Solution:
     """Gauss-Newton steps taken."""
 
 
-def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float, fallback: np.ndarray) -> Solution:
+def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float, fallback: np.ndarray) -> HandSolution:
     """
     Estimate all parameters from poses and turns.
 
@@ -51,7 +51,7 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
 
     Returns
     -------
-    Solution
+    HandSolution
 
     """
     memory, priors = {}, model.priors
@@ -64,7 +64,7 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
     cov = covariance_with_held(factor, ~held, held, priors) + _of_gravity(state.values, gravity_sd / model.gravity)
-    return Solution(state, cov, held, scatter, factor, steps + more)
+    return HandSolution(state, cov, held, scatter, factor, steps + more)
 
 
 def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:

@@ -42,7 +42,7 @@ class Gathered:
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
     findings: tuple = ()
-    """What a look at the recording found before anything was estimated (`preflight.Finding`)."""
+    """What a look at the recording found before anything was estimated (`preflight.finding.CheckFinding`)."""
 
     @property
     def duration(self):

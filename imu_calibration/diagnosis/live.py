@@ -96,15 +96,15 @@ class LiveDiagnosis:
             self.recent.add(windows)
 
     def question(self, live):
-        """Return the Question about the last solution of a `LiveCalibration`, or None while there are too few windows."""
+        """Return the DiagnosisQuestion about the last solution of a `LiveCalibration`, or None while there are too few windows."""
         windows = self.recent.list() + live.open_windows
         if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
             return None
-        return Question(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten)
+        return DiagnosisQuestion(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten)
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class DiagnosisQuestion:
     """What a diagnosis needs, for another thread."""
 
     windows: list

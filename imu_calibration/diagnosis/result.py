@@ -60,7 +60,7 @@ class Diagnosis:
     findings: tuple
     """Findings as found, the strongest first."""
     unexplained: dict
-    """Sensor -> `unexplained.Rest` beside the findings."""
+    """Sensor -> `unexplained.Unexplained` beside the findings."""
     candidates: tuple
     """Every effect that was asked about, strongest first (Candidate)."""
     not_testable: tuple

@@ -18,7 +18,7 @@ ALPHA = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class Unexplained:
     """Structure of one sensor's residual that no effect explains."""
 
     significant: bool
@@ -40,7 +40,7 @@ class Rest:
 
 
 def unexplained(attempt, explained, chosen):
-    """Return sensor -> Rest for a choice of effects."""
+    """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), attempt.search.used(chosen)
     values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
     return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
@@ -57,12 +57,12 @@ def _rest(attempt, explained, sensor, excess, values):
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT and explained.chosen.sum() >= LEAST_WINDOWS)
     if not significant:
-        return Rest(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
+        return Unexplained(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
     if sigma_means <= SIGNIFICANT:
         inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
-        return Rest(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
+        return Unexplained(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
     name, share = correlate(_explanations(recording), residual / noise_sd)
-    return Rest(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
+    return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
 
 
 def correlate(explanations, residual):

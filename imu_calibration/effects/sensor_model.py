@@ -16,7 +16,7 @@ WARP, WARP_LEVER = 'warp:', 'warp_lever:'
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class ColumnLayout:
     """Columns of one sensor: which effects make them and where their coefficients stand."""
 
     effects: tuple
@@ -194,7 +194,7 @@ class SensorModel:
                         widths[WARP_LEVER + effect.name] = 9 * effect.size
             ends = np.cumsum([0, *widths.values()])
             rows = {name: slice(int(a), int(b)) for name, a, b in zip(widths, ends, ends[1:])}
-            self._layouts[sensor] = Layout(tuple(self.concerning(sensor)), groups, rows, int(ends[-1]), self.full_point())
+            self._layouts[sensor] = ColumnLayout(tuple(self.concerning(sensor)), groups, rows, int(ends[-1]), self.full_point())
         return self._layouts[sensor]
 
     @cached_property

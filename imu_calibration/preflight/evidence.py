@@ -40,7 +40,7 @@ class Stream:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class RecordingEvidence:
     """A recording as the checks see it; SI after the nominal scaling, when one was given."""
 
     streams: dict
@@ -88,7 +88,7 @@ class Evidence:
 
 
 class EvidenceGatherer:
-    """Takes blocks and gives the `Evidence`."""
+    """Takes blocks and gives the `RecordingEvidence`."""
 
     def __init__(self, gravity, nominal=None):
         self.gravity, self.nominal = gravity, nominal
@@ -105,14 +105,14 @@ class EvidenceGatherer:
                 self._take(name, self._checks[name].push(samples))
 
     def evidence(self):
-        """Close the streams and return the Evidence."""
+        """Close the streams and return the RecordingEvidence."""
         for name in STREAMS:
             self._take(name, self._checks[name].finish())
         streams = {name: Stream(check.statistics(), *self._steps[name].summary()) for name, check in self._checks.items()
                    if self._steps[name].first_ns is not None}
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
-        return Evidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends, self._temperature_c, self.gravity)
+        return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends, self._temperature_c, self.gravity)
 
     def _take(self, name, pieces):
         for epoch, samples in pieces:

@@ -21,7 +21,7 @@ REFUSE, WARNING, NOTE, GOOD = Severity
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """One line about a recording."""
 
     check: str
@@ -35,7 +35,7 @@ class Finding:
     key: str | None = None
     """What has to be given, a key of `errors.KEYS`."""
 
-    def named(self, name: str) -> 'Finding':
+    def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""
         return replace(self, text=f'{name}: {self.text}')
 

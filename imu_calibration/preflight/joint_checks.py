@@ -7,7 +7,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
-from imu_calibration.preflight.finding import REFUSE, Finding
+from imu_calibration.preflight.finding import REFUSE, CheckFinding
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power say nothing."""
@@ -76,13 +76,13 @@ def _rate_units(moments):
     if not ratio > 0:
         return
     if 40 < ratio < 80:
-        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
+        yield CheckFinding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
                       'convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578', key='nominal')
     elif 1 / 80 < ratio < 1 / 40:
-        yield Finding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
+        yield CheckFinding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
                       'degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
-        yield Finding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
+        yield CheckFinding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
                       'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
 
 
@@ -96,7 +96,7 @@ def _axes(sensor, moments, table):
     if not match.wrong:
         return
     what, whose = WORDS[sensor]
-    yield Finding('handedness', REFUSE, f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
+    yield CheckFinding('handedness', REFUSE, f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
 
 
 def _exchange(match, seen, whose):

@@ -1,6 +1,6 @@
 """Checks of the stamps: what was dropped, gaps, rates, clocks."""
 
-from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, Finding
+from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
 
 NAMES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> what people call it."""
@@ -26,15 +26,15 @@ def stamps(evidence):
         total = found.count + sum(count for reason, count in found.dropped.items() if reason != 'clock reset')
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
-            yield Finding('stamps', REFUSE, f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
+            yield CheckFinding('stamps', REFUSE, f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
                           f'({reasons}); correct the driver and record again')
             continue
         for reason, count in found.dropped.items():
-            yield Finding('stamps', WARNING, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
+            yield CheckFinding('stamps', WARNING, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
                           if reason != 'clock reset' else f'{NAMES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
         clean += [] if found.dropped else [NAMES[name]]
     if clean:
-        yield Finding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
+        yield CheckFinding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
 
 
 def _phrase(reason):
@@ -53,7 +53,7 @@ def gaps(evidence):
             found = evidence.streams[name].statistics
             if found.n_gaps:
                 severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
-                yield Finding('gaps', severity, f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
+                yield CheckFinding('gaps', severity, f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
                               f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
@@ -64,10 +64,10 @@ def sampling(evidence):
             stream = evidence.streams[name]
             nominal, real = stream.statistics.rate, stream.real_rate
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
-                yield Finding('sampling', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
+                yield CheckFinding('sampling', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
                               'samples were lost, or stamps are made when messages arrive; look at the driver and at the load of the recorder')
             elif nominal:
-                yield Finding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
+                yield CheckFinding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
 
 def jitter(evidence):
@@ -82,7 +82,7 @@ def jitter(evidence):
             came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
             if stream.irregular > IRREGULAR_SHARE:
                 came += (', ' if came else '') + f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
-            yield Finding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
+            yield CheckFinding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
 
 
 def clocks(evidence):
@@ -96,8 +96,8 @@ def clocks(evidence):
     shorter = min(imu.statistics.duration, joints.statistics.duration)
     late = (joints.first_ns - imu.first_ns) * 1e-9
     if overlap <= 0 and shorter > 0:
-        yield Finding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
+        yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
                       f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on one computer')
     elif overlap < 0.9 * shorter:
-        yield Finding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
+        yield CheckFinding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
                       f'{"after" if late > 0 else "before"} the Imu: only what overlaps is used; are both stamped by one clock?')

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.axes import CLEAR, match_axes
-from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, Finding
+from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
 from imu_calibration.units import significant
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
@@ -42,12 +42,12 @@ def force_unit(evidence):
     elif not 3.0 < length < 30.0:
         yield _unit('force_unit', f'{came}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale')
     else:
-        yield Finding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
+        yield CheckFinding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
 
 
 def _unit(check, text):
     """Return the refusal of a unit that a nominal scaling would put right."""
-    return Finding(check, REFUSE, text, key='nominal')
+    return CheckFinding(check, REFUSE, text, key='nominal')
 
 
 def rate_unit(evidence):
@@ -66,7 +66,7 @@ def rate_unit(evidence):
         elif not 0.5 < ratio < 2.0:
             yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
         else:
-            yield Finding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
+            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
     elif largest > FASTEST:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
@@ -82,14 +82,14 @@ def handedness(evidence):
     match = match_axes(turning.matrix, seen)
     if not match.wrong:
         if turning.seen.all():
-            yield Finding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
+            yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
         return
     what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j, sign in match.exchanges(seen))
     if not what or match.agreement < CLEAR:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
     kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, the recording cannot tell')
-    yield Finding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
+    yield CheckFinding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
                   f'{what} ({kind}); correct signs and order of the axes in the driver')
 
 
@@ -102,12 +102,12 @@ def frozen(evidence):
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
-            yield Finding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
+            yield CheckFinding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
                           'look at the sensor and its driver')
             continue
         for axis in np.flatnonzero(constant):
             if noisy.any():
-                yield Finding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
+                yield CheckFinding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
                               'look at the sensor and its driver')
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
@@ -115,7 +115,7 @@ def frozen(evidence):
             stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
-                yield Finding('frozen', WARNING, f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
+                yield CheckFinding('frozen', WARNING, f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
                               'and leave that time out', samples=int(stuck.sum() * chunks.size))
 
 
@@ -147,7 +147,7 @@ def clipping(evidence):
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
         if words:
             people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
-            yield Finding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
+            yield CheckFinding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
                           'what is beyond is lost, move less or choose a wider range', samples=total)
 
 
@@ -163,17 +163,17 @@ def gravity(evidence):
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
-        yield Finding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
+        yield CheckFinding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
                       f'{100 * off:+.1f} %: scale or bias is far off, or the gravity given is that of another place')
     else:
-        yield Finding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
+        yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 
 
 def repeated_readings(evidence):
     """Every message carries a new measurement."""
     share = evidence.n_repeated / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
-        yield Finding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
+        yield CheckFinding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
                       'the sensor measures, and noise is underestimated; publish each measurement once')
 
 
@@ -188,7 +188,7 @@ def resolution(evidence):
         if coarse.any():
             size = step[coarse].max()
             people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
-            yield Finding('resolution', NOTE, f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
+            yield CheckFinding('resolution', NOTE, f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
                           'are rounded too')
 
 
@@ -199,9 +199,9 @@ def temperature(evidence):
     low, high = evidence.temperature_c
     if low < -80 or high > 180:
         kelvin = ': kelvin?' if 200 < low and high < 450 else ''
-        yield Finding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
+        yield CheckFinding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
     else:
-        yield Finding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
+        yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
 
 
 def _axes(flags):

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.encoder import encoder_step
-from imu_calibration.reference.joint_fit import JointSettings, Rows, Trend, fit_with_velocity
+from imu_calibration.reference.joint_fit import JointRows, JointSettings, Trend, fit_with_velocity
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.quintic_spline import Knots, evaluate_pieces, piece_coefficients
 from imu_calibration.reference.smoothing import smooth
@@ -90,7 +90,7 @@ def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=Joint
     noise = floor.copy()
     moving = np.flatnonzero(~still)
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
-        rows = Rows(knots, time)
+        rows = JointRows(knots, time)
         fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], settings.robustness)
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)

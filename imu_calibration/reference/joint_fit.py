@@ -10,7 +10,7 @@ from imu_calibration.reference.smoothing import PenalisedSpline, smooth
 from imu_calibration.settings import setting
 
 
-class Rows:
+class JointRows:
     """Rows of the design at the stamps, for positions and velocities."""
 
     def __init__(self, knots, time):

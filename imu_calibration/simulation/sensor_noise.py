@@ -8,7 +8,7 @@ from imu_calibration.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
-class NoiseModel:
+class SimulatedNoise:
     """
     Random errors of one IMU and of what it is compared with.
 
@@ -39,14 +39,14 @@ class NoiseModel:
 
     def white_only(self):
         """Return the model with nothing but the white noise of the IMU."""
-        return NoiseModel(accel_density=self.accel_density, gyro_density=self.gyro_density)
+        return SimulatedNoise(accel_density=self.accel_density, gyro_density=self.gyro_density)
 
 
 @dataclass(frozen=True)
 class ImuGrade:
     """A grade of IMU: its noise, and the standard deviations of the errors that a calibration finds."""
 
-    noise: NoiseModel
+    noise: SimulatedNoise
     """Random errors."""
     accel_bias: float
     """Run-to-run accelerometer bias, m/s^2."""
@@ -64,19 +64,19 @@ class ImuGrade:
 
 GRADES = {
     'consumer': ImuGrade(
-        NoiseModel(400 * MICRO_G, 0.005 * DEG, 100 * MICRO_G, 20 * DEG_H, 100.0, 61e-6 * STANDARD_GRAVITY, DEG / 131.0),
+        SimulatedNoise(400 * MICRO_G, 0.005 * DEG, 100 * MICRO_G, 20 * DEG_H, 100.0, 61e-6 * STANDARD_GRAVITY, DEG / 131.0),
         0.05 * STANDARD_GRAVITY, 2.0 * DEG, 0.02, 0.01, 3e-3,
         'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none'),
     'industrial': ImuGrade(
-        NoiseModel(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
+        SimulatedNoise(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
         5e-3 * STANDARD_GRAVITY, 0.2 * DEG, 5e-3, 3e-3, 3e-3,
         'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and arms before factory calibration'),
     'tactical': ImuGrade(
-        NoiseModel(150 * MICRO_G, 0.002 * DEG, 200 * MICRO_G, 8 * DEG_H, 100.0, 250 * MICRO_G, 0.005 * DEG),
+        SimulatedNoise(150 * MICRO_G, 0.002 * DEG, 200 * MICRO_G, 8 * DEG_H, 100.0, 250 * MICRO_G, 0.005 * DEG),
         15e-3 * STANDARD_GRAVITY, 0.5 * DEG, 5e-3, 0.87e-3, 5e-3,
         'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15 mg and 0.5 deg/s, axis to axis 0.05 deg'),
     'navigation': ImuGrade(
-        NoiseModel(1 * MICRO_G, 0.002 / 60 * DEG, 10 * MICRO_G, 0.005 * DEG_H, 100.0),
+        SimulatedNoise(1 * MICRO_G, 0.002 / 60 * DEG, 10 * MICRO_G, 0.005 * DEG_H, 100.0),
         75 * MICRO_G, 0.02 * DEG_H, 1e-4, 3e-5, 0.02,
         'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h, run-to-run 50-100 ug and 0.01-0.03 deg/h'),
 }
@@ -122,7 +122,7 @@ def add_imu_noise(force_s, rate_s, model, sample_rate, rng):
     ----------
     force_s, rate_s : array, shape (n, 3)
         Outputs without noise, m/s^2 and rad/s.
-    model : NoiseModel
+    model : SimulatedNoise
     sample_rate : float
         Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that the integral over t seconds
         scatters by ``d sqrt(t)`` (random-walk convention).

@@ -8,7 +8,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders
+from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders
 
 START_NS = 1_700_000_000_000_000_000
 """First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
@@ -23,7 +23,7 @@ class SimulationOptions:
     """IMU samples per second."""
     joint_rate: float = 100.0
     """Joint states per second."""
-    noise: NoiseModel = GRADES['industrial'].noise
+    noise: SimulatedNoise = GRADES['industrial'].noise
     """Noise of the IMU, the encoders and the stamps."""
     with_velocity: bool = True
     """Whether the joint states carry velocities."""

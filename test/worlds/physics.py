@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES, NoiseModel, add_imu_noise, jitter_stamps, read_encoders, realistic
+from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders, realistic
 
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
 from worlds.physics_sensor import low_pass
@@ -69,7 +69,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         Effect (or outside cause) -> size. A number is the magnitude of a drawn value, None a clearly visible one, an array the
         value itself. Saturation: the fraction of samples that are clipped, or the array (level,). Drift: the amplitude, or the
         array (x, y, z, time constant).
-    noise : str or NoiseModel
+    noise : str or SimulatedNoise
         'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too.
     grade : str
         IMU grade in `imu_calibration.simulation.sensor_noise.GRADES`.
@@ -152,7 +152,7 @@ def _noise_model(noise, grade, encoder_resolution):
     if isinstance(noise, str):
         full = realistic(grade)
         quiet = replace(full.white_only(), encoder_noise=2e-6)
-        noise = {'none': NoiseModel(), 'white': quiet, 'realistic': replace(full, encoder_noise=2e-6)}[noise]
+        noise = {'none': SimulatedNoise(), 'white': quiet, 'realistic': replace(full, encoder_noise=2e-6)}[noise]
     return noise if encoder_resolution is None else replace(noise, encoder_resolution=encoder_resolution)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.diagnosis.traces import Traces
-from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Rest, correlate, slow_explanations, where_most
+from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 from imu_calibration.estimation.solution import Solution
 
 
@@ -63,11 +63,11 @@ def rest_of(hand, inquiry, named, sensor):
     layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
     significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
     if not significant:
-        return Rest(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)
+        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)
     name, share = correlate(_explanations(hand), layers / noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
-    return Rest(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd)
+    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd)
 
 
 def _explanations(hand):
