@@ -7,6 +7,12 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import effect_slopes
 
+WIDE = 10.0
+"""
+Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior held
+them the noise beside them came out otherwise; from six times on it does not matter.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class BankEntry:
@@ -33,7 +39,7 @@ class BankEntry:
     @property
     def prior_sd(self):
         """Standard deviations of the amplitudes before any data."""
-        return self.effect.amplitudes(self.effect.prior_sds())
+        return WIDE * self.effect.amplitudes(self.effect.prior_sds())
 
     def columns(self, ref):
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
