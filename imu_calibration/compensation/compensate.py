@@ -1,6 +1,7 @@
 """Compensation: the calibration inverted, with the lever-arm correction from the measured rate."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -61,6 +62,21 @@ class Transfer:
             raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
                              'correct it')
         return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
+
+    @cached_property
+    def _quaternion_st(self):
+        return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
+
+    def turned_quaternion(self, quaternion):
+        """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros stay zeros."""
+        px, py, pz, pw = quaternion
+        qx, qy, qz, qw = self._quaternion_st
+        return (pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
+                pw * qz + px * qy - py * qx + pz * qw, pw * qw - px * qx - py * qy - pz * qz)
+
+    def turned_covariance(self, covariance):
+        """Return a covariance in the target frame, shape (3, 3)."""
+        return self.mat_ts @ covariance @ self.mat_ts.T
 
 
 def invertible(model):

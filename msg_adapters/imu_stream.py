@@ -1,0 +1,122 @@
+"""Serialized Imu messages of one stream, taken apart and put together again; what repeats is looked at only where its bytes change."""
+
+import struct
+
+import numpy as np
+
+from msg_adapters.imu import find_imu_layout
+
+STAMP_AT = 4
+HEAD_AT = 12
+"""Bytes before the frame_id's length: encapsulation and stamp."""
+NS = 1_000_000_000
+
+
+class ImuStream:
+    """
+    Where the parts of a stream's messages stand.
+
+    Parameters
+    ----------
+    frame_id : str, optional
+        Frame of the messages that are written; default that of those which are read.
+    late_ns : int
+        By how much stamps are moved back.
+
+    """
+
+    def __init__(self, frame_id=None, late_ns=0):
+        self._frame_out, self._late_ns = frame_id, late_ns
+        self._size, self._order, self._head, self._head_end, self._head_out = -1, b'', b'', HEAD_AT, b''
+        self._body = self._rate_at = self._force_at = 0
+        self._rate_cov = self._force_cov = b''
+        self._use('<')
+
+    def _use(self, order):
+        self._stamp, self._readings = struct.Struct(order + 'iI'), struct.Struct(order + '3d72x3d')
+        self._tail = struct.Struct(order + '3d72s3d72s')
+        self._nine, self._four = struct.Struct(order + '9d'), struct.Struct(order + '4d')
+
+    def open(self, data):
+        """
+        Find the places in a message with a new head; return its frame_id.
+
+        Raises
+        ------
+        MessageError
+            When it is not an Imu message.
+
+        """
+        self.forget()
+        layout = find_imu_layout(data)
+        self._use(layout.order)
+        self._order, self._body = data[:2], layout.offsets['orientation'][0]
+        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]   # the padding behind it may hold anything
+        self._head = data[HEAD_AT:self._head_end]
+        self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
+        encoded = (layout.names[0] if self._frame_out is None else self._frame_out).encode() + b'\0'
+        self._head_out = struct.pack(layout.order + 'I', len(encoded)) + encoded
+        self._head_out += b'\0' * (-(HEAD_AT - 4 + len(self._head_out)) % 8)
+        self._size = len(data)
+        return layout.names[0]
+
+    def take(self, data):
+        """Return (stamp in ns, readings: rate x, y, z, force x, y, z), or None where head or covariances differ from the last."""
+        if (len(data) != self._size or data[HEAD_AT:self._head_end] != self._head or data[:2] != self._order
+                or data[self._rate_at + 24:self._rate_at + 96] != self._rate_cov or data[self._force_at + 24:] != self._force_cov):
+            return None
+        return self.read(data)
+
+    def read(self, data):
+        """Return (stamp in ns, readings) of a message whose places are known."""
+        seconds, nanoseconds = self._stamp.unpack_from(data, STAMP_AT)
+        return seconds * NS + nanoseconds, self._readings.unpack_from(data, self._rate_at)
+
+    def heads(self, data):
+        """Return whether a message has the head of the one that was opened last, so that everything stands where it stood."""
+        return len(data) == self._size and data[HEAD_AT:self._head_end] == self._head and data[:2] == self._order
+
+    def forget(self):
+        """Have the next message opened whatever it is."""
+        self._size = -1
+
+    def covariances(self, data):
+        """Return the covariances of (force, rate), each (3, 3)."""
+        self._rate_cov, self._force_cov = data[self._rate_at + 24:self._rate_at + 96], data[self._force_at + 24:]
+        return tuple(np.array(self._nine.unpack_from(raw)).reshape(3, 3) for raw in (self._force_cov, self._rate_cov))
+
+    def orientation(self, data):
+        """Return (quaternion x, y, z, w; its covariance as bytes)."""
+        return self._four.unpack_from(data, self._body), data[self._body + 32:self._rate_at]
+
+    def unpacked(self, covariance):
+        """Return the matrix in the bytes of a covariance, shape (3, 3)."""
+        return np.array(self._nine.unpack(covariance)).reshape(3, 3)
+
+    def packed(self, covariance):
+        """Return a covariance, (3, 3), as bytes."""
+        return self._nine.pack(*covariance.ravel().tolist())
+
+    def rewritten(self, data, stamp_ns, readings, rate_cov, force_cov, orientation=None):
+        """
+        Return a message with other readings, the rest as it came.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            As it was read.
+        readings : sequence of 6 floats
+            Rate x, y, z, force x, y, z.
+        rate_cov, force_cov : bytes
+            From `packed`.
+        orientation : (sequence of 4 floats, bytes), optional
+            Quaternion and the bytes of its covariance; with it goes the other frame.
+
+        """
+        tail = self._tail.pack(*readings[:3], rate_cov, *readings[3:], force_cov)
+        if orientation is None and not self._late_ns:
+            return data[:self._rate_at] + tail
+        start = data[:STAMP_AT] + self._stamp.pack(*divmod(stamp_ns - self._late_ns, NS))
+        if orientation is None:
+            return start + data[HEAD_AT:self._rate_at] + tail
+        return start + self._head_out + self._four.pack(*orientation[0]) + orientation[1] + tail
