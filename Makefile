@@ -40,7 +40,7 @@ help:
 
 setup: $(STAMP)
 
-$(STAMP): $(filter-out $(addprefix constraints/,validate.txt oracles.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
+$(STAMP): $(filter-out $(addprefix constraints/,validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -68,6 +68,7 @@ test-fast: $(STAMP)
 # Libraries that some tests compare with; without them these tests are skipped.
 oracles: $(STAMP)
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/oracles.txt
+	@$(PIP) --no-deps --requirement constraints/oracles-alone.txt
 
 # Unused names and arguments, line length, docstrings, annotations: seconds.
 lint: $(STAMP)-lint

@@ -51,6 +51,7 @@ From the ground up; each package imports only what stands above it. The words ar
 `preflight`       what looks wrong with a recording before anything is estimated
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
+`allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
 `selection`       which effects the evidence of a recording asks for, proven on windows that are held out
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata

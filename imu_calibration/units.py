@@ -11,6 +11,14 @@ SHOWN = {
     'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
 }
 """SI unit -> (factor, unit that people use)."""
+SHOWN_OF_NOISE = {
+    'm/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
+    'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
+    'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'),
+    'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'), 'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'),
+    'rad': (3600 / DEG, 'arcsec'), 'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's'),
+}
+"""The same for the figures of noise, as data sheets print them."""
 
 
 def for_people(unit):

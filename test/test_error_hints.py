@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EDGES = ('cli', 'nodes')
 ARGUMENTS = {'arm': ['BAG', '--imu-topic', 'A'], 'calibrate': ['BAG', '--output', 'DIR'], 'compare': ['A', 'B'], 'inspect': ['BAG'],
              'compensate': ['BAG', '--calibration', 'FILE', '--output', 'BAG2'], 'diagnose': ['BAG', '--output', 'DIR'],
-             'fleet': ['FOLDER', '--table', 'TABLE', '--output', 'DIR'], 'simulate': ['--output', 'BAG']}
+             'fleet': ['FOLDER', '--table', 'TABLE', '--output', 'DIR'], 'noise': ['BAG', '--output', 'DIR'], 'simulate': ['--output', 'BAG']}
 
 
 def core():

@@ -30,16 +30,28 @@ class Chunks:
     """Largest minus smallest, shape (n, 6)."""
     size: int
     """Samples per chunk."""
+    first_ns: int = 0
+    """Stamp of the first sample, where `time` is zero."""
 
     def __len__(self):
         return len(self.time)
 
 
 class ChunkSeries:
-    """Cuts clean samples into chunks of equal number; how the stream was cut into blocks does not matter."""
+    """
+    Cuts clean samples into chunks of equal number; how the stream was cut into blocks does not matter.
 
-    def __init__(self):
-        self.size = None
+    Parameters
+    ----------
+    chunk_time : float
+        Wanted length of a chunk, s.
+    capacity : int
+        Chunks kept.
+
+    """
+
+    def __init__(self, chunk_time=CHUNK_TIME, capacity=CAPACITY):
+        self.size, self._chunk_time, self._capacity = None, chunk_time, capacity
         self.n_samples = 0
         self.n_changed = np.zeros(6, np.int64)
         self.n_repeated = 0
@@ -53,17 +65,17 @@ class ChunkSeries:
             stamp_ns, columns = np.concatenate([self._rest[0], stamp_ns]), np.concatenate([self._rest[1], columns], axis=1)
         self._rest = (stamp_ns, columns)
         if self.size is None and len(stamp_ns) >= FIRST:
-            self.size = _size(stamp_ns)
+            self.size = _size(stamp_ns, self._chunk_time)
         if self.size is not None:
             self._cut()
 
     def chunks(self):
         """Return the Chunks until now."""
         if self.size is None and self._rest is not None and len(self._rest[0]) > LEAST:
-            self.size = _size(self._rest[0])
+            self.size = _size(self._rest[0], self._chunk_time)
             self._cut()
         parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
-        return Chunks(*(np.concatenate(column) for column in zip(*parts, strict=True)), self.size or LEAST)
+        return Chunks(*(np.concatenate(column) for column in zip(*parts, strict=True)), self.size or LEAST, int(self._first_ns or 0))
 
     def _count_changes(self, columns):
         if self._last is not None:
@@ -81,7 +93,7 @@ class ChunkSeries:
         n = len(stamp_ns) // self.size
         used = n * self.size
         self._rest = stamp_ns[used:].copy(), columns[:, used:].copy()
-        if not n or self._n_chunks >= CAPACITY:
+        if not n or self._n_chunks >= self._capacity:
             return
         if self._first_ns is None:
             self._first_ns = stamp_ns[0]
@@ -89,9 +101,9 @@ class ChunkSeries:
         self._n_chunks += n
 
 
-def _size(stamps):
+def _size(stamps, chunk_time):
     period = float(np.median(np.diff(stamps[:FIRST]))) * 1e-9
-    return int(np.clip(round(CHUNK_TIME / max(period, 1e-6)), LEAST, MOST))
+    return int(np.clip(round(chunk_time / max(period, 1e-6)), LEAST, MOST))
 
 
 def _describe(time, values):

@@ -52,14 +52,22 @@ class Rest:
 
 
 def find_rest(chunks):
+    """Return the `Rest` of Chunks, or None when the sensor never rests (see `still_chunks`)."""
+    still = still_chunks(chunks)
+    if still.sum() < LEAST_CHUNKS:
+        return None
+    return Rest(_stretches(chunks, still), np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0))
+
+
+def still_chunks(chunks):
     """
-    Return the `Rest` of Chunks, or None when the sensor never rests.
+    Return in which chunks the sensor is at rest, bool, shape (n,).
 
     At rest both sensors scatter as little as in the quietest tenth, and gravity keeps its direction. Both are relative, so that
     counts and g do as well as m/s^2.
     """
     if len(chunks) < LEAST_CHUNKS:
-        return None
+        return np.zeros(len(chunks), bool)
     quiet = np.ones(len(chunks), bool)
     for part in (slice(0, 3), slice(3, 6)):
         scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
@@ -68,14 +76,11 @@ def find_rest(chunks):
     turn = np.linalg.norm(np.diff(direction, axis=0), axis=1)
     still = quiet & (np.append(turn, 0.0) < STILL) & (np.append(0.0, turn) < STILL)
     if still.sum() < LEAST_CHUNKS:
-        return None
+        return still
     rate = np.median(chunks.mean[still, 3:], axis=0)
     away = np.linalg.norm(chunks.mean[:, 3:] - rate, axis=1)
     # A spin at constant rate about the vertical is as quiet as rest, but has rates.
-    still &= away <= np.maximum(0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1)))
-    if still.sum() < LEAST_CHUNKS:
-        return None
-    return Rest(_stretches(chunks, still), np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0))
+    return still & (away <= np.maximum(0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))))
 
 
 def _stretches(chunks, still):

@@ -1,0 +1,217 @@
+"""
+How honest and how sharp identified noise is: simulated records of four grades and three lengths, intervals and errors against the bound.
+
+    make noise-records        # fresh seeds, writes docs/noise_records.json and the tables of docs/noise.md
+
+Every axis draws its own densities and one of four forms of slow noise. Intervals are those of the whole identification, choice of form included. Errors
+are those of the fit of the true form, against the Cramer-Rao bound of an estimator that knows the form: exact Fisher information of block means, and of the
+spectrum within blocks.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
+
+from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance  # noqa: E402
+from imu_calibration.allan.forms import PROCESSES, fit_names  # noqa: E402
+from imu_calibration.allan.moment_fit import Moments, Whitener  # noqa: E402
+from imu_calibration.allan.processes import gauss_markov, mean_covariance  # noqa: E402
+from imu_calibration.allan.scale_covariance import ScaleCovariance  # noqa: E402
+from imu_calibration.allan.terms import TIME, identify_axis  # noqa: E402
+from imu_calibration.effects.base import SENSORS  # noqa: E402
+from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
+
+from worlds.noise_worlds import FORMS, RATE, draw_truth  # noqa: E402
+
+LENGTHS = {'10 min': 600.0, '1 h': 3600.0, '3 h': 10800.0}
+NAMES = {'white_noise': 'white noise N', 'random_walk': 'random walk K', 'bias_instability': 'bias instability B', 'gauss_markov': 'Gauss–Markov σ',
+         TIME: 'correlation time τ', 'quantisation': 'quantisation Q'}
+BLOCKS = 500
+"""Blocks of the Fisher information."""
+INFORMED = 0.3
+"""Errors are compared with the bound where the bound is below this share of the coefficient: elsewhere there is nothing to be sharp about."""
+
+
+def record_axes(length, grade, number, seed):
+    """Yield (truth, moments) of the six axes of one record."""
+    period = 1.0 / RATE
+    n = int(length * RATE)
+    factors = averaging_factors(n)
+    scales = scales_of(n, period)
+    for k, sensor in enumerate(2 * SENSORS[:1] + SENSORS[:1] + 3 * SENSORS[1:]):
+        rng = np.random.default_rng((seed, int(length), sorted(GRADES).index(grade), number, k))
+        truth = draw_truth(grade, sensor, FORMS[rng.integers(len(FORMS))], rng)
+        variance = overlapping_allan_variance(truth.draw(n, period, rng)[:, None], factors)[:, 0]
+        yield truth, Moments(scales, variance, variance > 0)
+
+
+_SCALES: dict = {}
+
+
+def scales_of(n, period):
+    """Return the covariances of a record of n samples, made once."""
+    if n not in _SCALES:
+        _SCALES[n] = ScaleCovariance(averaging_factors(n), [n], period)
+    return _SCALES[n]
+
+
+def judged(truth, moments):
+    """Return what became of one axis: (name, truth, lower, upper, status) of every figure, and the errors of the fit of the true form."""
+    found = identify_axis(moments)
+    figures = []
+    for name, value in truth.figures.items():
+        term = found.alternatives.get(name) or found.terms.get(name)
+        figures.append((name, value, *((term.interval[0], term.interval[1], term.status) if term else (None, None, 'not asked'))))
+    names = [name for name in ('quantisation', 'white_noise', *truth.form) if name in truth.figures]
+    fit = fit_names(moments, tuple(names))
+    true, values = coefficients(truth, names), dict(zip(names, fit.coefficients))
+    if 'gauss_markov' in names:
+        values[TIME] = fit.processes[-1].time
+    bounds, of_moments = bound(moments, truth, names), moment_bound(moments, truth, names)
+    errors = [(name, float(values[name] / true[name] - 1), bounds[name], of_moments[name]) for name in true]
+    return {'true': list(truth.form), 'found': list(found.form), 'rivals': [list(form) for form in found.others], 'figures': figures, 'errors': errors}
+
+
+def coefficients(truth, names):
+    """Return the true coefficients, and the correlation time."""
+    true = {name: truth.figures[name]**2 for name in names}
+    if 'gauss_markov' in names:
+        true[TIME] = truth.figures[TIME]
+    return true
+
+
+def bound(moments, truth, names):
+    """Return the relative Cramer-Rao bounds of coefficients and correlation time."""
+    period, n = moments.scales.period, round(moments.scales.longest / moments.scales.period)
+    size = n // BLOCKS
+    lag, seconds = np.subtract.outer(np.arange(BLOCKS), np.arange(BLOCKS)) * size * period, size * period
+    parts = _derivatives(truth, names, lambda process: mean_covariance(process, lag, seconds))
+    basis = np.linalg.qr(np.column_stack([np.ones(BLOCKS), np.eye(BLOCKS)[:, 1:]]))[0][:, 1:]
+    parts = [basis.T @ part @ basis for part in parts]
+    inverse = np.linalg.inv(sum(parts[:len(names)]))
+    inside = [inverse @ part for part in parts]
+    information = np.array([[0.5 * np.einsum('ij,ji->', a, b) for b in inside] for a in inside])
+    frequency = np.arange(BLOCKS // 2, n // 2 + 1) / (n * period)
+    spectra = _derivatives(truth, names, lambda process: _spectrum(process, frequency, period))
+    shares = np.array(spectra) / sum(spectra[:len(names)])
+    information += shares @ shares.T
+    sd = np.sqrt(np.diag(np.linalg.inv(information)))
+    return {name: float(value) for name, value in zip([*names, *([TIME] if 'gauss_markov' in names else [])], sd)}
+
+
+def moment_bound(moments, truth, names):
+    """Return the relative bounds of an estimator that knows the Allan variances only and weighs them best (GMWM's bound)."""
+    design = np.column_stack(_derivatives(truth, names, moments.scales.expectation))
+    processes = tuple(gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name] for name in names)
+    squares = np.array([truth.figures[name]**2 for name in names])
+    columns = Whitener(np.einsum('p,q,pqij->ij', squares, squares, moments.scales.tensor(processes)))(design)
+    sd = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
+    return {name: float(value) for name, value in zip([*names, *([TIME] if 'gauss_markov' in names else [])], sd)}
+
+
+def _derivatives(truth, names, of):
+    """Return what each process contributes, and the change with the logarithm of the correlation time."""
+    parts = []
+    for name in names:
+        process = gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name]
+        parts.append(truth.figures[name]**2 * of(process))
+    if 'gauss_markov' in names:
+        time, step = truth.figures[TIME], 0.01
+        parts.append(truth.figures['gauss_markov']**2 * (of(gauss_markov(time * (1 + step))) - of(gauss_markov(time * (1 - step)))) / (2 * step))
+    return parts
+
+
+def _spectrum(process, frequency, period):
+    """Return the two-sided density of a process of unit coefficient, far above the corner of slow ones."""
+    angular = 2 * np.pi * frequency
+    return {'white_noise': np.ones_like(frequency), 'quantisation': (2 * np.sin(np.pi * frequency * period) / period)**2,
+            'random_walk': angular**-2, 'bias_instability': 1 / angular,
+            'gauss_markov': 2 * process.time / (1 + (angular * process.time)**2)}[process.name]
+
+
+def run(records, seed, progress=print):
+    """Return what became of all axes: length -> list of `judged`; `records` for each grade and length."""
+    found = {}
+    for label, length in LENGTHS.items():
+        start = time.monotonic()
+        found[label] = [judged(truth, moments) for grade in GRADES for number in range(records)
+                        for truth, moments in record_axes(length, grade, number, seed)]
+        progress(f'{label}: {len(found[label])} axes in {time.monotonic() - start:.0f} s')
+    return found
+
+
+def coverage(axes):
+    """Return {name: (number, share of intervals that hold the truth, share below, share above)} of figures that were asked for."""
+    table = {}
+    for name in NAMES:
+        rows = [(value, lower, upper) for axis in axes for known, value, lower, upper, _ in axis['figures'] if known == name and lower is not None]
+        if rows:
+            value, lower, upper = np.array(rows, float).T
+            table[name] = (len(rows), float(np.mean((lower <= value) & (value <= upper))), float(np.mean(upper < value)), float(np.mean(lower > value)))
+    return table
+
+
+def sharpness(axes):
+    """Return {name: (number, rms error over the Cramer-Rao bound, over that of the moments)} where there is something to know."""
+    table = {}
+    for name in NAMES:
+        rows = [numbers for axis in axes for known, *numbers in axis['errors'] if known == name and numbers[1] < INFORMED]
+        if len(rows) >= 10:
+            error, *limits = np.array(rows).T
+            table[name] = (len(rows), *(float(np.sqrt(np.mean((error / limit)**2))) for limit in limits))
+    return table
+
+
+def statuses(axes):
+    """Return {name: {status: number}}."""
+    return {name: {status: sum(known == name and state == status for axis in axes for known, *_, state in axis['figures'])
+                   for status in ('determined', 'weak', 'held')} for name in NAMES}
+
+
+def tables(found):
+    """Return the tables of docs/noise.md."""
+    every = [axis for axes in found.values() for axis in axes]
+    lines = [f'{len(every) // 6} records of six axes ({", ".join(f"{len(axes) // 6} of {label}" for label, axes in found.items())}; {RATE:g} Hz).', '',
+             '| figure | axes that have it | interval holds the truth | too low | too high | ' + ' | '.join(found) + ' | determined / weak / held |',
+             '| --- | ---: | ---: | ---: | ---: |' + ' ---: |' * len(found) + ' --- |']
+    by_length, states = {label: coverage(axes) for label, axes in found.items()}, statuses(every)
+    for name, (count, inside, low, high) in coverage(every).items():
+        cells = [f'{by_length[label][name][1]:.1%}' if name in by_length[label] else '' for label in found]
+        lines.append(f'| {NAMES[name]} | {count} | {inside:.1%} | {low:.1%} | {high:.1%} | ' + ' | '.join(cells) + ' | '
+                     + ' / '.join(str(states[name][s]) for s in ('determined', 'weak', 'held')) + ' |')
+    lines += ['', '| figure | axes with a bound below 30 % | rms error over the Cramér–Rao bound | over the bound of the moments |',
+              '| --- | ---: | ---: | ---: |']
+    lines += [f'| {NAMES[name]} | {count} | {ratio:.2f} | {moments:.2f} |' for name, (count, ratio, moments) in sharpness(every).items()]
+    right = sum(axis['true'] == axis['found'] for axis in every)
+    part = sum(set(axis['found']) < set(axis['true']) or axis['found'] == ['random_walk'] and axis['true'] == ['gauss_markov'] for axis in every)
+    rival = sum(axis['true'] in axis['rivals'] for axis in every)
+    lines += ['', f'The form of the slow noise: found as it was in {right} axes, a part or a limiting case of it in {part}, named as explaining the curve as '
+              f'well in {rival}, of {len(every)}.']
+    return '\n'.join(lines)
+
+
+def main():
+    """Run, print and, when asked, write the documents."""
+    parser = argparse.ArgumentParser(description='Intervals and errors of identified noise over simulated records.')
+    parser.add_argument('--records', type=int, default=17, help='records for each grade and length, default 17: 204 in all')
+    parser.add_argument('--seed', type=int, default=20261122)
+    parser.add_argument('--write', action='store_true', help='write docs/noise_records.json and the tables of docs/noise.md')
+    options = parser.parse_args()
+    found = run(options.records, options.seed, lambda line: print(line, flush=True))
+    text = tables(found)
+    print(text)
+    if options.write:
+        (ROOT / 'docs/noise_records.json').write_text(json.dumps({'seed': options.seed, 'records': options.records, 'axes': found}) + '\n')
+        from worlds.figures import replace_between
+        replace_between(ROOT / 'docs/noise.md', 'records', text)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,139 @@
+"""The figures of the noise of an IMU as people and programs exchange them, and what filters take from them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
+from imu_calibration.allan.terms import TIME, Term
+
+HORIZON = 100.0
+"""s; a filter that knows white noise and a random walk only is given the walk that has the same Allan variance there."""
+SLOW = (FLICKER.name, RANDOM_WALK.name, 'gauss_markov')
+
+
+@dataclass(frozen=True)
+class TrendFigure:
+    """A trend that was taken out of an axis before its noise was read."""
+
+    name: str
+    """'temperature', 'turn_on' or 'ramp'."""
+    value: float
+    """Per kelvin, size at the beginning, or per second."""
+    sd: float
+    """Standard deviation."""
+    time: float = 0.0
+    """Time constant of turn-on, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFigures:
+    """The noise of one axis."""
+
+    terms: dict[str, Term]
+    """Name of the process -> its figure."""
+    form: tuple[str, ...] = ()
+    """Processes that make the slow part."""
+    others: tuple[tuple[str, ...], ...] = ()
+    """Forms that explain the curve as well."""
+    alternatives: dict[str, Term] = field(default_factory=dict)
+    """Figures of processes that only those have."""
+    trends: tuple[TrendFigure, ...] = ()
+    """What was taken out."""
+    record_for: dict[str, float | None] = field(default_factory=dict)
+    """Name of a figure that is not determined -> seconds of rest that would do, None: more than two days of it."""
+    sample_sd: float = 0.0
+    """Standard deviation of single samples as measured."""
+    shortest: float = 0.0
+    """Shortest averaging time that was fitted, s; longer than the period where the sensor filters its noise."""
+    excess: float = 1.0
+    """Factor on all variances of the fit because the curve departs from the model by more than chance."""
+    oscillation: tuple[float, float] | None = None
+    """Frequency (Hz) and amplitude of an oscillation that shows as a hump, where no model explains the curve."""
+    deviation: tuple[float, ...] = ()
+    """Allan deviations at the averaging times of the document."""
+
+    def processes(self) -> list[tuple[NoiseProcess, float]]:
+        """Return the processes of the model with their coefficients (squares of the figures)."""
+        found = []
+        for name in (QUANTISATION.name, WHITE.name, *self.form):
+            term = self.terms.get(name)
+            if term is not None and term.value is not None:
+                found.append((self._process(name), term.value**2))
+        return found
+
+    def _process(self, name):
+        if name == 'gauss_markov':
+            return gauss_markov(self.terms[TIME].value or self.terms[TIME].interval[0])
+        return {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}[name]
+
+    @property
+    def white(self) -> float:
+        """The density of the white noise; where it is held, its bound."""
+        term = self.terms[WHITE.name]
+        return term.interval[1] if term.value is None else term.value
+
+    def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
+        """
+        Return the density of the random walk that stands for the slow part, and where it comes from.
+
+        The walk whose Allan variance at the horizon is that of all slow processes together; without a slow part in the curve, the
+        largest walk that the curve allows.
+        """
+        slow = [(process, coefficient) for process, coefficient in self.processes() if process.name in SLOW]
+        if not slow:
+            return self.terms[RANDOM_WALK.name].interval[1], 'bound'
+        variance = sum(coefficient * float(allan_variance(process, np.array([horizon]))[0]) for process, coefficient in slow)
+        density = float(np.sqrt(3.0 * variance / horizon))
+        return density, 'walk' if [process.name for process, _ in slow] == [RANDOM_WALK.name] else 'equivalent'
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFigures:
+    """The noise of an IMU."""
+
+    accelerometer: tuple[AxisFigures, ...]
+    """x, y, z."""
+    gyroscope: tuple[AxisFigures, ...]
+    """x, y, z."""
+    rate: float
+    """Sampling rate of the recording, Hz."""
+    frame_id: str = ''
+    """Frame of the messages."""
+    recording: dict = field(default_factory=dict)
+    """Seconds at rest, parts, what was left out."""
+    tau: tuple[float, ...] = ()
+    """Averaging times of the Allan deviations, s."""
+    provenance: dict = field(default_factory=dict)
+    """Software version, recording, options."""
+
+    def sensor(self, name: str) -> tuple[AxisFigures, ...]:
+        """Return the axes of 'accelerometer' or 'gyroscope'."""
+        return {'accelerometer': self.accelerometer, 'gyroscope': self.gyroscope}[name]
+
+    def densities(self, sensor: str, horizon: float = HORIZON, worst: Callable = max) -> 'Densities':
+        """Return the two numbers that most filters take for a sensor: those of its worst axis."""
+        walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
+        walk, basis = worst(walks)
+        return Densities(float(worst(axis.white for axis in self.sensor(sensor))), float(walk), basis)
+
+
+@dataclass(frozen=True)
+class Densities:
+    """White noise and random walk in continuous time."""
+
+    white: float
+    """Per root hertz."""
+    walk: float
+    """Per second and root hertz."""
+    basis: str
+    """'walk' (found), 'equivalent' (stands for other slow noise) or 'bound' (none was seen: at most so much)."""
+
+    def sample_sd(self, rate: float) -> float:
+        """Return the standard deviation of the white noise of a sample at a rate (Hz)."""
+        return self.white * float(np.sqrt(rate))
+
+    def step_sd(self, rate: float) -> float:
+        """Return the standard deviation by which the bias steps from one sample to the next at a rate (Hz)."""
+        return self.walk / float(np.sqrt(rate))

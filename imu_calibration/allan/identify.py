@@ -1,0 +1,185 @@
+"""From a recording at rest to the figures of its noise: what a user calls."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration import __version__
+from imu_calibration.allan.curve import AllanCurve, Detrending, read_curve
+from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
+from imu_calibration.allan.forms import PROCESSES
+from imu_calibration.allan.moment_fit import Moments
+from imu_calibration.allan.processes import RANDOM_WALK, WHITE
+from imu_calibration.allan.recording_time import RecordingTimes
+from imu_calibration.allan.scale_covariance import ScaleCovariance
+from imu_calibration.allan.still_parts import LeftOut, StillPart, still_parts
+from imu_calibration.allan.survey import Survey, survey
+from imu_calibration.allan.terms import DETERMINED, AxisNoise, identify_axis
+from imu_calibration.allan.trends import MOST_BLOCKS, Blocks, Trend, TrendSearch
+from imu_calibration.errors import InputError
+from imu_calibration.samples import NominalScaling, SampleBlock
+
+LEAST_SAMPLES = 1000
+"""Samples at rest without which there is no curve to speak of."""
+EPOCH_GAP = 1.0
+"""Time between two epochs of the clock, s; the true one is unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestingRecord:
+    """The Allan curves of what a recording holds at rest, and what was left out and taken out."""
+
+    curve: AllanCurve
+    """Allan variances of the six axes."""
+    moments: tuple[Moments, ...]
+    """Variances with their covariance, one for each axis: force x, y, z, then rate x, y, z."""
+    trends: tuple[tuple[Trend, ...], ...]
+    """What was taken out of each axis."""
+    parts: tuple[StillPart, ...]
+    """Stretches at rest."""
+    left_out: LeftOut
+    """Seconds that were not at rest."""
+    sample_sd: np.ndarray
+    """Standard deviation of single samples within a quarter of a second, shape (6,)."""
+    survey: Survey
+    """The first reading."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseIdentification:
+    """What a recording says about the noise of an IMU."""
+
+    record: RestingRecord
+    """What was read."""
+    axes: tuple[AxisNoise, ...]
+    """Force x, y, z, then rate x, y, z."""
+
+
+def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> NoiseIdentification:
+    """
+    Identify the noise of an IMU from a recording that holds rest.
+
+    Parameters
+    ----------
+    source : callable
+        Gives the blocks of the recording, each time anew; it is read twice.
+    nominal : NominalScaling, optional
+        For recordings in volts or counts.
+
+    Raises
+    ------
+    InputError
+        When nothing rests for long enough, or the recording is not usable.
+
+    """
+    record = read_rest(source, nominal)
+    return NoiseIdentification(record, tuple(identify_axis(moments) for moments in record.moments))
+
+
+def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> RestingRecord:
+    """Read a recording twice, first for what rests and for trends, then for the Allan curves; arguments as for `identify_noise`."""
+    found = survey(source(), nominal)
+    pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
+    parts, left_out = [part for part, _ in pieces], _joined([left for _, left in pieces])
+    seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
+    if seconds < LEAST_SAMPLES * found.period or not found.period:
+        raise InputError(f'the IMU must rest for at least {LEAST_SAMPLES} samples, it rested for {seconds:.1f} s; '
+                         'record with the IMU lying still on something heavy, for an hour if you can')
+    clock = _Clock(found.epochs)
+    search = TrendSearch(_blocks(found, parts, clock))
+    trends = tuple(search.find(axis) for axis in range(6))
+    detrending = Detrending(trends, search.reference, clock.temperature(found))
+    curve = read_curve(source(), parts, found.period, detrending, clock.time, nominal)
+    scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
+    moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]))
+                    for axis, variance in enumerate(curve.variance.T))
+    flat = tuple(part for of_epoch in parts for part in of_epoch)
+    return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found)
+
+
+def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
+    """Return what is written to noise.yaml: the figures of all axes and what was left out."""
+    record, left = result.record, result.record.left_out
+    times = RecordingTimes(record.curve.period)
+    axes = [_axis_figures(record, k, axis, times) for k, axis in enumerate(result.axes)]
+    recording = {'seconds_at_rest': float(record.curve.seconds), 'parts': len(record.parts),
+                 'longest_part': float(max(part.seconds for part in record.parts)),
+                 'left_out': {'motion': left.motion, 'short_rests': left.short, 'other_sampling_rate': left.other_rate},
+                 'dropped': dict(record.survey.dropped)}
+    return NoiseFigures(tuple(axes[:3]), tuple(axes[3:]), 1.0 / record.curve.period, record.survey.frame_id, recording,
+                        tuple(float(tau) for tau in record.curve.tau), {'software': f'imu_calibration {__version__}'} | (provenance or {}))
+
+
+def _axis_figures(record, k, axis, times):
+    trends = tuple(TrendFigure(trend.name, trend.coefficient, trend.sd, trend.time) for trend in record.trends[k])
+    return AxisFigures(axis.terms, axis.form, axis.others, axis.alternatives, trends, _record_for(axis, times), float(record.sample_sd[k]),
+                       axis.shortest, axis.excess, axis.oscillation, tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
+
+
+def _record_for(axis, times):
+    """Return for how long one must record for each figure that is not determined; what is held counts with the size it may have at most."""
+    found = {}
+    for name, term in axis.terms.items():
+        asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
+        if term.status == DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
+            continue
+        processes, coefficients = list(axis.fit.processes), list(axis.fit.coefficients)
+        if name not in axis.fit.names:
+            processes.insert(0, PROCESSES[name])
+            coefficients.insert(0, 0.0)
+        index = [process.name for process in processes].index(name)
+        coefficients[index] = (term.value or term.interval[1])**2
+        some = [j for j in range(len(processes)) if coefficients[j] > 0]
+        found[name] = times.needed(tuple(processes[j] for j in some), np.array([coefficients[j] for j in some]), some.index(index))
+    return found
+
+
+def _joined(left):
+    return LeftOut(*(sum(getattr(item, name) for item in left) for name in LeftOut.__dataclass_fields__))
+
+
+class _Clock:
+    """Time since the beginning of the recording, across new settings of the clock."""
+
+    def __init__(self, epochs):
+        self._first = [chunks.first_ns for chunks in epochs]
+        lengths = [float(chunks.time[-1]) + EPOCH_GAP if len(chunks) else 0.0 for chunks in epochs]
+        self._offset = np.concatenate([[0.0], np.cumsum(lengths)])
+
+    def time(self, epoch, stamp_ns):
+        """Return seconds since the beginning for stamps of an epoch."""
+        return (stamp_ns - self._first[epoch]) * 1e-9 + self._offset[epoch]
+
+    def temperature(self, found):
+        """Return (time, degrees Celsius) of the thinned temperatures, or None; they belong to the first epoch of the clock."""
+        if found.temperature is None:
+            return None
+        stamp_ns, values = found.temperature
+        order = np.argsort(stamp_ns, kind='stable')
+        return self.time(0, stamp_ns[order]), values[order]
+
+
+def _blocks(found, parts, clock):
+    """Return the means of equal numbers of chunks within the parts."""
+    total = sum(part.chunks.stop - part.chunks.start for of_epoch in parts for part in of_epoch)
+    size = max(int(np.ceil(total / MOST_BLOCKS)), 1)
+    time, mean, number, seconds = [], [], [], 0.0
+    for epoch, (chunks, of_epoch) in enumerate(zip(found.epochs, parts)):
+        for part in of_epoch:
+            inside = part.chunks
+            count = (inside.stop - inside.start) // size
+            take = slice(inside.start, inside.start + count * size)
+            time.append(clock.time(epoch, chunks.first_ns + chunks.time[take].reshape(count, size).mean(axis=1) * 1e9))
+            mean.append(chunks.mean[take].reshape(count, size, 6).mean(axis=1))
+            number.append(np.full(count, len(number)))
+            seconds = size * float(np.median(chunks.duration))
+    time = np.concatenate(time)
+    warmth = clock.temperature(found)
+    return Blocks(time, np.concatenate(mean), np.concatenate(number), seconds, None if warmth is None else np.interp(time, *warmth))
+
+
+def _sample_sd(found, parts):
+    variances = [chunks.sd[part.chunks]**2 for chunks, of_epoch in zip(found.epochs, parts) for part in of_epoch]
+    size = found.epochs[0].size
+    return np.sqrt(np.concatenate(variances).mean(axis=0) * size / (size - 1))

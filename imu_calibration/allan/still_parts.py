@@ -1,0 +1,166 @@
+"""
+The parts of a recording in which nothing moved: where its noise can be read.
+
+Rest is found coarsely as for the checks (`preflight.rest`), then again against what rest usually looks like in this recording: a chunk that
+scatters more (vibration, a knock) and a step from one mean to the next (somebody moved it) end a part. A bias by itself is slower.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter
+
+from imu_calibration.preflight.chunks import Chunks
+from imu_calibration.preflight.rest import still_chunks
+
+OUTLIER = 8.0
+"""Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median."""
+LEAST_GROWTH = 1.25
+"""A scatter within this factor of the median is no motion, however regular it is otherwise."""
+FROZEN = 0.05
+"""Share of chunks without any scatter from which on an output is coarse."""
+SETTLING = 1.0
+"""Kept out on both sides of motion, s."""
+LEAST = 2.0
+"""Shortest part, s."""
+STEP_WIDTHS = (1, 4, 16, 64)
+"""Means of so many chunks are compared: a small step shows only against long ones."""
+NEIGHBOURS = 41
+"""Chunks among which a period is the usual one."""
+SAME_PERIOD = 0.02
+"""Relative change of the sampling period that ends a part."""
+BRIDGE = 60.0
+"""Longest hole within a part, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class StillPart:
+    """A stretch at rest."""
+
+    first_ns: int
+    """First stamp that belongs to it."""
+    end_ns: int
+    """First stamp that does not."""
+    chunks: slice
+    """Its chunks."""
+
+    @property
+    def seconds(self) -> float:
+        """Length, s."""
+        return (self.end_ns - self.first_ns) * 1e-9
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What of a recording was not at rest."""
+
+    motion: float = 0.0
+    """Seconds with motion, and around it."""
+    short: float = 0.0
+    """Seconds at rest in pieces too short to be used."""
+    other_rate: float = 0.0
+    """Seconds sampled at another rate."""
+
+
+def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut]:
+    """
+    Return the parts at rest and what was left out.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        Of one epoch of the clock.
+    period : float
+        Usual time between samples, s.
+
+    """
+    seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0
+    same = _at_the_usual_rate(chunks, period)
+    still = _usual(chunks, still_chunks(chunks) & same)
+    margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
+    shrunk = _shrunk(still, margin)
+    parts, short = [], 0.0
+    for first, last in _runs(shrunk, np.diff(chunks.time) > BRIDGE):
+        part = _part(chunks, first, last)
+        if part.seconds >= LEAST:
+            parts.append(part)
+        else:
+            short += part.seconds
+    moved = float(np.sum(~shrunk & same)) * seconds
+    return parts, LeftOut(moved, short, float(np.sum(~same)) * seconds)
+
+
+def _at_the_usual_rate(chunks, period):
+    """Return the chunks around which most have the usual period; a chunk with a lost sample is longer, its neighbours are not."""
+    if not len(chunks):
+        return np.zeros(0, bool)
+    return np.abs(median_filter(chunks.duration / chunks.size, NEIGHBOURS, mode='nearest') / period - 1.0) <= SAME_PERIOD
+
+
+def _usual(chunks, still):
+    """Return the chunks at rest without those that scatter or step beyond what is usual."""
+    if not still.any():
+        return still
+    scatter = np.log(np.maximum(chunks.sd, _least_scatter(chunks.sd[still])))
+    usual = np.ones(len(chunks), bool)
+    for column in scatter.T:
+        middle, width = _centre(column[still])
+        usual &= column - middle <= max(OUTLIER * width, np.log(LEAST_GROWTH))
+    still = still & usual
+    for width in STEP_WIDTHS:
+        still = still & ~_stepping(chunks.mean, still, width)
+    return still
+
+
+def _least_scatter(sd):
+    """Return the scatter of each column below which there is none to speak of: where a coarse converter often says the same, its steps."""
+    frozen = (sd == 0).mean(axis=0) > FROZEN
+    return np.where(frozen, np.maximum(np.quantile(sd, 0.9, axis=0), 1e-300), 1e-300)
+
+
+def _stepping(mean, still, width):
+    """Return the chunks at which the means of `width` chunks before and after differ by more than they usually do."""
+    sums, count = (np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+                   for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float)))
+    whole = (count[width:] - count[:-width])[:, 0] == width
+    means = (sums[width:] - sums[:-width]) / width
+    step, rests = np.abs(means[width:] - means[:-width]), whole[width:] & whole[:-width]
+    found = np.zeros(len(still), bool)
+    if rests.sum() < 4 * width:
+        return found
+    for column in step.T:
+        size = np.where(rests, column, 0.0)
+        usual = 1.4826 * np.median(column[rests])
+        peaks = (size > OUTLIER * usual) & (size == maximum_filter1d(size, 2 * width + 1)) & (usual > 0)
+        for peak in np.flatnonzero(peaks):
+            margin = max(width // 8, 1)
+            found[peak + width - margin:peak + width + margin] = True
+    return found
+
+
+def _centre(values):
+    """Return the median and the robust standard deviation."""
+    middle = np.median(values)
+    return middle, 1.4826 * np.median(np.abs(values - middle))
+
+
+def _shrunk(still, margin):
+    """Return where rest lasts for `margin` chunks on both sides; the ends of the recording are no motion."""
+    moving = np.concatenate([[0], np.cumsum(~still)])
+    index = np.arange(len(still))
+    return moving[np.minimum(index + margin + 1, len(still))] == moving[np.maximum(index - margin, 0)]
+
+
+def _runs(mask, broken):
+    """Return (first, last + 1) of the runs of True, cut where `broken` says that two neighbours are apart."""
+    edges = []
+    for first, last in np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2):
+        cuts = first + 1 + np.flatnonzero(broken[first:last - 1])
+        edges += list(zip([first, *cuts], [*cuts, last]))
+    return edges
+
+
+def _part(chunks, first, last):
+    begin = chunks.time[first] - 0.5 * chunks.duration[first]
+    end = chunks.time[last - 1] + 0.5 * chunks.duration[last - 1]
+    return StillPart(chunks.first_ns + round(begin * 1e9), chunks.first_ns + round(end * 1e9), slice(int(first), int(last)))

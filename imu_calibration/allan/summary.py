@@ -1,0 +1,178 @@
+"""The figures of the noise in words and rows: for the terminal and the report."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.allan.document import TERMS, UNIT, UNITS
+from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures
+from imu_calibration.allan.processes import RANDOM_WALK, WHITE
+from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
+from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.units import SHOWN_OF_NOISE, significant
+
+TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
+          'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
+          'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
+
+
+BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise that was found',
+         'bound': 'none was seen: the largest that the curve allows'}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of one axis as text."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    axis: str
+    """'x', 'y' or 'z'."""
+    name: str
+    """Name in noise.yaml."""
+    title: str
+    """What people call it, with its letter."""
+    value: str
+    """The figure; '<' and the upper end where it is held."""
+    interval: str
+    """95 %."""
+    unit: str
+    """The unit that data sheets use."""
+    status: str
+    """'determined', 'weak' or 'held'."""
+    note: str
+    """Why it is not determined, and for how long one must record."""
+
+
+def rows(figures: NoiseFigures) -> list[Row]:
+    """Return the figures of all axes, sensor by sensor, figure by figure."""
+    found = []
+    for sensor in SENSORS:
+        for name in TERMS:
+            for letter, axis in zip(AXES, figures.sensor(sensor)):
+                if name in axis.terms:
+                    found.append(_row(sensor, letter, axis, axis.terms[name]))
+    return found
+
+
+def _row(sensor, letter, axis, term):
+    factor, unit = SHOWN_OF_NOISE[UNITS[sensor][term.name]]
+    lower, upper = (end * factor for end in term.interval)
+    value = f'< {significant(upper)}' if term.value is None else _digits(term.value * factor, upper - lower)
+    interval = ' … '.join(_digits(end, upper - lower) for end in (lower, upper))
+    return Row(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
+
+
+def _digits(value, width):
+    """Return a value with the digits that an interval of this width supports."""
+    if not np.isfinite(width) or width <= 0 or not 0 < value < np.inf:
+        return '0' if value == 0 else significant(value)
+    return significant(value, int(np.clip(np.ceil(np.log10(value / width)) + 2, 2, 6)))
+
+
+def _note(axis, term):
+    parts = [term.reason] if term.reason else []
+    if term.name in axis.record_for:
+        seconds = axis.record_for[term.name]
+        parts.append('record for more than two days' if seconds is None else f'record for {duration(seconds)}')
+    return '; '.join(parts)
+
+
+def duration(seconds: float) -> str:
+    """Return a length of time in the largest units that suit."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f'{seconds:.0f} s'
+    if minutes < 120:
+        return f'{minutes} min'
+    return f'{minutes / 60:.3g} h'
+
+
+def requested(axis: AxisFigures) -> list[Term]:
+    """Return the figures of an axis that count: white noise and the slow part, or the random walk where no slow part is seen."""
+    names = [WHITE.name, *(axis.form or (RANDOM_WALK.name,))]
+    return [axis.terms[name] for name in [*names, *([TIME] if 'gauss_markov' in names else [])]]
+
+
+def counts(figures: NoiseFigures) -> dict[str, int]:
+    """Return how many of the figures that count are determined, weak and held."""
+    statuses = [term.status for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)]
+    return {status: statuses.count(status) for status in (DETERMINED, WEAK, HELD)}
+
+
+def exit_code(figures: NoiseFigures) -> int:
+    """Return 0 when every figure that counts is determined and nothing was lost, else 3."""
+    found = counts(figures)
+    return 3 if found[WEAK] or found[HELD] or figures.recording.get('dropped') else 0
+
+
+def lines(figures: NoiseFigures) -> list[str]:
+    """Return what a user must know besides the figures: what was left out and taken out, what else fits, how long to record."""
+    found = [_rest_line(figures.recording)]
+    for sensor in SENSORS:
+        for letter, axis in zip(AXES, figures.sensor(sensor)):
+            found += _axis_lines(f'{sensor} {letter}', sensor, axis)
+    longest = _longest(figures)
+    if longest:
+        found.append(longest)
+    return found
+
+
+def _rest_line(recording):
+    left = {name.replace('_', ' '): seconds for name, seconds in recording['left_out'].items() if seconds >= 0.05}
+    said = ', '.join(f'{seconds:.1f} s of {name}' for name, seconds in left.items())
+    parts = '' if recording['parts'] == 1 else f' in {recording["parts"]} parts, the longest {duration(recording["longest_part"])}'
+    return f'at rest: {duration(recording["seconds_at_rest"])}{parts}' + (f'; left out: {said}' if said else '')
+
+
+def _axis_lines(name, sensor, axis):
+    found = []
+    for trend in axis.trends:
+        factor, unit = SHOWN_OF_NOISE[UNITS[sensor][trend.name]]
+        constant = f' within {duration(trend.time)}' if trend.name == 'turn_on' else ''
+        size = f'{significant(trend.value * factor)} ± {significant(trend.sd * factor, 2)} {unit}'
+        found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; taken out')
+    if axis.others:
+        others = ' or '.join(said(form) for form in axis.others)
+        found.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
+    if axis.excess > 1:
+        found.append(f'{name}: the curve departs from every model by {np.sqrt(axis.excess):.2g} times what chance allows'
+                     f'{_hump(sensor, axis)}; intervals are wider by that')
+    return found
+
+
+def _hump(sensor, axis):
+    """Return what the hump of a curve looks like, or ''."""
+    if axis.oscillation is None:
+        return ''
+    (frequency, amplitude), (factor, unit) = axis.oscillation, SHOWN_OF_NOISE[UNIT[sensor]]
+    return f', as if something oscillated at about {significant(frequency, 2)} Hz by {significant(amplitude * factor, 2)} {unit}'
+
+
+def said(form: tuple[str, ...]) -> str:
+    """Return a form in words."""
+    return ' and '.join(name.replace('_', ' ').replace('gauss markov', 'a Gauss–Markov process') for name in form) or 'white noise alone'
+
+
+def _longest(figures):
+    """Return for how long one must record until everything that counts is determined, or ''."""
+    needed = [axis.record_for[term.name] for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)
+              if term.name in axis.record_for]
+    if not needed:
+        return ''
+    most = None if any(seconds is None for seconds in needed) else max(needed)
+    return 'to determine all of them: record ' + ('more than two days' if most is None else duration(most)) + ' at rest'
+
+
+def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HORIZON) -> list[str]:
+    """Return what filters ask for, continuous and at each rate."""
+    found = []
+    for sensor in SENSORS:
+        densities = figures.densities(sensor, horizon)
+        units = UNITS[sensor]
+        found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]}, '
+                     f'random walk {significant(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
+        for rate in rates:
+            found.append(f'    at {rate:.6g} Hz: a sample scatters by {significant(densities.sample_sd(rate))} {UNIT[sensor]}, '
+                         f'the bias steps by {significant(densities.step_sd(rate))} {UNIT[sensor]}')
+    return found

@@ -1,0 +1,219 @@
+"""
+What is not noise in the readings at rest: the temperature, the settling after turn-on, a steady drift.
+
+Each is a regressor on means of short blocks, ``reading = one constant for each part + sum of coefficient * regressor + noise``, with white
+noise and a random walk whose ratio comes from the restricted likelihood. A bias that walks looks like a trend to ordinary least squares;
+against its own covariance it does not. What is found is subtracted; how much noise goes with it at long averaging times is known.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
+
+MOST_BLOCKS = 200
+CLEAR = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
+"""A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on that are tried."""
+LEAST_BLOCKS = 12
+"""More blocks than constants by this number, or nothing is asked."""
+SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
+"""Time constants of turn-on that are tried, as shares of the recording."""
+RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
+"""Variance of the random walk in the middle of the recording over that of the white noise of a block."""
+TEMPERATURE, TURN_ON, RAMP = 'temperature', 'turn_on', 'ramp'
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Means of equal stretches at rest."""
+
+    time: np.ndarray
+    """Middle, s since the beginning of the recording, shape (n,)."""
+    mean: np.ndarray
+    """Readings, shape (n, 6)."""
+    part: np.ndarray
+    """Part that each belongs to, shape (n,)."""
+    seconds: float
+    """Length of a block."""
+    temperature_c: np.ndarray | None = None
+    """Mean temperature, shape (n,); None without."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """One trend of one axis."""
+
+    name: str
+    """'temperature', 'turn_on' or 'ramp'."""
+    coefficient: float
+    """Per kelvin, or the size at the beginning, or per second."""
+    sd: float
+    """Standard deviation of the coefficient."""
+    time: float = 0.0
+    """Time constant of turn-on, s."""
+
+    def at(self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference') -> np.ndarray:
+        """Return the trend at instants (s since the beginning), shape (n,)."""
+        return self.coefficient * shape_of(self.name, self.time)(time, temperature_c, reference)
+
+
+@dataclass(frozen=True)
+class TrendReference:
+    """Where the trends are zero, or begin."""
+
+    begin: float = 0.0
+    """Beginning of the recording, s."""
+    middle: float = 0.0
+    """Middle of the blocks, s."""
+    temperature_c: float = 0.0
+    """Mean temperature."""
+
+
+def shape_of(name: str, constant: float = 0.0) -> Callable:
+    """Return the regressor of a trend as a function of (time, temperature, reference)."""
+    return {TEMPERATURE: lambda time, warmth, reference: warmth - reference.temperature_c,
+            TURN_ON: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
+            RAMP: lambda time, warmth, reference: time - reference.middle}[name]
+
+
+class TrendSearch:
+    """
+    Finds trends in the means of blocks.
+
+    Parameters
+    ----------
+    blocks : Blocks
+
+    """
+
+    def __init__(self, blocks: Blocks):
+        self.blocks = blocks
+        self._constants = (blocks.part[:, None] == np.unique(blocks.part)[None, :]).astype(float)
+        warmth = blocks.temperature_c
+        begin = float(blocks.time[0] - blocks.seconds / 2)
+        self.reference = TrendReference(begin, float(blocks.time.mean()), 0.0 if warmth is None else float(warmth.mean()))
+        lag = blocks.time[:, None] - blocks.time[None, :]
+        self._walk = mean_covariance(RANDOM_WALK, lag, blocks.seconds)
+        self._lag = lag
+        centred = self._walk - self._walk.mean(axis=0) - self._walk.mean(axis=1)[:, None] + self._walk.mean()
+        self._scale = float(np.trace(centred)) / len(lag)
+        self._whiteners = [self._whitener(ratio) for ratio in RATIOS]
+
+    @property
+    def usable(self) -> bool:
+        """Whether there are enough blocks."""
+        return len(self.blocks.time) - self._constants.shape[1] >= LEAST_BLOCKS
+
+    def _whitener(self, ratio):
+        """Return (inverse factor, log determinant) of unit white noise and a random walk, in a form that needs no variance of the walk."""
+        centred = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
+        covariance = np.eye(len(centred)) + ratio / self._scale * centred
+        factor = np.linalg.cholesky(covariance)
+        return np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum()
+
+    def find(self, axis: int) -> tuple[Trend, ...]:
+        """Return the trends of an axis (0 to 5), the temperature first."""
+        if not self.usable:
+            return ()
+        chosen: list[tuple[str, float]] = []
+        while True:
+            asked = [TEMPERATURE] if not chosen and self._warmth_varies() else []
+            found = self._clearest(axis, chosen, asked) or self._clearest(axis, chosen, [TURN_ON, RAMP])
+            if found is None:
+                break
+            chosen.append(found)
+        if not chosen:
+            return ()
+        values, sd, _ = self.regress(axis, chosen)
+        return tuple(Trend(name, float(v), float(s), constant) for (name, constant), v, s in zip(chosen, values, sd))
+
+    def _warmth_varies(self):
+        return self.blocks.temperature_c is not None and np.ptp(self.blocks.temperature_c) > 0.1
+
+    def _clearest(self, axis, chosen, names):
+        """Return the (name, time constant) whose coefficient is clearest beside those chosen, or None."""
+        span = np.ptp(self.blocks.time) + self.blocks.seconds
+        taken = {name for name, _ in chosen}
+        tried = [(name, constant) for name in names if name not in taken
+                 for constant in ([share * span for share in SETTLING_SHARES] if name == TURN_ON else [0.0])]
+        scores = []
+        for trial in tried:
+            values, sd, _ = self.regress(axis, [*chosen, trial])
+            scores.append(abs(values[-1]) / sd[-1])
+        best = int(np.argmax(scores)) if scores else None
+        return None if best is None or scores[best] < CLEAR[tried[best][0]] else tried[best]
+
+    def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
+        """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""
+        shapes = [shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference) for trend in trends]
+        return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1]:]
+
+    def regress(self, axis: int, trends: list[tuple[str, float]]) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return coefficients, their standard deviations, and the index of the likeliest ratio of `RATIOS`."""
+        design, target = np.column_stack([self._constants, self.columns(trends)]), self.blocks.mean[:, axis]
+        size = np.linalg.norm(design, axis=0)
+        fits = []
+        for inverse, logs in self._whiteners:
+            basis, triangle = np.linalg.qr(inverse @ (design / size))
+            rest = inverse @ target
+            along = basis.T @ rest
+            squares = float(rest @ rest - along @ along)
+            freedom = len(target) - design.shape[1]
+            cost = logs + 2 * np.log(np.abs(np.diag(triangle))).sum() + freedom * np.log(squares)
+            fits.append((cost, triangle, along, squares / freedom))
+        best = int(np.argmin([fit[0] for fit in fits]))
+        _, triangle, along, variance = fits[best]
+        root = np.linalg.inv(triangle)
+        values, sd = root @ along / size, np.sqrt(variance * np.einsum('ij,ij->i', root, root)) / size
+        return values[-len(trends):], sd[-len(trends):], best
+
+    def kept(self, axis: int, trends: tuple[Trend, ...]) -> 'KeptShare':
+        """Return how much of the Allan variance is left when these trends have been taken out."""
+        if not trends:
+            return KeptShare()
+        shapes = [(trend.name, trend.time) for trend in trends]
+        inverse = self._whiteners[self.regress(axis, shapes)[2]][0]
+        design = np.column_stack([self._constants, self.columns(shapes)])
+        whitened = inverse @ design
+        taken = np.eye(len(design)) - design @ np.linalg.pinv(whitened) @ inverse
+        counts = np.unique(np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int))
+        shares = {process.name: self._shares(process, counts, taken) for process in (WHITE, FLICKER, RANDOM_WALK)}
+        return KeptShare(counts * self.blocks.seconds, shares)
+
+    def _shares(self, process, counts, taken):
+        covariance = mean_covariance(process, self._lag, self.blocks.seconds)
+        shares = np.ones(len(counts))
+        for k, count in enumerate(counts):
+            difference = self._differences(count)
+            if len(difference):
+                left = difference @ taken
+                shares[k] = np.einsum('ij,jk,ik->', left, covariance, left) / np.einsum('ij,jk,ik->', difference, covariance, difference)
+        return np.clip(shares, 0.02, 1.0)
+
+    def _differences(self, count):
+        """Return the second differences at `count` blocks per mean as rows, within parts only."""
+        n = len(self.blocks.time)
+        starts = [k for k in range(n - 2 * count + 1) if self.blocks.part[k] == self.blocks.part[k + 2 * count - 1]]
+        rows = np.zeros((len(starts), n))
+        for row, k in zip(rows, starts):
+            row[k:k + count], row[k + count:k + 2 * count] = -1.0 / count, 1.0 / count
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class KeptShare:
+    """Share of the Allan variance of a process that is left after trends were taken out."""
+
+    tau: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Averaging times, s; empty when nothing was taken out."""
+    shares: dict = field(default_factory=dict)
+    """Name of the process -> shares at `tau`."""
+
+    def of(self, process: NoiseProcess, tau: np.ndarray) -> np.ndarray:
+        """Return the shares at averaging times."""
+        if not len(self.tau):
+            return np.ones(len(tau))
+        shares = self.shares.get(process.name, self.shares[FLICKER.name])
+        return np.interp(np.log(tau), np.log(self.tau), shares)

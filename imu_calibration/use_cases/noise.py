@@ -1,0 +1,87 @@
+"""From a recording at rest to the figures of its noise."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+
+from imu_calibration import files
+from imu_calibration.allan.document import noise_to_text
+from imu_calibration.allan.figures import HORIZON, NoiseFigures
+from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
+from imu_calibration.allan.summary import exit_code, lines
+from imu_calibration.preflight.checks import warnings
+from imu_calibration.samples import NominalScaling, SampleBlock
+from imu_calibration.use_cases.choices import nominal_of
+from imu_calibration.use_cases.drawing import Drawing
+from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedNoise:
+    """What a recording says about the noise: prints the figures, draws the Allan curves, saves noise.yaml and report.html."""
+
+    result: NoiseIdentification
+    """The identification with everything that a report needs."""
+    figures: NoiseFigures
+    """What noise.yaml holds."""
+    horizon: float = HORIZON
+    """Averaging time at which a random walk stands for other slow noise, s."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every figure that counts is determined and nothing was lost, else 3."""
+        return exit_code(self.figures)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What looks wrong with the recording."""
+        return tuple(finding.text for finding in warnings(self.result.record.survey.findings))
+
+    def plot(self, sensor: str = 'accelerometer') -> Drawing:
+        """Return the Allan deviations of one sensor with their model as a figure for a notebook."""
+        from imu_calibration.report.noise_curve import draw_curve
+        return Drawing(draw_curve(self.result, sensor))
+
+    @cached_property
+    def report(self) -> str:
+        """The report as one HTML page."""
+        from imu_calibration.report.noise_page import noise_report
+        return noise_report(self.result, self.figures, self.horizon)
+
+    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
+        """Write noise.yaml and, when wanted, report.html into a folder."""
+        text, place = noise_to_text(self.figures, self.horizon), files.make_folder(folder)
+        if report:
+            files.write_text(place / 'report.html', self.report)
+        files.write_text(place / 'noise.yaml', text)
+
+    def __str__(self):
+        return '\n'.join(lines(self.figures))
+
+
+def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = None, temperature_topic: str | None = None,
+          nominal: str | PathLike | NominalScaling | None = None, horizon: float = HORIZON) -> IdentifiedNoise:
+    """
+    Identify the noise of an IMU from a recording that holds rest.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+        Bag, or samples in memory; it is read twice.
+    imu_topic, temperature_topic : str, optional
+        Default /imu/data_raw and /imu/temperature, else the only topics of their types.
+    nominal : path-like or NominalScaling, optional
+        For recordings in volts or counts.
+    horizon : float
+        Averaging time at which a random walk stands for other slow noise, s.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When the recording cannot be used, or nothing in it is at rest for long enough.
+
+    """
+    topics = Topics(imu_topic, None, temperature_topic)
+    result = identify_noise(source_of(recording, topics, want_joints=False), nominal_of(nominal))
+    options = {name: value for name, value in (('imu_topic', imu_topic), ('temperature_topic', temperature_topic)) if value}
+    return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

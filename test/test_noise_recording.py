@@ -1,0 +1,255 @@
+"""From a recording to noise.yaml: what is at rest is found, trends are taken out and said, and the verb writes what it promises."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration.allan.document import noise_from_text, noise_to_text
+from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
+from imu_calibration.allan.processes import RANDOM_WALK
+from imu_calibration.allan.summary import exit_code, filter_lines, lines
+from imu_calibration.allan.trends import Blocks, Trend, TrendSearch
+from imu_calibration.cli.main import main
+from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.report.noise_page import noise_report
+from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
+from msg_adapters.write import write_session
+
+from worlds.noise_worlds import random_walk, white
+
+PERIOD = 0.02
+SIZES = np.array([2e-3] * 3 + [1e-4] * 3)
+WALK = 0.03
+
+
+def resting(seconds, seed=0, walk=WALK, period=PERIOD):
+    """An IMU at rest, z up: white noise of SIZES, a random walk of `walk` times that."""
+    rng, n = np.random.default_rng(seed), int(seconds / period)
+    values = np.column_stack([size * (white(n, period, 1.0, rng) + random_walk(n, period, walk, rng)) for size in SIZES])
+    values[:, 2] += 9.81
+    return ImuSamples(np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18, values[:, :3], values[:, 3:], 'imu_link')
+
+
+def source(imu, temperature=None, size=20_000):
+    """Blocks of a recording, each time anew."""
+    def blocks():
+        for start in range(0, len(imu), size):
+            part = imu.select(slice(start, start + size))
+            warm = None
+            if temperature is not None:
+                warm = temperature.select((temperature.stamp_ns >= part.stamp_ns[0]) & (temperature.stamp_ns <= part.stamp_ns[-1]))
+            yield SampleBlock(part, temperature=warm)
+    return blocks
+
+
+def changed(imu, columns, start, values):
+    """The samples with something added to columns (0 to 5) from sample `start` on."""
+    both = np.concatenate([imu.force_s, imu.rate_s], axis=1)
+    both[start:start + len(values), columns] += values
+    return ImuSamples(imu.stamp_ns, both[:, :3], both[:, 3:], imu.frame_id)
+
+
+@pytest.fixture(scope='module')
+def quiet():
+    """Twenty minutes at rest, and what is identified from them."""
+    imu = resting(1200.0)
+    return imu, identify_noise(source(imu))
+
+
+def test_rest_is_used_whole_and_nothing_is_taken_out(quiet):
+    found = quiet[1].record
+    assert len(found.parts) == 1 and found.curve.seconds == pytest.approx(1200.0, abs=1.0)
+    assert found.left_out.motion == 0 and not any(found.trends)
+    for axis, size in zip(quiet[1].axes, SIZES):
+        lower, upper = axis.terms['white_noise'].interval
+        assert lower * 0.995 < size < upper * 1.005
+    np.testing.assert_allclose(found.sample_sd, SIZES / np.sqrt(PERIOD), rtol=0.02)
+
+
+def test_the_outcome_does_not_depend_on_the_blocks(quiet):
+    again = read_rest(source(quiet[0], size=3_333))
+    np.testing.assert_allclose(again.curve.variance, quiet[1].record.curve.variance, rtol=1e-9)
+
+
+def test_a_knock_is_left_out_and_the_noise_is_as_without_it(quiet):
+    imu, before = quiet
+    rng = np.random.default_rng(1)
+    knocked = changed(imu, slice(0, 6), 30_000, rng.normal(0, 1, (40, 6)) * np.array([0.5] * 3 + [0.03] * 3))
+    found = read_rest(source(knocked))
+    assert len(found.parts) == 2 and 0.5 < found.left_out.motion < 6.0
+    # short averages are the same, but for two seconds in twenty minutes
+    np.testing.assert_allclose(found.curve.variance[:10], before.record.curve.variance[:10], rtol=5e-3)
+
+
+def test_an_imu_that_was_moved_is_two_stretches(quiet):
+    imu, before = quiet
+    tilted = changed(imu, 0, 30_000, np.full(30_000, 0.03))   # 3 mrad, less than a fifth of a sample's noise
+    found = read_rest(source(tilted))
+    assert len(found.parts) == 2
+    # the step would add 0.03^2 / 12 at the longest averages
+    longest = (found.curve.tau > 100) & (found.curve.tau < 300)
+    assert np.all(found.curve.variance[longest, 0] < 0.3 * 0.03**2 / 12)
+    assert found.parts[0].seconds == pytest.approx(600.0, abs=15.0)
+
+
+def test_a_walking_bias_is_no_motion():
+    """A bias that walks ten times the usual over twenty minutes stays in one part."""
+    found = read_rest(source(resting(1200.0, 2, walk=0.3)))
+    assert len(found.parts) == 1 and found.left_out.motion == 0
+
+
+def warming(imu, per_kelvin, seed=3):
+    """Temperature that rises by 10 K, and readings that follow it."""
+    time = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9
+    warmth = 25.0 + 10.0 * (1 - np.exp(-time / 400.0))
+    stamps = imu.stamp_ns[::50]
+    noisy = warmth[::50] + np.random.default_rng(seed).normal(0, 0.02, len(stamps))
+    return changed(imu, 0, 0, per_kelvin * (warmth - 30.0)), TemperatureSamples(stamps, noisy)
+
+
+def test_the_temperature_is_taken_out_and_said(quiet):
+    imu, before = quiet
+    warm, temperature = warming(imu, 5e-3)
+    found = identify_noise(source(warm, temperature))
+    (trend,) = found.record.trends[0]
+    assert trend.name == 'temperature' and abs(trend.coefficient - 5e-3) < 4 * trend.sd
+    assert not any(found.record.trends[1:])
+    assert any('follows the temperature' in line for line in lines(figures_of(found)))
+    # the curve with the trend is far above at long times, the one without it is not
+    curve = found.record.curve
+    longest = curve.tau > 100
+    assert np.all(curve.raw[longest, 0] > 3 * curve.variance[longest, 0])
+    lower, upper = found.axes[0].terms['random_walk'].interval
+    assert lower < SIZES[0] * WALK < upper
+    blind = read_rest(source(warm))
+    assert blind.trends[0] and blind.trends[0][0].name in ('turn_on', 'ramp')
+
+
+def test_trends_are_not_found_in_a_walk():
+    """Walks look like trends; against their own covariance they are not. 20 records of 6 axes."""
+    rng, n = np.random.default_rng(4), 150
+    time = np.arange(n) * 20.0 + 10.0
+    found = 0
+    for ratio in (0.0, 1.0, 50.0):
+        for _ in range(7):
+            means = rng.normal(size=(n, 6)) + np.cumsum(rng.normal(size=(n, 6)), axis=0) * np.sqrt(6 * ratio / n)
+            search = TrendSearch(Blocks(time, means, np.zeros(n, int), 20.0, 25 + 10 * (1 - np.exp(-time / 900))))
+            found += sum(len(search.find(axis)) for axis in range(6))
+    assert found <= 4   # of 126 axes; one in a thousand each for temperature, turn-on and ramp
+
+
+def test_what_goes_with_a_trend_is_known():
+    """Taking a line out of a walk takes variance at long averages: as much as `kept` says."""
+    rng, n, seconds = np.random.default_rng(5), 60, 10.0
+    time = (np.arange(n) + 0.5) * seconds
+    ratios = []
+    means = np.zeros((n, 6))
+    search = TrendSearch(Blocks(time, means, np.zeros(n, int), seconds))
+    for _ in range(300):
+        walk = means[:, 0] = np.cumsum(rng.normal(size=n)) + 0.1 * rng.normal(size=n)
+        values, *_ = search.regress(0, [('ramp', 0.0)])
+        rest = walk - search.columns([('ramp', 0.0)])[:, 0] * values[0]
+        ratios.append([np.mean((series[40:] - 2 * series[20:-20] + series[:-40])**2) for series in
+                       (np.concatenate([[0], np.cumsum(x)]) for x in (rest, walk))])
+    kept = search.kept(0, (Trend('ramp', 0.0, 1.0),)).of(RANDOM_WALK, np.array([20 * seconds]))[0]
+    left, whole = np.mean(ratios, axis=0)
+    assert kept < 0.97
+    assert left / whole == pytest.approx(kept, abs=0.06)   # 300 records with about one average each
+
+
+def test_lost_samples_and_holes_in_time_change_little(quiet):
+    imu, before = quiet
+    keep = np.random.default_rng(6).random(len(imu)) > 0.005
+    keep[20_000:20_400] = False
+    found = read_rest(source(imu.select(keep)))
+    assert found.curve.seconds == pytest.approx(1200.0, abs=2.0)
+    np.testing.assert_allclose(found.curve.variance[:16], before.record.curve.variance[:16], rtol=0.03)
+
+
+def test_stamps_in_milliseconds_and_an_odd_rate_are_followed():
+    imu = resting(600.0, 7, period=1 / 104.17)
+    rounded = imu.stamp_ns // 1_000_000 * 1_000_000
+    found = read_rest(source(ImuSamples(rounded, imu.force_s, imu.rate_s, imu.frame_id)))
+    assert 1 / found.curve.period == pytest.approx(104.17, rel=1e-3)
+    assert sum(found.curve.lengths) == pytest.approx(len(imu), abs=20)
+
+
+def test_what_moves_all_the_time_is_refused(tmp_path, capsys):
+    rng = np.random.default_rng(8)
+    imu = changed(resting(20.0, 8), slice(0, 6), 0, np.cumsum(rng.normal(0, 0.05, (1000, 6)), axis=0))
+    with pytest.raises(InputError, match='must rest for at least 1000 samples'):
+        read_rest(source(imu))
+
+
+def test_a_document_is_read_as_it_was_written(quiet):
+    figures = figures_of(quiet[1], {'bags': [{'name': 'a', 'sha256': 'b'}]})
+    text = noise_to_text(figures)
+    assert noise_to_text(noise_from_text(text)) == text
+    document = yaml.safe_load(text)
+    assert document['format'] == 'imu_calibration/noise/1'
+    assert set(document['accelerometer']['white_noise']) == {'value', 'interval95', 'status', 'reason', 'unit'}
+    assert document['accelerometer']['white_noise']['unit'] == 'm/s^2/sqrt(Hz)'
+
+
+@pytest.mark.parametrize('change, what', [
+    (lambda d: d.update(format='imu_calibration/1'), 'must say'), (lambda d: d.pop('gyroscope'), 'must have the parts'),
+    (lambda d: d['gyroscope'].pop('random_walk'), "must have 'random_walk'"), (lambda d: d.update(sampling_rate=0.0), 'above zero'),
+    (lambda d: d['gyroscope']['white_noise'].update(value=[None] * 3), 'finite value'),
+    (lambda d: d['gyroscope']['white_noise'].update(interval95=[[2.0, 1.0], [2.0, 1.0], [2.0, 1.0]]), 'rising order')])
+def test_a_spoiled_document_is_refused_in_one_line(quiet, change, what):
+    document = yaml.safe_load(noise_to_text(figures_of(quiet[1])))
+    change(document)
+    with pytest.raises(DocumentError, match=what) as refused:
+        noise_from_text(yaml.safe_dump(document))
+    assert '\n' not in str(refused.value)
+
+
+def test_discrete_figures_follow_the_rate(quiet):
+    figures = figures_of(quiet[1])
+    found = figures.densities('accelerometer')
+    assert found.sample_sd(400.0) == pytest.approx(2 * found.sample_sd(100.0))
+    assert found.step_sd(400.0) == pytest.approx(0.5 * found.step_sd(100.0))
+    assert len(filter_lines(figures, [50.0, 400.0])) == 6
+
+
+def test_the_report_holds_the_plots_and_is_the_same_each_time(quiet):
+    figures = figures_of(quiet[1])
+    page = noise_report(quiet[1], figures)
+    assert page == noise_report(quiet[1], figures)
+    assert page.count('<svg') == 2 and 'slope −½' in page and 'averaging time τ, s' in page and 'nan' not in page.lower().replace('nano', '')
+
+
+def test_memory_is_that_of_a_shorter_recording():
+    """Four times the length takes hardly more: means of a quarter of a second are kept, samples are not."""
+    peaks = []
+    for seconds in (400.0, 1600.0):
+        blocks = [resting(100.0, 9)]
+
+        def stream(blocks=blocks, seconds=seconds):
+            part = blocks[0]
+            for k in range(int(seconds / 100)):
+                yield SampleBlock(ImuSamples(part.stamp_ns + k * 100_000_000_000, part.force_s, part.rate_s, part.frame_id))
+        tracemalloc.start()
+        read_rest(stream)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 30e6
+
+
+def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys):
+    imu = resting(120.0, 10)
+    write_session(tmp_path / 'bag', imu, None, None)
+    assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
+    said = capsys.readouterr().out
+    assert 'accelerometer.x white noise N' in said and 'at 200 Hz' in said and 'to determine all of them: record' in said
+    figures = noise_from_text((tmp_path / 'out/noise.yaml').read_text())
+    assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
+    assert figures.provenance['bags'][0]['name'] == 'bag'
+    assert (tmp_path / 'out/report.html').read_text().startswith('<!DOCTYPE html>')
+    short = imu.select(slice(0, 400))
+    write_session(tmp_path / 'short', short, None, None)
+    assert main(['noise', str(tmp_path / 'short'), '--output', str(tmp_path / 'none')]) == 1
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and 'must rest' in error and not (tmp_path / 'none').exists()
