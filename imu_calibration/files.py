@@ -9,6 +9,8 @@ from pathlib import Path
 from stat import S_ISDIR
 
 from imu_calibration import documents
+from imu_calibration.allan.document import noise_from_text
+from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import calibration_from_text, checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import InputError
@@ -66,6 +68,14 @@ def read_tolerances(path, catalogue=CATALOGUE):
 def read_calibration(path):
     """Return the calibration in a file."""
     return calibration_from_text(read_text(path, 'calibration'))
+
+
+def read_noise(path: str | os.PathLike) -> NoiseFigures:
+    """Return the noise in a file that the verb `noise` wrote; an error names the file."""
+    try:
+        return noise_from_text(read_text(path, 'noise document'))
+    except InputError as error:
+        raise error.named(path) from error
 
 
 def make_folder(path):

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
+from imu_calibration import files
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
 from imu_calibration.allan.summary import exit_code, filter_lines, lines
-from imu_calibration.allan.trends import Blocks, Trend, TrendSearch
+from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.report.noise_page import noise_report
@@ -153,7 +154,7 @@ def test_what_goes_with_a_trend_is_known():
         rest = walk - search.columns([('ramp', 0.0)])[:, 0] * values[0]
         ratios.append([np.mean((series[40:] - 2 * series[20:-20] + series[:-40])**2) for series in
                        (np.concatenate([[0], np.cumsum(x)]) for x in (rest, walk))])
-    kept = search.kept(0, (Trend('ramp', 0.0, 1.0),)).of(RANDOM_WALK, np.array([20 * seconds]))[0]
+    kept = search.kept(0, (AxisTrend('ramp', 0.0, 1.0),)).of(RANDOM_WALK, np.array([20 * seconds]))[0]
     left, whole = np.mean(ratios, axis=0)
     assert kept < 0.97
     assert left / whole == pytest.approx(kept, abs=0.06)   # 300 records with about one average each
@@ -244,7 +245,7 @@ def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys
     assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
     said = capsys.readouterr().out
     assert 'accelerometer.x white noise N' in said and 'at 200 Hz' in said and 'to determine all of them: record' in said
-    figures = noise_from_text((tmp_path / 'out/noise.yaml').read_text())
+    figures = files.read_noise(tmp_path / 'out/noise.yaml')
     assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
     assert figures.provenance['bags'][0]['name'] == 'bag'
     assert (tmp_path / 'out/report.html').read_text().startswith('<!DOCTYPE html>')

@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.allan.deviation import AllanSums, averaging_factors
 from imu_calibration.allan.sample_grid import SampleGrid, spread
 from imu_calibration.allan.still_parts import StillPart
-from imu_calibration.allan.trends import Trend, TrendReference
+from imu_calibration.allan.trends import AxisTrend, TrendReference
 from imu_calibration.samples import NominalScaling, SampleBlock
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
 
@@ -43,7 +43,7 @@ class AllanCurve:
 class Detrending:
     """What is subtracted from the samples."""
 
-    trends: tuple[tuple[Trend, ...], ...]
+    trends: tuple[tuple[AxisTrend, ...], ...]
     """Trends of each of the six axes."""
     reference: TrendReference
     """Where they begin."""

@@ -16,7 +16,7 @@ from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, still_parts
 from imu_calibration.allan.survey import Survey, survey
 from imu_calibration.allan.terms import DETERMINED, AxisNoise, identify_axis
-from imu_calibration.allan.trends import MOST_BLOCKS, Blocks, Trend, TrendSearch
+from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.errors import InputError
 from imu_calibration.samples import NominalScaling, SampleBlock
 
@@ -34,7 +34,7 @@ class RestingRecord:
     """Allan variances of the six axes."""
     moments: tuple[Moments, ...]
     """Variances with their covariance, one for each axis: force x, y, z, then rate x, y, z."""
-    trends: tuple[tuple[Trend, ...], ...]
+    trends: tuple[tuple[AxisTrend, ...], ...]
     """What was taken out of each axis."""
     parts: tuple[StillPart, ...]
     """Stretches at rest."""

@@ -21,7 +21,7 @@ BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise that was f
 
 
 @dataclass(frozen=True)
-class Row:
+class FigureRow:
     """One figure of one axis as text."""
 
     sensor: str
@@ -44,7 +44,7 @@ class Row:
     """Why it is not determined, and for how long one must record."""
 
 
-def rows(figures: NoiseFigures) -> list[Row]:
+def rows(figures: NoiseFigures) -> list[FigureRow]:
     """Return the figures of all axes, sensor by sensor, figure by figure."""
     found = []
     for sensor in SENSORS:
@@ -60,7 +60,7 @@ def _row(sensor, letter, axis, term):
     lower, upper = (end * factor for end in term.interval)
     value = f'< {significant(upper)}' if term.value is None else _digits(term.value * factor, upper - lower)
     interval = ' … '.join(_digits(end, upper - lower) for end in (lower, upper))
-    return Row(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
+    return FigureRow(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
 
 
 def _digits(value, width):

@@ -42,7 +42,7 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class Trend:
+class AxisTrend:
     """One trend of one axis."""
 
     name: str
@@ -113,7 +113,7 @@ class TrendSearch:
         factor = np.linalg.cholesky(covariance)
         return np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum()
 
-    def find(self, axis: int) -> tuple[Trend, ...]:
+    def find(self, axis: int) -> tuple[AxisTrend, ...]:
         """Return the trends of an axis (0 to 5), the temperature first."""
         if not self.usable:
             return ()
@@ -127,7 +127,7 @@ class TrendSearch:
         if not chosen:
             return ()
         values, sd, _ = self.regress(axis, chosen)
-        return tuple(Trend(name, float(v), float(s), constant) for (name, constant), v, s in zip(chosen, values, sd))
+        return tuple(AxisTrend(name, float(v), float(s), constant) for (name, constant), v, s in zip(chosen, values, sd))
 
     def _warmth_varies(self):
         return self.blocks.temperature_c is not None and np.ptp(self.blocks.temperature_c) > 0.1
@@ -169,7 +169,7 @@ class TrendSearch:
         values, sd = root @ along / size, np.sqrt(variance * np.einsum('ij,ij->i', root, root)) / size
         return values[-len(trends):], sd[-len(trends):], best
 
-    def kept(self, axis: int, trends: tuple[Trend, ...]) -> 'KeptShare':
+    def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
         """Return how much of the Allan variance is left when these trends have been taken out."""
         if not trends:
             return KeptShare()
