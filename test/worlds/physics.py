@@ -16,6 +16,7 @@ from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, Tempe
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders, realistic
 
+from worlds.physics_cause import NO_CAUSE
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
 from worlds.physics_sensor import low_pass
 from worlds.physics_table import local_gravity, move_table
@@ -57,7 +58,7 @@ class Session:
 
 def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_rate=100.0, joint_rate=100.0, duration=None, profile='random',
                  table='three_axis', arms=False, mount_rpy_deg=None, temperature='warm_up', velocity='good', encoder_resolution=None,
-                 dropped=None, only_at_rest=False, knock=False, wrong_covariance=False, oversampling=8):
+                 dropped=None, only_at_rest=False, knock=False, wrong_covariance=False, oversampling=8, unit=None, cause=None):
     """
     Return a `Session` with effects hidden in it.
 
@@ -75,8 +76,8 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         IMU grade in `imu_calibration.simulation.sensor_noise.GRADES`.
     duration : float, optional
         Length of the session, s; default the profile's own.
-    profile : str
-        Name in `imu_calibration.simulation.profiles`.
+    profile : str or Profile
+        Name in `imu_calibration.simulation.profiles`, or a motion.
     table : str or dict
         Name in `TABLES` or a description; `mount_rpy_deg` changes the mount.
     arms : bool
@@ -97,25 +98,31 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         The messages claim a noise that is ten times too small.
     oversampling : int
         Steps of the fine grid per sample, used when there is a filter.
+    unit : int, optional
+        Draws the IMU in place of `seed`: sessions of one unit.
+    cause : worlds.physics_cause.Cause, optional
+        What the world does beside the motion.
 
     """
+    cause = cause or NO_CAUSE
     hidden = dict(hidden or {})
     mapping = copy.deepcopy(TABLES[table] if isinstance(table, str) else table)
     if mount_rpy_deg is not None:
         mapping['mount']['rpy_deg'] = list(mount_rpy_deg)
-    moves = make_profile(profile, seed=seed, table=mapping, duration=duration)
+    told = make_profile(profile, seed=seed, table=mapping, duration=duration) if isinstance(profile, str) else profile
+    moves = cause.moved(told)
     n_joints = len(mapping['joints'])
     # Every thing is drawn from its own generator: hiding an effect leaves unit, motion and noise as they were.
     values = {name: draw_value(name, size, n_joints, generator(seed, name)) for name, size in hidden.items()}
     model = _noise_model(noise, grade, encoder_resolution)
-    triads = draw_imu(GRADES[grade], values, arms, generator(seed, 'unit'))
+    triads = draw_imu(GRADES[grade], values, arms, generator(seed if unit is None else unit, 'unit'))
     events = draw_events(moves, generator(seed, 'events'))
     climate = Climate(temperature or 'warm_up', moves.duration, generator(seed, 'climate'))
     gravity = mapping['gravity'] or local_gravity(mapping['latitude'], mapping['height'])
-    sampling = _Sampling(imu_rate, moves.duration, oversampling if any(triad.low_pass for triad in triads) else 1)
+    sampling = _Sampling(imu_rate, moves.duration, max(cause.oversampling, oversampling if any(triad.low_pass for triad in triads) else 1))
 
     world = _move(mapping, moves, sampling.fine_time, gravity, values, events)
-    outputs = _sense(world, triads, climate.at(sampling.fine_time), values, events)
+    outputs = _sense(world, triads, climate.at(sampling.fine_time), values, events, cause)
     outputs = [low_pass(out, sampling.step, triad.low_pass, triad.low_pass_order)[:: sampling.factor]
                for out, triad in zip(outputs, triads)]
     if knock or 'knock_step' in values:
@@ -126,9 +133,9 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
 
     clock = generator(seed, 'clock')
     start_ns = 1_700_000_000_000_000_000 + int(clock.integers(10**12))
-    stamp_ns = start_ns + to_ns(sampling.time + values.get('time_offset', 0.0))
+    stamp_ns = start_ns + to_ns(sampling.time + values.get('time_offset', 0.0) + cause.stamped(sampling.time, generator(seed, 'driver')))
     imu = ImuSamples(jitter_stamps(stamp_ns, model.stamp_jitter, clock), *outputs, 'imu_link')
-    joints = _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, generator(seed, 'encoders'))
+    joints = _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, cause, generator(seed, 'encoders'))
     published = climate.publish(start_ns, moves.duration, generator(seed, 'thermometer')) if temperature else None
     if 'earth_rate' in values:
         values['earth_rate'] = world.earth_n
@@ -177,12 +184,13 @@ def _move(mapping, moves, time, gravity, values, events):
     return move_table(mapping, time, motion, gravity, values.get('table_tilt', (0.0, 0.0)), values.get('axis_non_orthogonality'), slip)
 
 
-def _sense(world, triads, temperature_c, values, events):
+def _sense(world, triads, temperature_c, values, events, cause):
     accel, gyro = triads
-    force_s = world.to_sensor(world.force_n)
+    plate = [world.to_sensor(vector) for vector in (world.force_n, world.rate_n, world.alpha_n)]
+    force_s, rate_s = cause.carried(world.time, *plate)
     same = not np.any(accel.arms)
-    forces = [force_s] * 3 if same else [world.force_at(arm) for arm in accel.arms]
-    rates = [world.to_sensor(world.rate_n)] * 3
+    forces = [force_s] * 3 if same else [world.force_at(arm) + force_s - plate[0] for arm in accel.arms]
+    rates = [rate_s] * 3
     outputs = [accel.respond(forces, world.time, temperature_c, force_s), gyro.respond(rates, world.time, temperature_c, force_s)]
     first, second = world.joints[:, 0], world.joints[:, min(1, world.joints.shape[1] - 1)]
     for k, name in enumerate(('angle_bias_accel', 'angle_bias_gyro')):
@@ -195,7 +203,7 @@ def _sense(world, triads, temperature_c, values, events):
     if 'second_warm_up' in values:
         since = np.maximum(world.time - events['second_start'], 0.0)
         outputs[0] -= values['second_warm_up'] * np.outer(np.expm1(-since / events['second_constant']), events['direction'])
-    return outputs
+    return cause.delivered(world.time, outputs, rate_s)
 
 
 def _set_limits(triads, outputs, values):
@@ -214,11 +222,12 @@ def _shock(time, start):
     return 3.0 * np.outer(ring, [1.0, -0.6, 0.3]), 0.05 * np.outer(ring, [0.3, 1.0, -0.5])
 
 
-def _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, rng):
+def _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, cause, rng):
     time = np.arange(round(moves.duration * joint_rate)) / joint_rate + rng.uniform(0.0, 1.0 / joint_rate)
     motion = moves.at(time)
     shown, slope = encoder_reading(motion.position, values.get('encoder_harmonic'))
-    rate = motion.rate * slope
+    too_much, growth = cause.encoder_error(time, motion)
+    shown, rate = shown + too_much, motion.rate * slope + growth
     shown = read_encoders(shown, model, rng)
     rate = {'good': rate + rng.normal(0.0, 1e-5, rate.shape) * (model.encoder_noise > 0.0), 'none': np.full_like(rate, np.nan),
             'zero': np.zeros_like(rate), 'differences': np.gradient(shown, 1.0 / joint_rate, axis=0)}[velocity]
