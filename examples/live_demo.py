@@ -37,15 +37,15 @@ class Watcher:
         from sensor_msgs.msg import Imu
         from std_msgs.msg import String
 
-        from imu_calibration.nodes.batches import BatchSubscription
-        from imu_calibration.nodes.qos import input_qos, latched_qos
+        from imu_calibration.nodes.inputs import BatchInput
+        from imu_calibration.nodes.qos import latched_qos
         from msg_adapters.live import LiveGatherer
         self._rclpy, self._processes = rclpy, processes
         rclpy.init()
         self.node = rclpy.create_node('live_demo')
         self.streams = {topic: LiveGatherer() for topic in ('imu/data_raw', 'imu/data_corrected', 'imu/truth')}
         for topic, gatherer in self.streams.items():
-            BatchSubscription(self.node, Imu, topic, gatherer.add_imu, input_qos(reliable=True))
+            BatchInput(self.node, Imu, topic, gatherer.add_imu)
         self.documents, self.status = [], {}
         self.node.create_subscription(String, 'imu/calibration', lambda message: self.documents.append(message.data), latched_qos())
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._note, 10)

@@ -43,6 +43,14 @@ def read_text(path, what):
     return text
 
 
+def read_bytes(path, what):
+    """Return the bytes of a file, or refuse in one line."""
+    try:
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:
+        raise InputError(f'the {what} {path} must be readable: {_why(error)}; correct the path') from error
+
+
 def _why(error):
     return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 

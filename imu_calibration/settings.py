@@ -1,18 +1,45 @@
 """Every adjustable number, declared once: YAML files, options and ROS parameters are made from here."""
 
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from imu_calibration.errors import InputError
 
 
-def setting(default, unit, text, bounds=(None, None), symptom=''):
-    """Declare one field of a settings dataclass: default, unit, meaning, bounds, and what a wrong value looks like."""
-    return field(default=default, metadata={'unit': unit, 'text': text, 'bounds': bounds, 'symptom': symptom})
+@dataclass(frozen=True)
+class Setting:
+    """One field of a settings dataclass, as it was declared."""
+
+    name: str
+    """Name of the field, the option and the parameter."""
+    default: Any
+    """Its type is the setting's."""
+    unit: str
+    """'' or '1' without one."""
+    text: str
+    """What it means."""
+    bounds: tuple
+    """(smallest, largest) value; None: no end."""
+    symptom: str
+    """What a wrong value looks like."""
+    live: bool
+    """Whether a running session takes a change."""
+    fixed: str
+    """Why not, when it does not."""
+    session: bool
+    """Whether it names what a session works on: files of settings leave it out, or they would undo what was said before them."""
 
 
-def describe(group):
-    """Return (name, default, unit, text, bounds, symptom) for each field of a settings class or instance."""
-    return [(f.name, f.default, *(f.metadata[key] for key in ('unit', 'text', 'bounds', 'symptom'))) for f in fields(group)]
+def setting(default: Any, unit: str, text: str, bounds: tuple = (None, None), symptom: str = '', *, live: bool = False,
+            fixed: str = 'it is read at the start', session: bool = False) -> Any:
+    """Declare one field of a settings dataclass; arguments as in `Setting`."""
+    return field(default=default, metadata={'unit': unit, 'text': text, 'bounds': bounds, 'symptom': symptom, 'live': live, 'fixed': fixed,
+                                            'session': session})
+
+
+def describe(group: Any) -> list[Setting]:
+    """Return the Setting of each field of a settings class or instance."""
+    return [Setting(f.name, f.default, **f.metadata) for f in fields(group)]
 
 
 def override(group, values):

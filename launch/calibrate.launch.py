@@ -3,7 +3,7 @@ Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
 
-    ros2 launch imu_calibration calibrate.launch.py table:= imu:=/imu/data_raw      # by hand, without a table
+    ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand, without a table
 
 Several IMUs: one launch each with its own `namespace` and `save_file`.
 """
@@ -23,11 +23,11 @@ def generate_launch_description():
     """Describe calibration_node and the names it can be given."""
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
-                              description='table description, YAML; empty: no table, by hand'),
+                              description='table description, YAML; none: no table, by hand'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
                               description='parameters of the node, YAML'),
-        DeclareLaunchArgument('save_file', default_value='calibration.yaml',
-                              description='where ~/save writes; relative to the working directory'),
+        DeclareLaunchArgument('save_file', default_value='',
+                              description='where ~/save writes; empty: calibration.yaml in the working directory, with ~/save alone'),
         DeclareLaunchArgument('resume', default_value='false', description='go on with the accumulator beside save_file'),
         DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),

@@ -20,6 +20,8 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument('calibration', default_value='',
                               description='calibration.yaml; empty: wait for the latched topic imu/calibration'),
+        DeclareLaunchArgument('adopt', default_value='file_then_topic',
+                              description='where calibrations come from: file, topic (displaces the file), file_then_topic'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
                               description='parameters of the node, YAML'),
         DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
@@ -30,6 +32,7 @@ def generate_launch_description():
             package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'), {
                 'calibration_file': ParameterValue(LaunchConfiguration('calibration'), value_type=str),
+                'adopt': LaunchConfiguration('adopt'),
                 'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
             remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('imu/data_corrected', LaunchConfiguration('corrected'))],
         ),

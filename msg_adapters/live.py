@@ -34,15 +34,15 @@ class LiveGatherer:
         self._topics = {'imu': _Topic(imu, max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
                         'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
 
-    def add_imu(self, message):
-        """Add an Imu message: bytes or a message object."""
+    def add_imu(self, message, sent_ns=0):
+        """Add an Imu message: bytes or a message object, and when it was sent, ns."""
         self._topics['imu'].add(message)
 
-    def add_joints(self, message):
+    def add_joints(self, message, sent_ns=0):
         """Add a JointState message: bytes or a message object."""
         self._topics['joints'].add(message)
 
-    def add_temperature(self, message):
+    def add_temperature(self, message, sent_ns=0):
         """Add a Temperature message: bytes or a message object."""
         self._topics['temperature'].add(message)
 

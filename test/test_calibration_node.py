@@ -45,8 +45,8 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         documents = station.watch_documents()
         corrected, residuals = station.watch_imu('imu/data_corrected'), station.watch_imu('imu/residual')
         station.watch_diagnostics()
-        station.calibration_node(tmp_path, reliable=True, resume=True)
-        compensator = station.start('compensator_node', {'reliable': True})
+        station.calibration_node(tmp_path, resume=True)
+        compensator = station.start('compensator_node')
         player = station.play(bags / 'session', RATE, subscribers=1)
         station.until(lambda: player.poll() is not None, 'the end of the recording')
         answer = station.call('/calibration_node/save')
@@ -123,7 +123,7 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     first = expected.findings[0]
     with Station() as station:
         station.watch_diagnostics()
-        station.calibration_node(tmp_path, reliable=True, table_file=tmp_path / 'table.yaml')
+        station.calibration_node(tmp_path, table_file=tmp_path / 'table.yaml')
         station.until(lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting', 'the first diagnostics')
         player = station.play(tmp_path / 'bag', 20.0, subscribers=1)
         station.until(lambda: player.poll() is not None, 'the end of the recording')
@@ -154,13 +154,13 @@ def test_poses_by_hand_through_the_node(tmp_path):
 
 def check_by_hand(bag, folder, rate, gravity=None):
     """Play a bag to a node without a table."""
-    options = {'reliable': True, 'table_file': '', 'gravity': gravity or 0.0}
+    options = {'table_file': '', 'gravity': gravity or 0.0}
     with Station() as station:
         documents, residuals = station.watch_documents(), station.watch_imu('imu/residual')
         corrected = station.watch_imu('imu/data_corrected')
         station.watch_diagnostics()
         node = station.calibration_node(folder, **options)
-        station.start('compensator_node', {'reliable': True})
+        station.start('compensator_node')
         station.until(lambda: 'calibration_node: poses' in station.status, 'the first diagnostics')
         assert 'joint' not in station.status['calibration_node: streams'].message.lower()
         player = station.play(bag, rate, subscribers=2)

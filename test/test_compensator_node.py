@@ -28,8 +28,8 @@ CALIBRATION = {name: random_calibration(seed) for seed, name in enumerate('ABCE'
 TEXT = {name: calibration_to_text(calibration) for name, calibration in CALIBRATION.items()}
 POSE = (0.4, -0.3, 0.2), (0.3, 1.0, -2.0)
 NODES = {
-    'own': {'calibration_file': 'A', 'reliable': True},
-    'public': {'calibration_file': 'B', 'public_executor': True},
+    'own': {'calibration_file': 'A', 'adopt': 'topic'},
+    'public': {'calibration_file': 'B', 'adopt': 'topic', 'public_executor': True},
     'waiting': {},
     'passing': {'passthrough': True},
     'late': {'target_frame': 'base_link', 'target_xyz': list(POSE[0]), 'target_rpy': list(POSE[1])},
@@ -196,7 +196,7 @@ def test_a_new_calibration_is_taken_over_without_a_gap_and_rolled_back(bench):
 def test_reload_without_a_file_says_so(bench):
     from std_srvs.srv import Trigger
     response = bench.call(Trigger, '/late/compensator_node/reload')
-    assert not response.success and 'calibration_file is empty' in response.message
+    assert not response.success and "'calibration_file' is empty" in response.message
 
 
 @pytest.mark.parametrize(('text', 'words'), [

@@ -6,7 +6,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import yaml
+
+from imu_calibration.nodes.parameter_files import settings_of
+from imu_calibration.settings import describe
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -51,6 +53,6 @@ def test_arguments_are_declared_and_parameters_exist(path, launch):
     assert sorted(declared) == sorted({r.args[0] for r in of_kind['LaunchConfiguration']})
     for node in of_kind['Node']:
         name = node.kwargs['executable']
-        known = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
+        known = {item.name for group in settings_of(name) for item in describe(group)}
         given = {key for group in node.kwargs['parameters'] if isinstance(group, dict) for key in group}
-        assert given <= set(known) | {'use_sim_time'}, name
+        assert given <= known | {'use_sim_time'}, name

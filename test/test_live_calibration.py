@@ -131,7 +131,7 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     first = LiveCalibration(TABLE)
     run(first, *halves[0])
     data = accumulator_state.to_bytes(first.gathered(pending=True), first.model)
-    second = LiveCalibration(TABLE, earlier=accumulator_state.from_bytes(data, first.model))
+    second = LiveCalibration(TABLE, saved=data)
     assert second.n_windows > 20
     run(second, *halves[1])
     result, expected = second.solve(pending=True), offline(*halves)

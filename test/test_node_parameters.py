@@ -23,8 +23,8 @@ def test_parameter_file_is_the_declaration(node):
 
 @pytest.mark.parametrize('node', NODES)
 def test_yaml_gives_the_defaults_back(node):
-    values = yaml.safe_load(rendered(node))['/**']['ros__parameters']
-    defaults = {name: default for group in settings_of(node) for name, default, *_ in describe(group)}
+    values = yaml.safe_load(rendered(node))['/**']['ros__parameters'] or {}
+    defaults = {item.name: item.default for group in settings_of(node) for item in describe(group) if not item.session}
     assert {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()} == defaults
     assert [type(value) for value in values.values()] == [list if isinstance(value, tuple) else type(value) for value in defaults.values()]
 

@@ -5,12 +5,9 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-import yaml
 
-from imu_calibration.calibration.live import LiveSettings
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.joint_trajectory import TableMotion, trajectory_from
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
@@ -23,7 +20,7 @@ from worlds.live_sessions import TABLE, make_session
 pytest.importorskip('rclpy')
 from imu_calibration.nodes.processes import node_command  # noqa: E402
 
-from ros.live_station import ROOT, Station, taken  # noqa: E402
+from ros.live_station import Station, taken  # noqa: E402
 
 START = 1_800_000_000
 
@@ -98,19 +95,6 @@ def test_the_wander_goes_on_from_block_to_block():
     # 120 correlation times and three axes: the sample correlation of exp(-1) scatters by some 0.05
     assert abs(drift.std() / 1e-3 - 1) < 0.25 and abs(correlation - np.exp(-1)) < 0.2
     assert np.max(np.abs(np.diff(rate, axis=0))) < 6 * 1e-3 * np.sqrt(2 / 250)
-
-
-def test_parameter_files_hold_the_defaults_of_the_settings():
-    from imu_calibration.by_hand.live import LiveByHandSettings
-    from imu_calibration.nodes.bag_player_node import PlayerSettings
-    from imu_calibration.nodes.calibration_node import CalibrationNodeSettings
-    from imu_calibration.nodes.simulator_node import SimulatorSettings
-    groups = {'calibration_node': (CalibrationNodeSettings, LiveByHandSettings, LiveSettings, WindowSettings), 'simulator_node': (SimulatorSettings,),
-              'bag_player_node': (PlayerSettings,)}
-    for name, settings in groups.items():
-        written = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())['/**']['ros__parameters']
-        declared = {field.name: field.default for group in settings for field in fields(group)}
-        assert written == declared and {key: type(value) for key, value in written.items()} == {key: type(v) for key, v in declared.items()}
 
 
 @pytest.mark.dds

@@ -107,7 +107,7 @@ def play(case, speed=SPEED, domain_id=DOMAIN):
             with open(path, 'w') as file:
                 file.write(case.calibration)
             xyz, rpy = case.pose_of_a
-            common = {'calibration_file': path, 'reliable': True, 'target_frame': 'imu_b', 'target_rpy': list(rpy)}
+            common = {'calibration_file': path, 'target_frame': 'imu_b', 'target_rpy': list(rpy)}
             processes.start('compensator_node', common, namespace='/turned')
             processes.start('compensator_node', common | {'target_xyz': list(xyz)}, namespace='/moved')
             return _exchange(rclpy, context, case, speed)

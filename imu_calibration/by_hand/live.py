@@ -37,10 +37,11 @@ class LiveByHandSettings:
     """What a calibration by hand keeps, and its reference."""
 
     gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
-                             (0.0, 30.0), 'all three accelerometer scales are wrong together')
+                             (0.0, 30.0), 'all three accelerometer scales are wrong together',
+                             live=True, session=True)
     hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
                                 'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
-                                'too small: poses are forgotten, diagnostics say so')
+                                'too small: poses are forgotten, diagnostics say so', live=True)
 
 
 class LiveByHand:
@@ -85,6 +86,25 @@ class LiveByHand:
         """The model, as far as it is known before a solution."""
         asked = self._asked
         return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
+
+    needs_temperature = False
+    """Live, no temperatures are kept with the poses."""
+
+    @property
+    def frame_id(self):
+        """Frame of the sensor; '' before the first message."""
+        imu = self._store.samples()
+        return '' if imu is None else imu.frame_id
+
+    def change_windows(self, windows):
+        """Find poses by other settings from now on, in all samples."""
+        self.options = replace(self.options, windows=windows)
+        self._search(self._store)
+
+    def change(self, by_hand):
+        """Take another gravity, or another number of samples to keep."""
+        self._gravity = by_hand.gravity or None
+        self._store.most = by_hand.hand_samples
 
     @property
     def n_windows(self):

@@ -31,7 +31,7 @@ class HandStore:
     """
 
     def __init__(self, most):
-        self._most, self._parts, self._epoch = most, [], 0
+        self.most, self._parts, self._epoch = most, [], 0
         self._shift, self.forgotten = 0, 0
 
     def __len__(self):
@@ -39,7 +39,7 @@ class HandStore:
 
     def copy(self):
         """Return a copy that shares the samples."""
-        twin = HandStore(self._most)
+        twin = HandStore(self.most)
         twin.__dict__ |= self.__dict__ | {'_parts': list(self._parts)}
         return twin
 
@@ -79,8 +79,8 @@ class HandStore:
         imu = self.samples()
         if len(rests) > most_rests:
             self._drop(imu, slice(0, rests[len(rests) - int(SHARE_KEPT * most_rests)].start))
-        elif len(self) > self._most:
-            self._drop(imu, self._least_telling(imu, rests, len(imu) - int(SHARE_KEPT * self._most)))
+        elif len(self) > self.most:
+            self._drop(imu, self._least_telling(imu, rests, len(imu) - int(SHARE_KEPT * self.most)))
         else:
             return False
         return True

@@ -3,13 +3,15 @@
 import io
 import json
 import zipfile
+import zlib
+from contextlib import contextmanager
 
 import numpy as np
 
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError
+from imu_calibration.errors import DocumentError, shortened
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 from imu_calibration.reference.joint import JointNames
@@ -64,20 +66,30 @@ def from_bytes(data, model):
         When the bytes are no such archive, or it was gathered with another model.
 
     """
+    with _reading(data) as (header, arrays):
+        _check(header, model)
+        return _gathered(header, arrays)
+
+
+@contextmanager
+def _reading(data):
+    """Give (header, arrays) of an archive; whatever is damaged becomes one line."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
-            _check(header, model)
-            return _gathered(header, arrays)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, IndexError, zipfile.BadZipFile) as error:
-        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this is not ({type(error).__name__}: {error}); '
-                            'remove it, or start without resume') from error
+            if header.get('format') != FORMAT:
+                raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove it, "
+                                    'or start without resume')
+            yield header, arrays
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
+        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this is not '
+                            f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume') from error
 
 
 def saved_model(data):
-    """Return the SensorModel whose columns a saved accumulator holds."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return _model(json.loads(bytes(arrays['header']).decode()))
+    """Return the SensorModel whose columns a saved accumulator holds; raises as `from_bytes` when it is damaged."""
+    with _reading(data) as (header, _):
+        return _model(header)
 
 
 def _model(header):
@@ -88,8 +100,6 @@ def _model(header):
 
 
 def _check(header, model):
-    if header.get('format') != FORMAT:
-        raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {header.get('format')!r}; remove it, or start without resume")
     known = _model(header)
     same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL)
     same = same and known.joint_names == model.joint_names and known.definitions == model.definitions and known.temperature_ref_c == model.temperature_ref_c
@@ -99,7 +109,8 @@ def _check(header, model):
 
 
 def _text(model):
-    return ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in _MODEL)
+    effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in _MODEL)
+    return f'{effects} at {model.temperature_ref_c:g} C'
 
 
 def _gathered(header, arrays):

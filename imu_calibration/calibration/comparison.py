@@ -42,6 +42,13 @@ class Comparison:
     """The verdict in words."""
 
 
+def moved_beyond_sd(first, second):
+    """Return whether a later calibration says something else: other parameters, or a value further off than the first one's own sd."""
+    if first.param_names != second.param_names:
+        return True
+    return bool(np.any(np.abs(second.values - first.values) > first.sd))
+
+
 def compare(first, second):
     """
     Compare two calibrations, group by group.

@@ -30,18 +30,19 @@ class LiveSettings:
     """How often to solve, and what is kept and told."""
 
     solve_share: float = setting(0.1, '1', 'largest share of the time that solving after each window may take', (0.001, 1.0),
-                                 'too small: results come late; too large: the node takes a whole core')
+                                 'too small: results come late; too large: the node takes a whole core', live=True)
     residual_rate: float = setting(20.0, 'Hz', 'residuals published per second of data, the others are left out; 0: none', (0.0, 10000.0),
-                                   'too large: more time goes into publishing than into calibrating')
+                                   'too large: more time goes into publishing than into calibrating', live=True)
     store_samples: int = setting(300_000, '1', 'samples in motion kept for effects that must be linearised anew (table tilt, delays); '
                                  'about 200 bytes each', (0, 100_000_000),
-                                 'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so')
+                                 'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so',
+                                 fixed='windows that were not kept are gone')
     diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth '
                                       'of the time at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
-                                      'too small: the diagnosis takes a core from other programs')
+                                      'too small: the diagnosis takes a core from other programs', live=True)
     diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each',
                                      (1000, 100_000_000),
-                                     'too small: effects that need the whole session are not found')
+                                     'too small: effects that need the whole session are not found', fixed='windows that were not kept are gone')
 
 
 class LiveCalibration:
@@ -59,20 +60,27 @@ class LiveCalibration:
     options : CalibrationOptions
         What to estimate.
     settings : LiveSettings
-    earlier : Gathered, optional
-        What an earlier run left behind (see `accumulator_state`); this session is then merged with it.
+    saved : bytes, optional
+        What `saved` of an earlier run returned; this session is then merged with it, at its reference temperature.
+
+    Raises
+    ------
+    DocumentError
+        When the earlier run gathered another model, or `saved` is damaged.
 
     """
 
-    def __init__(self, table, options=CalibrationOptions(), settings=LiveSettings(), earlier=None):
-        self.table, self.options, self.settings, self.earlier = table, options, settings, earlier
+    def __init__(self, table, options=CalibrationOptions(), settings=LiveSettings(), saved=None):
+        self.table, self.options, self.settings, self.earlier = table, options, settings, None
         self._asked = choose_model(options, table)
         self._waiting, self._collector = [], None
         self.result = None
         self.open_windows = []
         """Windows that were still open at the last solution with `pending`, closed in a copy."""
-        if not self._asked.needs_temperature:
-            self._begin(self._asked)
+        if saved is not None and self._asked.needs_temperature:
+            self._begin(self._asked.with_reference_temperature(accumulator_state.saved_model(saved).temperature_ref_c), saved)
+        elif not self._asked.needs_temperature:
+            self._begin(self._asked, saved)
 
     @property
     def n_windows(self):
@@ -87,6 +95,23 @@ class LiveCalibration:
             return {}
         self._collector.update_counts()
         return dict(self._collector.gathered.counts)
+
+    @property
+    def needs_temperature(self):
+        """Whether an effect that was asked for depends on temperature."""
+        return self._asked.needs_temperature
+
+    @property
+    def frame_id(self):
+        """Frame of the sensor; '' before the first message."""
+        known = [part.frame_id for part in (self.earlier, self._collector and self._collector.gathered) if part]
+        return next(filter(None, known), '')
+
+    def change_windows(self, windows):
+        """Find windows by other settings from now on; raises an InputError when these cannot be changed any more."""
+        if self._collector is not None:
+            self._collector.gatherer.change(windows)
+        self.options = replace(self.options, windows=windows)
 
     @property
     def model(self):
@@ -122,7 +147,8 @@ class LiveCalibration:
             self._collector.push(held_back)
         return self._completed()
 
-    def _begin(self, model):
+    def _begin(self, model, saved=None):
+        self.earlier = None if saved is None else accumulator_state.from_bytes(saved, model)
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
@@ -183,7 +209,7 @@ class LiveCalibration:
         return self._with_earlier(self._collector.snapshot(pending)[0])
 
     def saved(self, pending=False):
-        """Return everything that was gathered as bytes, for an `earlier` of another run (see `accumulator_state`)."""
+        """Return everything that was gathered as bytes, for another run (see `accumulator_state`)."""
         return accumulator_state.to_bytes(self.gathered(pending), self.model)
 
     def _with_earlier(self, gathered):

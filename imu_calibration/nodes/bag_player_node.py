@@ -24,8 +24,10 @@ PAUSE = 0.01
 class PlayerSettings:
     """What to play, and how fast."""
 
-    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why')
-    topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing')
+    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why',
+                       session=True)
+    topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing',
+                          session=True)
     rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible',
                           (0.0, 10000.0), 'too large: messages are lost')
     clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time',

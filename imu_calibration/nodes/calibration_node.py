@@ -1,8 +1,15 @@
-"""calibration_node: calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose."""
+"""
+calibration_node: calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose.
+
+in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table), imu/temperature (sensor_msgs/Temperature, for thermal
+effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu), /diagnostics.
+services: ~/solve, ~/save, ~/reset.
+"""
 
 import sys
-from dataclasses import dataclass
-from pathlib import Path
+import time
+from dataclasses import dataclass, replace
+from typing import Any
 
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
@@ -11,17 +18,19 @@ from std_srvs.srv import Trigger
 
 from imu_calibration import files
 from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
-from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.nodes.batches import BatchSubscription
+from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
-from imu_calibration.nodes.calibration_worker import CalibrationWorker, accumulator_file
+from imu_calibration.nodes.calibration_worker import CalibrationWorker, Listeners
+from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.hints import HINTS
+from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
+from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
+from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting
@@ -32,135 +41,166 @@ INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
 MOST_WAITING = 200_000
 """Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
-COMPLAINT_PERIOD = 10.0
-"""Seconds between two warnings."""
+NO_TABLE = ('', 'none')
+"""Values of `table_file` that mean: by hand. Launch arguments cannot be empty."""
+PATIENCE = 3.0
+"""Seconds after the start from which a silent topic is worth a word."""
 
 
 @dataclass(frozen=True)
 class CalibrationNodeSettings:
     """What the node reads, asks for and writes."""
 
-    table_file: str = setting('', '', 'table description, path; empty: no table, calibrate by hand from poses held still and the '
-                              'turns between them', symptom='joint states are not listened to')
+    table_file: str = setting('', '', 'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
+                              'turns between them', symptom='joint states are not listened to', session=True,
+                              fixed='all motion gathered so far belongs to the table')
     frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
-                            symptom='every Imu message is dropped, diagnostics say so')
-    reliable: bool = setting(False, '', 'subscribe reliably instead of best-effort', symptom='a best-effort publisher never connects')
+                            symptom='every Imu message is dropped, diagnostics say so', session=True,
+                            fixed='all motion gathered so far is that of one sensor')
     accelerometer_model: str = setting('', '',
                                        'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
-                                       'when the rotation shows it', symptom='an effect that is there stays in the residuals')
+                                       'when the rotation shows it', symptom='an effect that is there stays in the residuals',
+                                       fixed='motion is gathered for the model')
     gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix',
-                                   symptom='an effect that is there stays in the residuals')
+                                   symptom='an effect that is there stays in the residuals', fixed='motion is gathered for the model')
     reference_model: str = setting('', '',
                                    "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
-                                   'azimuth is unknown', symptom='a tilted table shows as accelerometer bias')
+                                   'azimuth is unknown', symptom='a tilted table shows as accelerometer bias',
+                                   fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='good parameters are called weak')
-    save_file: str = setting('calibration.yaml', '',
-                             'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz',
-                             symptom='~/save answers that the place is not writable')
+                                   symptom='good parameters are called weak', session=True)
+    save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, also when '
+                             'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, with ~/save alone',
+                             symptom='the node says at its start that the place is not writable', live=True, session=True)
     resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
-                           symptom='old motion of another IMU enters the calibration')
+                           symptom='old motion of another IMU enters the calibration', session=True)
     autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
-                                     'after a crash the session starts from the last ~/save')
+                                     'after a crash the session starts from the last ~/save', live=True)
 
 
 class CalibrationNode(Node):
     """Listens, and tells what the worker finds."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('calibration_node')
         self.settings = declare_parameters(self, CalibrationNodeSettings)
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
-        self._by_hand = declare_parameters(self, LiveByHandSettings)
-        self._table = files.read_table(Path(self.settings.table_file).expanduser()) if self.settings.table_file else None
-        self._gatherer = LiveGatherer(self._table and self._table.joint_names, MOST_WAITING, self.settings.frame_id)
+        self._hand_settings = declare_parameters(self, LiveByHandSettings)
+        by_hand = self.settings.table_file in NO_TABLE
+        self._table = None if by_hand else files.read_table(files.user_path(self.settings.table_file))
+        place = SessionFiles(self.settings.save_file)
+        live = self._resumed(place) if self.settings.resume else self._make_live()
+        self._gatherer = LiveGatherer(self._table and self._table.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
-        self.worker = CalibrationWorker(self._gatherer, self._make_live, self.settings.save_file, self.settings.autosave_period,
-                                        self._publish_document, self._publish_residuals, self._complain, self._table is None,
-                                        HINTS['calibration_node'])
-        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place, self.settings.autosave_period,
+                                        Listeners(self._publish_document, self._publish_residuals), by_hand, HINTS['calibration_node'])
         for what in ('solve', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', lambda request, response, what=what: self._serve(what, response))
-        qos = input_qos(self.settings.reliable, INPUT_DEPTH)
-        topics = [(Imu, 'imu/data_raw', self._gatherer.add_imu), (Temperature, 'imu/temperature', self._gatherer.add_temperature)]
-        if self._table is not None:
-            topics.append((JointState, 'joint_states', self._gatherer.add_joints))
-        else:
-            self.get_logger().info("no 'table_file' was given: calibrates by hand, hold the IMU still in many attitudes "
-                                   'and turn it in between')
-        self._inputs = [BatchSubscription(self, kind, topic, add, qos) for kind, topic, add in topics]
+        self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
+        self._listen()
+        self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
+                                       'pose' if by_hand else 'window')
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        groups = {'settings': self.settings, 'live': self._live_settings, 'windows': self._options.windows, 'by_hand': self._hand_settings}
+        watch_parameters(self, groups, self._change, HINTS['calibration_node'])
         self.worker.start()
 
-    def close(self):
-        """End the worker after what it is doing."""
-        self.worker.end()
+    def _listen(self) -> None:
+        topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu), 'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
+        if self._table is not None:
+            topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
+            on_what = f'on the table {files.user_path(self.settings.table_file)} with the joints {", ".join(self._table.joint_names)}'
+        else:
+            on_what = "by hand, since no 'table_file' was given: hold the IMU still in many attitudes and turn it in between"
+        self._inputs = {name: BatchInput(self, kind, topic, add, depth=INPUT_DEPTH, single=name != 'joints')
+                        for name, (kind, topic, add) in topics.items()}
+        watch_inputs(self, list(self._inputs.values()))
+        self.get_logger().info(f'calibrates {on_what}; ~/save writes {self.worker.place.calibration}')
 
-    def _read_options(self, windows):
+    def close(self) -> None:
+        """End the worker after what it is doing, and say what became of the motion that is in no file."""
+        line = self.worker.end()
+        if line:
+            self.get_logger().warning(f'ends: {line}')
+
+    def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
         settings = self.settings
-        tolerances = files.read_tolerances(settings.tolerances_file or config_file('tolerances.yaml'))
+        tolerances = files.read_tolerances(files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml'))
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
                                   tolerances, windows)
 
-    def _make_live(self, resume):
-        saved = accumulator_file(self.settings.save_file)
-        data = saved.read_bytes() if resume and self.settings.resume and saved.is_file() else None
-        live = self._make_by_hand(data) if self._table is None else self._make_on_table(data)
-        if data is not None:
-            self.get_logger().info(f'goes on with {live.n_windows} {"poses" if self._table is None else "windows"} from {saved}')
+    def _make_live(self, saved: bytes | None = None) -> LiveCalibration | LiveByHand:
+        if self._table is None:
+            return LiveByHand(self._options, self._live_settings, self._hand_settings, saved)
+        return LiveCalibration(self._table, self._options, self._live_settings, saved)
+
+    def _resumed(self, place: SessionFiles) -> LiveCalibration | LiveByHand:
+        live = self._make_live(place.earlier())
+        self.get_logger().info(f'goes on with {live.n_windows} {"poses" if self._table is None else "windows"} from {place.accumulator}'
+                               if live.n_windows else f'nothing to go on with in {place.accumulator}: starts anew')
         return live
 
-    def _make_by_hand(self, data):
-        return LiveByHand(self._options, self._live_settings, self._by_hand, data)
-
-    def _make_on_table(self, data):
-        live = LiveCalibration(self._table, self._options, self._live_settings)
-        if data is None:
-            return live
-        earlier = accumulator_state.from_bytes(data, live.model or accumulator_state.saved_model(data))
-        return LiveCalibration(self._table, self._options, self._live_settings, earlier)
-
-    def _serve(self, what, response):
+    def _serve(self, what: str, response: Trigger.Response) -> Trigger.Response:
         request = self.worker.ask(what)
         while not request.done.wait(0.005):
-            for subscription in self._inputs:
-                subscription.drain()
+            for each in self._inputs.values():
+                each.drain()
             if not self.worker.is_alive():
                 break
         response.success, response.message = request.success, request.message
+        say(self.get_logger(), INFO if request.success else ERROR, f'~/{what}: {request.message}')
         self._diagnostics.publish_now()
         return response
 
-    def _publish_document(self, text):
+    def _change(self, name: str, group: Any) -> None:
+        """Take changed parameters: at once what concerns files, the rest by the worker between two of its steps."""
+        if name == 'settings':
+            if group.save_file != self.settings.save_file:
+                self.worker.move(SessionFiles(group.save_file))
+            self.worker.autosave_period, self.settings = group.autosave_period, group
+        elif name == 'live':
+            self._live_settings = group
+            self.worker.ask(lambda: self.worker.change_settings(group))
+        elif name == 'windows':
+            self._options = replace(self._options, windows=group)
+            self.worker.ask(lambda: self.worker.change_windows(group))
+        elif name == 'by_hand':
+            self._hand_settings = group
+            if self._table is None:
+                self.worker.ask(lambda: self.worker.change_by_hand(group))
+
+    def _publish_document(self, text: str) -> None:
         self._publish(self._document, String(data=text))
 
-    def _publish_residuals(self, residuals):
+    def _publish_residuals(self, residuals: Any) -> None:
         for message in rows(encode_imu(residuals)):
             self._publish(self._residual, bytes(message))
 
-    def _publish(self, publisher, message):
+    def _publish(self, publisher: Any, message: Any) -> None:
         try:
             publisher.publish(message)
         except Exception:
             if self.context.ok():   # else the node is being shut down while the worker finishes
                 raise
 
-    def _complain(self, line):
-        self.get_logger().warning(line, throttle_duration_sec=COMPLAINT_PERIOD)
-
-    def _statuses(self):
-        if self.worker.failure is not None:
-            raise self.worker.failure
+    def _statuses(self) -> list:
+        """Return the diagnostics, and say on the terminal what has changed."""
         state = self.worker.state
-        if state.streams is not None and state.streams.word == 'trouble':
-            self._complain(state.streams.message)
+        about_topics = [line for each in self._inputs.values() for line in each.faults()]
+        silent = [] if state.streams is None else [self._inputs[name].silence() for name in state.streams.silent]
         if self._table is None and self.count_publishers(self.resolve_topic_name('joint_states')):
-            self.get_logger().info("joint states are published; to calibrate on a table give 'table_file'", once=True)
-        return statuses_of(state)
+            about_topics.append("joint states are published and not listened to: to calibrate on a table give 'table_file'")
+        trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
+        if time.monotonic() - self._started > PATIENCE:
+            self._complaints.now('calibration', about_topics + silent + trouble, state.faults)
+        for level, line in self._guide.lines(state):
+            say(self.get_logger(), level, line)
+        return statuses_of(state, about_topics + silent)
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
     return run_node(CalibrationNode, arguments, hints=HINTS['calibration_node'])
 

@@ -1,24 +1,27 @@
 """Diagnostics of calibration_node: a status for the streams, the calibration, the poses or the diagnosis, and each parameter group."""
 
-from imu_calibration.nodes.diagnostics import ERROR, OK, STALE, WARN, make_status
+import math
 
-_STREAM_LEVELS = {'good': OK, 'trouble': WARN, 'silent': STALE}
-_GROUP_LEVELS = {'determined': OK, 'weak': WARN, 'held': STALE, 'waiting': STALE}
-_HAND_LEVELS = {'waiting': STALE, 'weak': WARN, 'determined': OK}
-_DIAGNOSIS_LEVELS = {'nothing found': OK, 'off': OK, 'waiting': STALE, 'found': WARN, 'unexplained': WARN, 'failed': ERROR}
-_VERDICT_LEVELS = {'': STALE, 'good': OK, 'weak': WARN, 'bad': ERROR}
+from imu_calibration.calibration.effect_states import GroupState
+from imu_calibration.nodes.calibration_state import WorkerState
+from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
+
+_STREAM_LEVELS = {'good': OK, 'trouble': WARN, 'silent': ERROR}
+_GROUP_LEVELS = {'determined': OK, 'weak': WARN, 'held': WARN, 'waiting': OK}
+_HAND_LEVELS = {'waiting': OK, 'weak': WARN, 'determined': OK}
+_DIAGNOSIS_LEVELS = {'nothing found': OK, 'off': OK, 'waiting': OK, 'found': WARN, 'unexplained': WARN, 'failed': ERROR}
+_VERDICT_LEVELS = {'': OK, 'good': OK, 'weak': WARN, 'bad': ERROR}
 
 
-def statuses_of(state):
-    """Return the DiagnosticStatus messages of a WorkerState."""
+def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
+    """Return the DiagnosticStatus messages of a WorkerState; `stream_faults` are lines about its topics."""
     found = []
     if state.streams is not None:
-        found.append(make_status(_STREAM_LEVELS[state.streams.word], 'streams', state.streams.message, state.streams.values))
-    message = '; '.join([state.verdict or 'waiting for motion', *state.lines[:3]])
-    level = _VERDICT_LEVELS.get(state.verdict, WARN)
-    if state.trouble:
-        message, level = f'{message}; {state.trouble}', max(level, WARN) if state.verdict else STALE
-    found.append(make_status(level, 'calibration', message, {'version': state.solution, **state.values}))
+        level = max(_STREAM_LEVELS[state.streams.word], WARN if stream_faults else OK)
+        found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), state.streams.values))
+    parts = [state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
+    level = ERROR if state.faults else max(_VERDICT_LEVELS[state.verdict], WARN if state.trouble and state.verdict else OK)
+    found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), {'version': state.solution, **state.values}))
     if state.hand is not None:
         found.append(make_status(_HAND_LEVELS[state.hand.word], 'poses', state.hand.message, state.hand.values))
     if state.diagnosis is not None:
@@ -27,13 +30,13 @@ def statuses_of(state):
     return found + [_group_status(group) for group in state.groups]
 
 
-def _group_status(group):
-    level = _GROUP_LEVELS[group.status]
+def _group_status(group: GroupState):
     text = {'determined': 'determined', 'weak': 'weak', 'held': 'held at its prior: the motion so far says next to nothing',
             'waiting': 'no solution yet'}[group.status]
     if group.needs:
         text += f'; still needed: {group.needs}'
-    values = {'parameter': group.parameter, f'standard error [{group.unit}]': f'{group.sd:.3g}',
-              f'tolerance [{group.unit}]': f'{group.tolerance:.3g}',
-              'needs': group.needs, f'predicted after that motion [{group.unit}]': f'{group.predicted_sd:.3g}'}
-    return make_status(level, f'{group.sensor} {group.effect}', text, values)
+    figures = {f'standard error [{group.unit}]': group.sd, f'tolerance [{group.unit}]': group.tolerance,
+               f'predicted after that motion [{group.unit}]': group.predicted_sd}
+    values = {'parameter': group.parameter, 'needs': group.needs,
+              **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)}}
+    return make_status(_GROUP_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values)

@@ -3,17 +3,20 @@
 import os
 import threading
 import time
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.calibration.result import summary
-from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis
-from imu_calibration.errors import ImuCalibrationError, NotObservableError
-from imu_calibration.files import write_whole
+from imu_calibration.calibration.trust import missing
+from imu_calibration.diagnosis.live import LiveDiagnosis
+from imu_calibration.errors import ImuCalibrationError, InputError, NotObservableError, shortened
+from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
-from imu_calibration.preflight.stream_watch import StreamState, StreamWatch
+from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.preflight.stream_watch import StreamWatch
 
 PERIOD = 0.1
 """Seconds between two looks at what arrived."""
@@ -22,49 +25,33 @@ IDLE = 3.0
 
 
 @dataclass(frozen=True)
-class WorkerState:
-    """What diagnostics tell; replaced as a whole, so that another thread may read it."""
+class Listeners:
+    """Who hears of what the worker makes."""
 
-    groups: list = field(default_factory=list)
-    """GroupState of every effect."""
-    streams: StreamState | None = None
-    """How the streams are."""
-    solution: int = 0
-    """Number of the last solution; 0 before the first."""
-    verdict: str = ''
-    """'good', 'weak' or 'bad'."""
-    lines: tuple = ()
-    """Reasons and next steps."""
-    trouble: str = ''
-    """Why there is no new solution."""
-    values: dict = field(default_factory=dict)
-    """Figures by name."""
-    hand: object = None
-    """HandStatus of a calibration without a table."""
-    diagnosis: DiagnosisState | None = None
-    """What the model gets wrong; None without a table."""
+    calibration: Callable[[str], None]
+    """Called with the text of each new calibration document."""
+    residuals: Callable[[Any], None]
+    """Called with ImuSamples."""
 
 
 class CalibrationWorker(threading.Thread):
     """
     Runs a LiveCalibration, or a LiveByHand without a table.
 
+    Whatever fails is told and left out, and the session goes on: nothing that a message, a solution or a disk does ends it.
+
     Parameters
     ----------
     gatherer : LiveGatherer
         Where messages are added by another thread.
+    live : LiveCalibration or LiveByHand
+        The session.
     make_live : callable
-        Returns a new LiveCalibration or LiveByHand; called at the start (with ``resume=True``) and for every reset.
-    save_file : str
-        Path of the calibration document; the accumulator goes beside it.
+        Returns a new one, for a reset.
+    place : SessionFiles
     autosave_period : float
         Seconds between two savings of the accumulator; 0: only when asked.
-    on_calibration : callable
-        Called with the text of each new calibration document.
-    on_residuals : callable
-        Called with ImuSamples.
-    on_trouble : callable
-        Called with one line when something cannot be used.
+    listeners : Listeners
     by_hand : bool
         Whether there is no table, and so no joint states.
     hints : dict, optional
@@ -72,72 +59,80 @@ class CalibrationWorker(threading.Thread):
 
     """
 
-    def __init__(self, gatherer, make_live, save_file, autosave_period, on_calibration, on_residuals, on_trouble, by_hand=False,
-                 hints=None):
+    def __init__(self, gatherer, live, make_live, place: SessionFiles, autosave_period: float, listeners: Listeners, by_hand: bool = False,
+                 hints: dict[str, str] | None = None):
         super().__init__(name='calibration', daemon=True)
-        self.gatherer, self.make_live = gatherer, make_live
-        self.save_file, self.autosave_period = Path(save_file).expanduser(), autosave_period
-        self.on_calibration, self.on_residuals, self.on_trouble = on_calibration, on_residuals, on_trouble
+        self.gatherer, self.live, self.make_live = gatherer, live, make_live
+        self.place, self.autosave_period, self.listeners = place, autosave_period, listeners
         self.hints = hints or {}
-        self.live = make_live(resume=True)
-        self.failure = None
-        self.state = WorkerState(groups=self.live.groups())
-        self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch(joints=not by_hand)
+        self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch(not by_hand, self.live.needs_temperature)
         self._by_hand, self._diagnosis = by_hand, DiagnosisThread(0.0 if by_hand else self.live.settings.diagnosis_period)
         self._diagnosed, self._windows = 0, self._new_diagnosis()
-        self._asked, self._lock, self._wake, self._ending = [], threading.Lock(), threading.Event(), False
-        self._n_solutions, self._new_windows, self._closed, self._saved = 0, self.live.n_windows > 0, True, (time.monotonic(), 0)
+        self._asked: list[Request] = []
+        self._lock, self._wake, self._ending = threading.Lock(), threading.Event(), False
+        self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
+        self.place.note_saved(self.live.n_windows)
         self._trouble = ''
+        self._faults: dict[str, str] = {}
+        self._note_fault('place', self.place.try_place())
+        self.state = WorkerState(groups=self.live.groups(), place=str(self.place.calibration))
 
     @property
-    def accumulator_file(self):
-        """Where the accumulator is saved."""
-        return accumulator_file(self.save_file)
+    def gathered(self) -> str:
+        """What is gathered, for people."""
+        return 'poses' if self._by_hand else 'windows'
 
-    def ask(self, what):
-        """Ask for 'solve', 'save' or 'reset'; return a Request whose `done` is set when (success, message) is there."""
-        request = Request(what)
+    def ask(self, what: str | Callable[[], str]) -> 'Request':
+        """Ask for 'solve', 'save', 'reset' or a function to be called; return a Request whose `done` is set when the answer is there."""
+        request = Request(getattr(self, f'_{what}') if isinstance(what, str) else what)
         with self._lock:
             self._asked.append(request)
         self._wake.set()
         return request
 
-    def end(self, timeout=20.0):
-        """Let the thread finish what it does, and wait for it."""
+    def end(self, timeout: float = 20.0) -> str:
+        """Let the thread finish what it does, keep what is not saved, and return what became of it; '' when nothing was left."""
         self._ending = True
         self._wake.set()
         self._diagnosis.end()
         if self.is_alive():
             self.join(timeout)
+        return f'a solution was still being made: {self.gathered} since the last save are lost' if self.is_alive() else \
+            self.place.keep(self.live, self.gathered)
 
-    def run(self):
+    def run(self) -> None:
         """Work until `end`."""
         try:
             while not self._ending:
                 self._wake.wait(PERIOD)
                 self._wake.clear()
-                self._take()
-                self._answer()
-                self._solve_when_due()
-                self._autosave()
-                self._diagnose_when_due()
-                self._tell()
-        except BaseException as error:
-            self.failure = error
-            raise
+                for step in (self._take, self._answer, self._solve_when_due, self._autosave, self._diagnose_when_due, self._tell):
+                    self._survive(step)
+            self._survive(self._take)
         finally:
             for request in self._asked:
                 request.answer(False, 'the node is ending')
 
-    def _take(self):
-        now = time.monotonic()
+    def _survive(self, step: Callable[[], None]) -> None:
+        """Do one step; what goes wrong in it is told until it goes well again."""
+        name = step.__name__.strip('_')
         try:
-            block = self.gatherer.flush()
-            self._watch.note(block, now)
-            windows = self.live.push(block)
+            step()
         except ImuCalibrationError as error:
-            self._complain(error.told(self.hints))
-            return
+            self._note_fault(name, error.told(self.hints))
+        except Exception as error:
+            self._note_fault(name, f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}')
+        else:
+            self._note_fault(name, '')
+
+    def _note_fault(self, name: str, line: str) -> None:
+        self._faults[name] = line
+
+    def _take(self) -> None:
+        now = time.monotonic()
+        block = self.gatherer.flush()
+        self._watch.note(block, now)
+        windows = self.live.push(block)
         if block.imu is not None or block.joints is not None:
             self._closed = False
         if windows:
@@ -145,20 +140,22 @@ class CalibrationWorker(threading.Thread):
             self._windows.add([] if self._by_hand else windows)
             residuals = self.live.residuals(windows)
             if residuals is not None and len(residuals):
-                self.on_residuals(residuals)
+                self.listeners.residuals(residuals)
 
-    def _answer(self):
+    def _answer(self) -> None:
         with self._lock:
             asked, self._asked = self._asked, []
         for request in asked:
             try:
-                success, message = True, getattr(self, '_' + request.what)()
+                success, message = request.action()
             except ImuCalibrationError as error:
                 success, message = False, error.told(self.hints)
-            self._tell()   # who asked looks at the diagnostics next
+            except Exception as error:   # who asked gets an answer whatever happens
+                success, message = False, shortened(f'{type(error).__name__}: {error}', 300)
+            self._survive(self._tell)   # who asked looks at the diagnostics next
             request.answer(success, message)
 
-    def _solve_when_due(self):
+    def _solve_when_due(self) -> None:
         idle = not self._closed and time.monotonic() - (self._watch.last_arrival or 0.0) > IDLE
         if idle:
             self._closed, self._new_windows = True, True
@@ -169,84 +166,116 @@ class CalibrationWorker(threading.Thread):
             self._publish_solution(pending=self._closed)
             if idle:
                 self._diagnosis.want()
-        except NotObservableError as error:
-            self._trouble = error.told(self.hints)
         except ImuCalibrationError as error:
             self._trouble = error.told(self.hints)
-            self._complain(error.told(self.hints))
+            self._note_fault('solution', '' if isinstance(error, NotObservableError) else self._trouble)
 
-    def _diagnose_when_due(self):
+    def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
         self._diagnosis.ask_when_due(lambda: self._windows.question(self.live), n_windows > self._diagnosed)
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
 
-    def _publish_solution(self, pending):
+    def _publish_solution(self, pending: bool) -> str:
         start = time.monotonic()
         result = self.live.solve(pending, {'mode': 'live', 'solution': self._n_solutions + 1})
         self._n_solutions += 1
         self._trouble, self._new_windows, self._closed = '', False, pending
+        self._note_fault('solution', '')
         text = calibration_to_text(result.calibration)
-        self.on_calibration(text)
+        self.listeners.calibration(text)
         self._pacer.note(start, time.monotonic())
         return text
 
-    def _solve(self):
+    def _solve(self) -> tuple[bool, str]:
         self._publish_solution(pending=True)
         self._diagnosis.want()
         verdict, lines = summary(self.live.result, self.hints)
-        return f'{verdict} ({self.live.n_windows} {"poses" if self._by_hand else "windows"})' + ''.join(f'; {line}' for line in lines)
+        return True, f'{verdict} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
 
-    def _save(self):
-        text = self._publish_solution(pending=True)
-        write_whole(self.save_file, text.encode())
-        self._save_accumulator(pending=True)
-        return f'written: {self.save_file} and {self.accumulator_file.name}'
+    def _save(self) -> tuple[bool, str]:
+        text, what = None, ''
+        try:
+            text = self._publish_solution(pending=True)
+            calibration = self.live.result.calibration
+            what = f'{calibration.verdict}: {missing(calibration) or "every parameter is determined"}'
+        except ImuCalibrationError as error:
+            what = f'no calibration yet: {error.told(self.hints)}'
+        if text is None and not self.live.n_windows:
+            return False, f'{what}; nothing written'
+        whole, written = self.place.save(self.live, text)
+        self._note_fault('place', '' if whole else written)
+        return whole and text is not None, f'{what}; {written}'
 
-    def _new_diagnosis(self):
+    def _new_diagnosis(self) -> LiveDiagnosis:
         settings = self.live.settings
         return LiveDiagnosis(0 if self._by_hand or not settings.diagnosis_period else settings.diagnosis_samples)
 
-    def _save_accumulator(self, pending):
-        write_whole(self.accumulator_file, self.live.saved(pending), to_disk=pending)
-        self._saved = (time.monotonic(), self.live.n_windows)
-
-    def _reset(self):
-        self.live = self.make_live(resume=False)
+    def _reset(self) -> tuple[bool, str]:
+        lost = self.place.unsaved(self.live)
+        self.live = self.make_live()
         self._new_windows, self._closed, self._diagnosed, self._windows = False, True, 0, self._new_diagnosis()
+        self.place.note_saved(0)
+        self._trouble = ''
         self._diagnosis.forget()
-        return 'started anew; the last calibration stays published until there is another one'
+        return True, (f'started anew, {lost} {self.gathered} that were in no file are forgotten; ' if lost else 'started anew; ') + \
+            'the last calibration stays published until there is another one'
 
-    def _autosave(self):
-        when, n_windows = self._saved
-        if self.autosave_period and time.monotonic() - when >= self.autosave_period and self.live.n_windows > n_windows:
-            try:
-                self._save_accumulator(pending=False)
-            except ImuCalibrationError as error:
-                self._saved = (time.monotonic(), n_windows)
-                self._complain(error.told(self.hints))
+    def change_settings(self, settings: Any) -> tuple[bool, str]:
+        """Solve, keep and tell as often as other LiveSettings say."""
+        was_off, self.live.settings = not self.live.settings.diagnosis_period, settings
+        self._pacer = SolvePacer(settings.solve_share)
+        self._diagnosis.change(0.0 if self._by_hand else settings.diagnosis_period)
+        if was_off:   # nothing was kept for it so far
+            self._windows = self._new_diagnosis()
+        return True, ''
 
-    def _complain(self, line):
-        self._trouble = line
-        self.on_trouble(line)
+    def change_windows(self, windows: Any) -> tuple[bool, str]:
+        """Find windows by other WindowSettings from now on."""
+        self.live.change_windows(windows)
+        return True, ''
 
-    def _tell(self):
+    def change_by_hand(self, by_hand: Any) -> tuple[bool, str]:
+        """Take other LiveByHandSettings; another gravity changes the solution at once."""
+        self.live.change(by_hand)
+        self._new_windows = self.live.n_windows > 0
+        return True, ''
+
+    def move(self, place: SessionFiles) -> None:
+        """
+        Save to another place from now on.
+
+        Raises
+        ------
+        InputError
+            When nothing can be saved there.
+
+        """
+        if why := place.try_place():
+            raise InputError(why)
+        self.place = place
+        self._note_fault('place', '')
+
+    def _autosave(self) -> None:
+        if self.place.autosave(self.live, self.autosave_period):
+            self._note_fault('place', '')
+
+    def _tell(self) -> None:
         now, counts = time.monotonic(), self.live.counts
         self._watch.note_counts(counts, now)
         result = self.live.result
-        verdict, lines = ('', ()) if result is None else summary(result, self.hints)
-        gathered = 'poses' if self._by_hand else 'windows'
-        values = {gathered: self.live.n_windows, 'solutions': self._n_solutions, 'process': os.getpid(), **counts}
+        verdict, lines = ('', []) if result is None else summary(result, self.hints)
+        values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
+                  f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
             lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: '
                      'calibrate the recording offline']
-        if self.state.solution != self._n_solutions or self.state.groups == [] or result is None:
-            groups = self.live.groups()
-        else:
-            groups = self.state.groups
+        stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
+        groups = self.live.groups() if stale else self.state.groups
         hand, diagnosis = (self.live.status(self.hints), None) if self._by_hand else (None, self._diagnosis_state())
-        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble, values,
-                                 hand, diagnosis)
+        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
+                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values, hand, diagnosis,
+                                 str(self.place.calibration))
 
     def _diagnosis_state(self):
         state = self._diagnosis.state
@@ -256,17 +285,11 @@ class CalibrationWorker(threading.Thread):
 class Request:
     """Something asked of the worker."""
 
-    def __init__(self, what):
-        self.what, self.done = what, threading.Event()
+    def __init__(self, action: Callable[[], tuple[bool, str]]):
+        self.action, self.done = action, threading.Event()
         self.success, self.message = False, ''
 
-    def answer(self, success, message):
+    def answer(self, success: bool, message: str) -> None:
         """Give the answer."""
         self.success, self.message = success, message
         self.done.set()
-
-
-def accumulator_file(save_file):
-    """Return the path of the accumulator that belongs to a calibration file."""
-    path = Path(save_file).expanduser()
-    return path.with_name(path.stem + '.accumulator.npz')

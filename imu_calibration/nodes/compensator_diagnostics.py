@@ -1,36 +1,47 @@
-"""What compensator_node says about itself."""
+"""What compensator_node says about itself, on /diagnostics and on the terminal."""
 
-import re
 from math import sqrt
 from time import monotonic
 
 import numpy as np
 
+from imu_calibration.calibration import trust
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 
-SERIOUS = ('frame_id', 'not an Imu message')
+SERIOUS = ('frame_id', 'not an Imu message', 'failed')
 """Beginnings of the reasons for which a stream as a whole cannot be corrected."""
 QUIET = 2.0
 """Seconds without a message after which diagnostics say so."""
+COLD = 10.0
+"""Seconds without a temperature after which diagnostics say so; drivers send one per second."""
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
+         'covariance not finite': "covariances are not finite: the calibration's noise takes their place",
          'beyond what can be undone': 'readings are too large for the non-linear effects to be undone: these messages are not published'}
 
 
 class CompensatorDiagnostics:
-    """Collects the state of the node; a line that differs from earlier ones in more than its numbers is logged."""
+    """Collects the state of the node; what is wrong is logged when it begins and when it is over."""
 
     def __init__(self, node):
-        self._node, self._logged, self._counts = node, set(), {}
-        self._received, self._last_change = 0, monotonic()
+        self._node, self._counts = node, {}
+        self._received, self._last_change, self._told_source = 0, monotonic(), ''
+        self._temperature, self._temperature_at, self._nan_temperatures = None, monotonic(), 0
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
     def publish_now(self):
         """Publish the present state at once."""
         self._publisher.publish_now()
+
+    def note_temperature(self, temperature_c):
+        """Take a temperature that came, which may be NaN."""
+        if np.isfinite(temperature_c):
+            self._temperature, self._temperature_at = temperature_c, monotonic()
+        else:
+            self._nan_temperatures += 1
 
     def collect(self):
         """Return the list of DiagnosticStatus."""
@@ -38,45 +49,48 @@ class CompensatorDiagnostics:
         node.look_for_correction()
         compensation = node.compensation
         serious, notes = self._lines(compensation)
-        if self._quiet(compensation):
-            notes.append(f'no messages come on {node.input_topic}')
-        for line in serious + notes:
-            kind = re.sub(r'[\d.]+', '#', line)
-            if kind not in self._logged:
-                self._logged.add(kind)
-                node.get_logger().warning(line)
+        notes += self._stream(compensation) + [line for each in node.inputs for line in each.faults()]
+        node.complaints.now('compensation', notes, serious)
+        calibration = None if node.adopted is None else node.adopted.calibration
+        notes += [] if calibration is None else node.adopted.caveats
         level = ERROR if serious else WARN if notes else OK
-        message = '; '.join(serious + notes) or f'corrected with calibration {node.version}'
-        frame = compensation.calibration.frame_id if compensation is not None else ''
-        return [make_status(level, 'compensation', message, self._values(compensation), frame)]
+        message = '; '.join(serious + notes) or f'corrected with calibration {node.adopted.version} ({trust.standing(calibration)})'
+        return [make_status(level, 'compensation', message, self._values(), '' if calibration is None else calibration.frame_id)]
 
-    def _quiet(self, compensation):
-        received = self._node.uncorrected + (0 if compensation is None else compensation.received)
+    def _stream(self, compensation):
+        """Return what is wrong with the stream of messages, and log where it comes from when it begins."""
+        node, received = self._node, self._node.uncorrected + (0 if compensation is None else compensation.received)
         if received != self._received:
             self._received, self._last_change = received, monotonic()
-        return monotonic() - self._last_change > QUIET
+            source = node.imu.source()
+            if source != self._told_source and node.imu.publishers:
+                self._told_source = source
+                node.get_logger().info(f'Imu messages come on {source}')
+        return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
 
     def _lines(self, compensation):
         """Return (what prevents correction, what should be known), one line each."""
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
+        if node.problem:
+            serious.append(node.problem + (f'; calibration {node.adopted.version} stays' if node.adopted else ''))
         if compensation is None:
             what = 'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
             waiting = f'waiting for a calibration, {what}'
-            return (serious + [f'{node.problem}; {waiting}'], []) if node.problem else (serious, [waiting])
-        notes = [f'{node.problem}; calibration {node.version} stays'] if node.problem else []
+            return (serious + [waiting], []) if node.problem else (serious, [waiting])
+        notes = []
         for reason, count in self._new_counts(compensation).items():
-            (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, count, compensation))
-        return serious, notes + self._outside(compensation)
+            (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, compensation))
+        return serious, notes + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
-        """Return the reasons of which there is more than at the last call."""
+        """Return the reasons of which there is more than at any call before: a calibration that is about to take over has counted nothing."""
         counts = dict(compensation.counts)
         new = {reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)}
-        self._counts = counts
+        self._counts |= new
         return new
 
-    def _line(self, reason, count, compensation):
+    def _line(self, reason, compensation):
         if reason.startswith('frame_id'):
             return f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they are not corrected"
         return KNOWN.get(reason, f'{reason}: these messages are not published')
@@ -87,16 +101,30 @@ class CompensatorDiagnostics:
             np.array([compensation.dt + compensation.calibration.model.temperature_ref_c])
         return outside_conditions(compensation.calibration, np.array([[fastest, 0.0, 0.0]]), temperature)
 
-    def _values(self, compensation):
+    def _warmth(self, compensation):
+        """Return what is wrong with the temperature, when the calibration needs one."""
         node = self._node
-        values = {'calibration': node.version or 'none', 'source': node.source,
-                  'loop': 'wait set' if node.by_wait_set else 'public executor',
+        if not compensation.needs_temperature or node.temperature is None:
+            return []
+        lines = []
+        if self._nan_temperatures:
+            lines.append(f'temperatures on {node.temperature.topic_name} are not finite: they are left out')
+            self._nan_temperatures = 0
+        if monotonic() - self._temperature_at > COLD:
+            last = 'none came yet' if self._temperature is None else f'the last one, {self._temperature:.1f} C, stays in use'
+            lines.append(f'{node.temperature.silence()}; {last}')
+        return lines
+
+    def _values(self):
+        node, adopted = self._node, self._node.adopted
+        values = {'calibration': adopted.version if adopted else 'none', 'source': adopted.source if adopted else '', 'adopt': node.settings.adopt,
+                  'loop': 'wait set' if node.by_wait_set else 'public executor', 'input': node.imu.source(),
                   'passed or held back without calibration': node.uncorrected}
-        if compensation is None:
+        if adopted is None:
             return values
-        calibration = compensation.calibration
-        values |= {'date': calibration.conditions.get('date', ''), 'parameters': len(calibration.status),
-                   'not determined': sum(status != DETERMINED for status in calibration.status),
+        calibration, compensation = adopted.calibration, adopted.compensation
+        values |= {'verdict': calibration.verdict or 'none', 'standing': trust.standing(calibration), 'date': calibration.conditions.get('date', ''),
+                   'parameters': len(calibration.status), 'not determined': sum(status != DETERMINED for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}
         if compensation.period is not None:
             values['period [s]'] = f'{compensation.period:.6g}'

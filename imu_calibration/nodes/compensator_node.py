@@ -1,7 +1,13 @@
-"""compensator_node: Imu in, corrected Imu out."""
+"""
+compensator_node: Imu in, corrected Imu out.
+
+in: imu/data_raw (sensor_msgs/Imu), imu/calibration (std_msgs/String, a calibration document), imu/temperature (sensor_msgs/Temperature,
+where the calibration has thermal effects). out: imu/data_corrected (sensor_msgs/Imu), /diagnostics. services: ~/reload (the file again).
+"""
 
 import sys
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import rclpy
 from rclpy.node import Node
@@ -9,19 +15,19 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from imu_calibration.calibration.document import calibration_from_text
-from imu_calibration.calibration.plausibility import implausible
-from imu_calibration.compensation.stream import refuse_corrected, requested_transfer
-from imu_calibration.documents import version_of
-from imu_calibration.errors import DocumentError, ImuCalibrationError, InputError
+from imu_calibration import files
+from imu_calibration.compensation.stream import refuse_corrected
+from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes import relay_loop
+from imu_calibration.nodes.adoption import Adopted, adopt, again
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.hints import HINTS
+from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
+from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
+from imu_calibration.nodes.qos import latched_qos, output_qos
 
 MARK = '/correction'
 """Behind the name of a corrected topic: a latched topic that says which calibration made it, and that it is corrected."""
@@ -31,53 +37,55 @@ class CompensatorNode(Node):
     """
     Corrects serialized messages with the calibration at hand.
 
-    Two threads: one takes, corrects and publishes messages; all else (documents, temperature, service, diagnostics) runs in the
-    other one, which prepares a new compensation; the first takes it over between two messages.
+    Two threads: one takes, corrects and publishes messages; all else (documents, temperature, services, parameters, diagnostics) runs in
+    the other one, which prepares a new compensation; the first takes it over between two messages.
     """
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any):
         super().__init__('compensator_node', **options)
         self.settings = declare_parameters(self, CompensatorSettings)
-        chosen = self.settings
-        self._transfer = requested_transfer(chosen.target_frame, chosen.target_xyz, chosen.target_rpy)
-        self._current = self._wanted = None
-        self.version, self.source, self.problem, self.corrected_already = '', '', '', ''
+        self.adopted: Adopted | None = None
+        self._current = self._wanted = self._told = None
+        self.problem, self.corrected_already, self._heard = '', '', ''
         self.uncorrected = 0
-        self.by_wait_set = relay_loop.available() and not chosen.public_executor
-        group = relay_loop.OutsideExecutor() if self.by_wait_set else None
+        self.complaints = Complaints(self.get_logger())
+        self.by_wait_set = relay_loop.available() and not self.settings.public_executor
         self._publisher = self.create_publisher(Imu, 'imu/data_corrected', output_qos())
         self._mark = self.create_publisher(String, self._publisher.topic_name + MARK, latched_qos())
-        self._imu = self.create_subscription(Imu, 'imu/data_raw', self._on_imu, input_qos(chosen.reliable), raw=True, callback_group=group)
+        group = relay_loop.OutsideExecutor() if self.by_wait_set else None
+        self.imu = MatchedInput(self, Imu, 'imu/data_raw', self._on_imu, group=group)
         self._refuse_own_output()
-        self._temperature = None
-        self._diagnostics = CompensatorDiagnostics(self)
-        self.create_subscription(String, 'imu/calibration', self._on_document, latched_qos())
+        self.documents = MatchedInput(self, String, 'imu/calibration', self._guarded(self._on_document), raw=False, latched=True)
+        self.temperature: MatchedInput | None = None
+        self.inputs = [self.imu, self.documents]
+        watch_inputs(self, self.inputs)
+        self.diagnostics = CompensatorDiagnostics(self)
         self.create_service(Trigger, '~/reload', self._on_reload)
-        if chosen.calibration_file:
-            self._load_file()
+        self._start()
+        watch_parameters(self, {'settings': self.settings}, self._change, HINTS['compensator_node'])
+        self._timer = None
+        self._set_refresh(self.settings.covariance_rate)
+
+    def _start(self) -> None:
+        if self.settings.calibration_file:
+            self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
-            self.get_logger().info('waiting for a calibration on ' + self.resolve_topic_name('imu/calibration'))
-        if chosen.covariance_rate > 0:
-            self.create_timer(1.0 / chosen.covariance_rate, self._refresh)
+            self.get_logger().info(f'waiting for a calibration on {self.documents.topic_name}' if self.settings.takes_topic else
+                                   "waiting for parameter 'calibration_file'")
 
     @property
     def compensation(self):
         """The LiveCompensation in use, or about to be, or None."""
         return self._wanted
 
-    @property
-    def input_topic(self):
-        """Full name of the topic of measured messages."""
-        return self._imu.topic_name
-
-    def spin(self):
+    def spin(self) -> None:
         """Work until the context ends."""
         if self.by_wait_set:
-            relay_loop.relay(self, self._imu, self._publisher, self.convert)
+            relay_loop.relay(self, self.imu, self._publisher, self.convert)
         else:
             rclpy.spin(self)
 
-    def convert(self, data):
+    def convert(self, data: bytes, information: dict) -> bytes | None:
         """Return what to publish for a serialized message, or None."""
         current = self._current
         if current is not self._wanted:
@@ -85,7 +93,11 @@ class CompensatorNode(Node):
         if current is None or self.corrected_already:
             self.uncorrected += 1
             return data if self.settings.passthrough and current is None and not self.corrected_already else None
-        return current(data)
+        try:
+            return current(data)
+        except Exception as error:   # a message that nobody foresaw must not end the stream
+            current.counts[shortened(f'failed with {type(error).__name__}: {error}', 100)] += 1
+            return None
 
     def _take_over(self):
         wanted = self._wanted
@@ -94,101 +106,112 @@ class CompensatorNode(Node):
         self._current = wanted
         return wanted
 
-    def _on_imu(self, data):
-        converted = self.convert(data)
+    def _on_imu(self, data: bytes, information: dict) -> None:
+        converted = self.convert(data, information)
         if converted is not None:
             self._publisher.publish(converted)
 
-    def _on_document(self, message):
-        self.adopt(message.data, 'topic ' + self.resolve_topic_name('imu/calibration'))
+    def _guarded(self, callback: Callable) -> Callable:
+        """Return a callback that tells what goes wrong instead of ending the node."""
+        def call(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self.complaints.event('what came could not be used, the node goes on as before: '
+                                      + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
+        return call
 
-    def adopt(self, text, source):
-        """
-        Take a calibration document over, or refuse it and keep the one there is.
+    def _on_document(self, message: String) -> None:
+        self._heard = message.data
+        if self.settings.takes_topic:
+            source = f'topic {self.documents.topic_name}'
+            self._try(source, self._adopt, message.data, source, self.settings)
+        else:
+            self.complaints.event(f"a calibration came on {self.documents.topic_name} and is not taken: parameter 'adopt' is "
+                                  f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'")
 
-        Returns
-        -------
-        str
-            What was wrong with it, empty when it was taken over.
+    def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
+        """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
+        self._put_in_force(adopt(text, source, settings, self.adopted))
+        if self.adopted.says_more_than(self._told):
+            self._told = self.adopted
+            self.get_logger().info(self.adopted.line())
+            for line in self.adopted.caveats:
+                self.get_logger().warning(f'calibration {self.adopted.version}: {line}')
 
-        """
+    def _put_in_force(self, adopted: Adopted) -> None:
+        self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
+        if adopted.compensation.needs_temperature and self.temperature is None:
+            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', self._guarded(self._on_temperature), depth=10, raw=False)
+            self.inputs.append(self.temperature)
+        self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
+        self.diagnostics.publish_now()
+
+    def _load_file(self, settings: CompensatorSettings) -> None:
+        path = files.user_path(settings.calibration_file)
+        self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
+
+    def _try(self, source: str, action: Callable, *arguments: Any) -> str:
+        """Do what may be refused; return why it was, '' when it was not."""
         try:
-            calibration = calibration_from_text(text)
-            strange = implausible(calibration)
-            if strange:
-                raise DocumentError(f'{strange[0]}; calibrate again')
-            self._check_frame(calibration.frame_id)
+            action(*arguments)
+            return ''
         except ImuCalibrationError as error:
-            return self._refuse(source, error.told(HINTS['compensator_node']))
-        chosen = self.settings
-        compensation = LiveCompensation(calibration, self._transfer, chosen.check_frame_id, chosen.parameter_covariance,
-                                        chosen.correct_stamps)
-        if compensation.needs_temperature and self._temperature is None:
-            self._temperature = self.create_subscription(Temperature, 'imu/temperature', self._on_temperature,
-                                                         input_qos(chosen.reliable, 10))
-        before = self._wanted
-        if before is not None:
-            compensation.prepare(before)
-        self.version, self.source, self.problem = version_of(text), source, ''
-        self._wanted = compensation
-        self._mark.publish(String(data=f'corrected with calibration {self.version}'))
-        self.get_logger().info(f'calibration {self.version} from {source} taken over')
-        self._diagnostics.publish_now()
-        return ''
-
-    def _check_frame(self, frame_id):
-        known = '' if self._wanted is None else self._wanted.frame_id
-        if known and frame_id and frame_id != known:
-            raise DocumentError(f"a new calibration must be for the same sensor, '{known}', this one is for '{frame_id}'; "
-                                'restart the node for another sensor')
-
-    def _refuse(self, source, why):
-        self.problem = f'a calibration from {source} was refused: {why}'
-        self.get_logger().error(self.problem)
-        self._diagnostics.publish_now()
+            why = error.told(HINTS['compensator_node'])
+        self.problem = f'the calibration from {source} was refused: {why}'
+        self.diagnostics.publish_now()
         return why
 
-    def _load_file(self):
-        path = self.settings.calibration_file
-        try:
-            text = Path(path).expanduser().read_text(encoding='utf-8')
-        except (OSError, UnicodeDecodeError) as error:
-            return self._refuse(f'file {path}', f'the file must be readable, {error}; correct parameter calibration_file')
-        return self.adopt(text, f'file {path}')
-
-    def _on_reload(self, request, response):
-        if not self.settings.calibration_file:
-            why = 'parameter calibration_file is empty; start the node with a file to return to'
+    def _on_reload(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self.settings.calibration_file:
+            why = self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
-            why = self._load_file()
-        response.success, response.message = not why, why or f'calibration {self.version} from {self.source}'
+            why = "parameter 'calibration_file' is empty; set it to the file to return to"
+        response.success, response.message = not why, why or self.adopted.line()
         return response
 
-    def _on_temperature(self, message):
-        if self._wanted is not None:
-            self._wanted.set_temperature(message.temperature)
+    def _change(self, name: str, settings: CompensatorSettings) -> None:
+        """Take changed parameters; raises an ImuCalibrationError and stays as it was."""
+        old, insists = self.settings, settings.anyway and not self.settings.anyway
+        if settings.calibration_file and (settings.calibration_file != old.calibration_file or (insists and not settings.takes_topic)):
+            self._load_file(settings)
+        elif settings.takes_topic and self._heard and (insists or not old.takes_topic):
+            self._adopt(self._heard, f'topic {self.documents.topic_name}', settings)
+        elif self.adopted is not None:
+            self._put_in_force(again(self.adopted, settings))
+        if settings.covariance_rate != old.covariance_rate:
+            self._set_refresh(settings.covariance_rate)
+        self.settings = settings
 
-    def _refresh(self):
-        if self._wanted is not None:
-            self._wanted.refresh()
+    def _on_temperature(self, message: Temperature) -> None:
+        self.diagnostics.note_temperature(message.temperature)
+        if self.compensation is not None:
+            self.compensation.set_temperature(message.temperature)
 
-    def look_for_correction(self):
+    def _set_refresh(self, rate: float) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+        self._timer = self.create_timer(1.0 / rate, self._guarded(self._refresh)) if rate > 0 else None
+
+    def _refresh(self) -> None:
+        if self.compensation is not None:
+            self.compensation.refresh()
+
+    def look_for_correction(self) -> None:
         """Notice when another compensator publishes the input, and when it no longer does."""
-        if self.count_publishers(self.input_topic + MARK):
-            self.corrected_already = (f'{self.input_topic} is corrected already (a publisher of {self.input_topic + MARK} says so): '
-                                      'nothing is published; remap imu/data_raw to the raw topic')
-        else:
-            self.corrected_already = ''
+        topic = self.imu.topic_name
+        self.corrected_already = (f'{topic} is corrected already (a publisher of {topic + MARK} says so): nothing is published; '
+                                  'remap imu/data_raw to the raw topic') if self.count_publishers(topic + MARK) else ''
 
-    def _refuse_own_output(self):
-        if self._imu.topic_name == self._publisher.topic_name:
-            raise InputError(f'input and output must be two topics, both are {self._imu.topic_name}; correct the remapping')
-        refuse_corrected(self._imu.topic_name)
+    def _refuse_own_output(self) -> None:
+        if self.imu.topic_name == self._publisher.topic_name:
+            raise InputError(f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping')
+        refuse_corrected(self.imu.topic_name)
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
-    return run_node(CompensatorNode, arguments, CompensatorNode.spin, HINTS['compensator_node'])
+    return run_node(CompensatorNode, arguments, CompensatorNode.spin, hints=HINTS['compensator_node'])
 
 
 if __name__ == '__main__':

@@ -2,32 +2,55 @@
 
 from dataclasses import dataclass
 
+from imu_calibration.errors import InputError
 from imu_calibration.settings import setting
+
+FILE, TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
+ADOPT = (FILE, TOPIC, FILE_THEN_TOPIC)
+"""
+Where calibrations are taken from.
+
+By default a file that was named stays in force, whatever comes on the topic, and without one the topic is listened to: nobody who names a file
+wants it displaced by somebody else's session, and nobody who names none has another use for the node.
+"""
 
 
 @dataclass(frozen=True)
 class CompensatorSettings:
     """What to correct with, where to, and how."""
 
-    calibration_file: str = setting('', '', 'calibration.yaml to start with and to return to on ~/reload; empty: wait for imu/calibration',
-                                    symptom='nothing is published, diagnostics say why')
+    calibration_file: str = setting('', '', 'calibration.yaml to correct with, and to return to on ~/reload; empty: wait for imu/calibration',
+                                    symptom='nothing is published, diagnostics say why', live=True, session=True)
+    adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
+                         'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
+                         symptom='a calibration that comes on the topic is not taken, or displaces the file', live=True)
+    anyway: bool = setting(False, '', 'take calibrations whose verdict is bad or whose proof failed, too',
+                           symptom='the correction may make the readings worse', live=True)
     passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
-                                symptom='uncorrected messages on the corrected topic')
+                                symptom='uncorrected messages on the corrected topic', live=True)
     target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to; empty: the frame of the sensor',
-                                symptom='frame_id is not the one that others expect')
+                                symptom='frame_id is not the one that others expect', live=True, session=True)
     target_xyz: tuple = setting((0.0, 0.0, 0.0), 'm', 'place of the sensor in the target frame',
-                                symptom='specific force is wrong while the body turns, right at rest')
+                                symptom='specific force is wrong while the body turns, right at rest', live=True, session=True)
     target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame',
-                                symptom='gravity points along the wrong axis')
-    reliable: bool = setting(False, '', 'subscribe reliably instead of best-effort',
-                             symptom='a best-effort publisher never connects; if false, messages may be lost under load')
+                                symptom='gravity points along the wrong axis', live=True, session=True)
     check_frame_id: bool = setting(True, '', 'correct only messages that carry the frame_id of the calibration',
-                                   symptom='nothing is published, diagnostics name both frames; if false, another sensor may pass unnoticed')
+                                   symptom='nothing is published, diagnostics name both frames; if false, another sensor may pass unnoticed',
+                                   live=True)
     correct_stamps: bool = setting(False, '', 'move the stamps back by the time_offset of the calibration',
-                                   symptom='stamps differ from those of the driver')
+                                   symptom='stamps differ from those of the driver', live=True)
     parameter_covariance: bool = setting(True, '', 'add what the uncertainty of the calibration contributes to the covariances',
-                                         symptom='covariances are too small, filters trust the readings too much')
+                                         symptom='covariances are too small, filters trust the readings too much', live=True)
     covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; 0: only with a new calibration',
-                                     (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time')
+                                     (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
     public_executor: bool = setting(False, '', "use rclpy's public executor, four times slower, instead of a wait set of our own",
-                                    symptom='messages are lost above 3 kHz')
+                                    symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
+
+    def __post_init__(self):
+        if self.adopt not in ADOPT:
+            raise InputError(f"parameter 'adopt' must be {', '.join(ADOPT)}, got '{self.adopt}'; choose one")
+
+    @property
+    def takes_topic(self) -> bool:
+        """Whether calibrations that come on the topic are taken."""
+        return self.adopt == TOPIC or (self.adopt == FILE_THEN_TOPIC and not self.calibration_file)

@@ -10,6 +10,9 @@ SHARE = 0.2
 """Share of the time that diagnosing takes at most."""
 
 
+OFF_WHY = "parameter 'diagnosis_period' is 0"
+
+
 class DiagnosisThread:
     """
     Answers one `live_diagnosis.Question` at a time.
@@ -24,8 +27,14 @@ class DiagnosisThread:
     def __init__(self, period):
         self.period, self._pacer, self._thread, self._ending = period, SolvePacer(SHARE), None, False
         self._next, self._wanted = time.monotonic() + period, False
-        self.state = DiagnosisState() if period else DiagnosisState(OFF, "parameter 'diagnosis_period' is 0")
+        self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
+
+    def change(self, period):
+        """Ask as often as another period says; 0: no more."""
+        if bool(period) != bool(self.period):
+            self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
+        self.period, self._next = period, time.monotonic() + period
 
     @property
     def is_running(self):

@@ -1,8 +1,17 @@
-"""Diagnostics: what a node knows about itself, once per second on /diagnostics and at once when it changes."""
+"""
+Diagnostics: what a node knows about itself, once per second on /diagnostics and at once when it changes.
+
+Levels by convention: OK works as it should, a start included; WARN works and somebody should look; ERROR does not do what it is for. STALE is
+for those who listen, when nothing comes any more.
+"""
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 
-OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+from imu_calibration.errors import shortened
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PERIOD = 1.0
 """Seconds between two messages; diagnostic aggregators call a status stale after five."""
 
@@ -14,7 +23,7 @@ def make_status(level, name, message, values=None, hardware_id=''):
     Parameters
     ----------
     level : bytes
-        `OK`, `WARN`, `ERROR` or `STALE`.
+        `OK`, `WARN` or `ERROR`.
     name : str
         What the status is about; the publisher puts the node's name in front.
     message : str
@@ -37,17 +46,20 @@ class DiagnosticsPublisher:
     """
 
     def __init__(self, node, collect):
-        from rclpy.clock import Clock
-        from rclpy.clock_type import ClockType
         self._node, self._collect = node, collect
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._timer = node.create_timer(PERIOD, self.publish_now, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish_now(self):
-        """Publish the present state."""
-        array = DiagnosticArray(status=self._collect())
+        """Publish the present state; when it cannot be told, that is told."""
+        try:
+            statuses = self._collect()
+        except Exception as error:   # diagnostics must not end what they speak of
+            statuses = [make_status(ERROR, 'diagnostics', shortened(f'the state cannot be told: {type(error).__name__}: {error}', 300))]
+        array = DiagnosticArray(status=statuses)
         array.header.stamp = self._node.get_clock().now().to_msg()
         prefix = self._node.get_fully_qualified_name().lstrip('/')
         for status in array.status:
             status.name = f'{prefix}: {status.name}'
-        self._publisher.publish(array)
+        if self._node.context.ok():
+            self._publisher.publish(array)

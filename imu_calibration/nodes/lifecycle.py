@@ -1,56 +1,80 @@
-"""From start to end of a node's process: exit code 0 after SIGINT and SIGTERM, one line and 1 when it cannot run."""
+"""From start to end of a node's process: exit code 0 after SIGINT and SIGTERM, one line and 1 when it cannot run or go on."""
 
 import signal
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import remove_ros_args
 
-from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.errors import ImuCalibrationError, shortened
+from imu_calibration.nodes.help import help_text
+from imu_calibration.nodes.parameters import unknown_parameters
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def run_node(make_node, arguments=None, spin=None, hints=None):
+def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, spin: Callable[[Any], None] | None = None,
+             hints: dict[str, str] | None = None) -> int:
     """
     Run one node until the process is asked to end, and return the exit code.
 
     Parameters
     ----------
     make_node : callable
-        Returns the node; an `ImuCalibrationError` becomes one line on standard error and exit code 1. A method `close` of the
-        node is called before it is destroyed.
+        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed.
     arguments : list of str, optional
-        Command line; default ``sys.argv``.
+        Command line without the program's name; default ``sys.argv[1:]``.
     spin : callable, optional
         Called with the node, returns or raises ExternalShutdownException when the context ends; default ``rclpy.spin``.
     hints : dict, optional
         As for `errors.with_hint`.
 
     """
-    # rclpy's handler, installed by init, ends the wait; without this line Python would also raise KeyboardInterrupt in mid-write.
-    early = []
-    signal.signal(signal.SIGINT, lambda number, frame: early.append(number))
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    own = remove_ros_args(['', *arguments])[1:]
+    if '-h' in own or '--help' in own:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)   # whoever reads may stop reading
+        print(help_text(make_node))
+        return 0
+    if own:
+        print(f"error: the node takes what stands behind --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
+              'and see --help', file=sys.stderr)
+        return 1
+    # rclpy's handlers, installed by init, end the wait and call these; without them Python would also raise KeyboardInterrupt in mid-write.
+    asked_to_end = []
+    for number in SIGNALS:
+        signal.signal(number, lambda number, frame: asked_to_end.append(number))
     rclpy.init(args=arguments)
     node = None
     try:
-        if early:   # before rclpy could take note of it
+        if asked_to_end:   # before rclpy could take note of it
             return 0
         node = make_node()
+        for line in unknown_parameters(node):
+            node.get_logger().warning(line)
         (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except ImuCalibrationError as error:
-        print(f'error: {error.told(hints or {})}', file=sys.stderr, flush=True)
-        return 1
-    except Exception:
+        return _failed(error.told(hints or {}))
+    except Exception as error:
         # A context that ends while something is being made or published fails in many ways; none of them is news.
-        if rclpy.ok():
-            raise
+        if not asked_to_end:
+            return _failed(f'the node cannot go on: {shortened(f"{type(error).__name__}: {error}", 300)}')
     finally:
         _end(node)
     return 0
 
 
-def _end(node):
+def _failed(line: str) -> int:
+    print(f'error: {line}', file=sys.stderr, flush=True)
+    return 1
+
+
+def _end(node: Any) -> None:
     if node is not None:
         if hasattr(node, 'close'):
             node.close()

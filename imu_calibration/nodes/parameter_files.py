@@ -1,7 +1,9 @@
 """
 Parameter files of the nodes, written from the settings that the nodes declare: ``make config``.
 
-A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and what a wrong value looks like.
+A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and what a wrong value looks like. What names
+the things that a session works on (table, calibration, bag) stands there as a comment: a file that set it to its default would undo
+what a command line said before it.
 """
 
 import ast
@@ -10,7 +12,7 @@ import json
 import textwrap
 from pathlib import Path
 
-from imu_calibration.settings import describe
+from imu_calibration.settings import Setting, describe
 
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
 
@@ -37,11 +39,16 @@ def rendered(node: str) -> str:
     """Return the text of the parameter file of `node`."""
     lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and what you see when it is wrong.', '/**:', '  ros__parameters:']
     for group in settings_of(node):
-        for name, default, unit, text, bounds, symptom in describe(group):
-            words = text + (f' [{unit}]' if unit not in ('', '1') else '') + range_text(bounds) + (f'. When wrong: {symptom}' if symptom else '')
+        for item in describe(group):
+            words = meaning(item) + (f'. When wrong: {item.symptom}' if item.symptom else '')
             lines += textwrap.wrap(words, 120, initial_indent='    # ', subsequent_indent='    # ')
-            lines.append(f'    {name}: {value_text(default)}')
+            lines.append(f'    {"# " if item.session else ""}{item.name}: {value_text(item.default)}')
     return '\n'.join(lines) + '\n'
+
+
+def meaning(item: Setting) -> str:
+    """Return what a setting means, with unit and range."""
+    return item.text + (f' [{item.unit}]' if item.unit not in ('', '1') else '') + range_text(item.bounds)
 
 
 def range_text(bounds: tuple) -> str:

@@ -1,26 +1,29 @@
-"""ROS parameters made from the settings that the package declares once."""
+"""ROS parameters made from the settings that the package declares once: declared, changed while a node runs, told when misspelt."""
 
 import math
 import sys
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
 
-from imu_calibration.errors import InputError
-from imu_calibration.settings import describe, override
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.settings import Setting, describe, override
+
+RETIRED = {'reliable': 'inputs connect as their publishers offer'}
+"""Parameters of earlier versions -> why they are not needed any more."""
+NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+"""Beginnings of the parameters that rclpy itself has."""
 
 
-def declare_parameters(node, group, changeable=()):
+def declare_parameters(node: Node, group: type) -> Any:
     """
     Declare every field of the settings `group` as a parameter of `node` and return the settings with the values it was given.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    group : dataclass class
-        Fields declared with `settings.setting`; tuples become arrays.
-    changeable : collection of str
-        Parameters that may be set while the node runs; the others are read-only.
+    Tuples become arrays.
 
     Raises
     ------
@@ -29,45 +32,114 @@ def declare_parameters(node, group, changeable=()):
 
     """
     values = {}
-    for name, default, unit, text, bounds, symptom in describe(group):
-        descriptor = parameter_descriptor(name, default, unit, text, bounds, symptom, name not in changeable)
+    for item in describe(group):
         try:
-            value = node.declare_parameter(name, _to_ros(default), descriptor).value
+            value = node.declare_parameter(item.name, _to_ros(item.default), parameter_descriptor(item)).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise InputError(f"parameter '{name}' must be {_type_name(default)}{_range_text(bounds)}: {error}") from error
-        values[name] = tuple(value) if isinstance(default, tuple) else value
+            raise InputError(f"parameter '{item.name}' must be {_type_name(item.default)}{_range_text(item.bounds)}: {error}") from error
+        values[item.name] = _from_ros(item, value)
     return override(group(), values)
 
 
-def parameter_descriptor(name, default, unit, text, bounds, symptom, read_only=True):
-    """Return the ParameterDescriptor of one setting: type, meaning, unit, range, and what a wrong value looks like."""
-    descriptor = ParameterDescriptor(name=name, description=f'{text} [{unit}]' if unit else text, read_only=read_only)
-    descriptor.additional_constraints = f'When wrong: {symptom}' if symptom else ''
-    if isinstance(default, bool) or bounds == (None, None):
+def parameter_descriptor(item: Setting) -> ParameterDescriptor:
+    """Return the descriptor of one setting: type, meaning, unit, range, what a wrong value looks like, why it cannot be changed."""
+    descriptor = ParameterDescriptor(name=item.name, description=f'{item.text} [{item.unit}]' if item.unit else item.text)
+    notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [f'Fixed while the node runs: {item.fixed}.'] * (not item.live)
+    descriptor.additional_constraints = ' '.join(notes)
+    if isinstance(item.default, bool) or item.bounds == (None, None):
         return descriptor
-    if isinstance(default, int):
-        low, high = _limits(bounds, 2**63 - 1)
+    if isinstance(item.default, int):
+        low, high = _limits(item.bounds, 2**63 - 1)
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-    elif isinstance(default, float):
-        low, high = _limits(bounds, sys.float_info.max)
+    elif isinstance(item.default, float):
+        low, high = _limits(item.bounds, sys.float_info.max)
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
 
 
-def _limits(bounds, largest):
+def watch_parameters(node: Node, groups: Mapping[str, Any], take: Callable[[str, Any], None],
+                     hints: Mapping[str, str] | None = None) -> None:
+    """
+    Let the settings that are declared `live` be changed while the node runs; the others say why they cannot.
+
+    Parameters
+    ----------
+    node : Node
+        Whose parameters were declared.
+    groups : mapping
+        Name -> settings in force; replaced in place as parameters change.
+    take : callable
+        Called with the name of a group and its new settings before they are in force; an ImuCalibrationError refuses them.
+    hints : mapping, optional
+        As for `errors.with_hint`.
+
+    """
+    def on_set(parameters: list) -> SetParametersResult:
+        new = dict(groups)
+        try:
+            for parameter in parameters:
+                _change(new, parameter)
+            for name, group in new.items():
+                if group is not groups[name]:
+                    take(name, group)
+                    groups[name] = group
+        except ImuCalibrationError as error:
+            return SetParametersResult(successful=False, reason=error.told(hints or {}))
+        except Exception as error:   # who asks gets an answer, and the node goes on as it was
+            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
+        return SetParametersResult(successful=True)
+    node.add_on_set_parameters_callback(on_set)
+
+
+def _change(groups: dict[str, Any], parameter: Any) -> None:
+    for name, group in groups.items():
+        item = next((item for item in describe(group) if item.name == parameter.name), None)
+        if item is None:
+            continue
+        value = _from_ros(item, parameter.value)
+        if value == getattr(group, item.name):
+            return
+        if not item.live:
+            raise InputError(f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed}; start the node with "
+                             f'-p {item.name}:={parameter.value}')
+        groups[name] = override(group, {item.name: value})
+
+
+def unknown_parameters(node: Node) -> list[str]:
+    """Return a line for each parameter that `node` was given and does not have: they are ignored, which nobody would notice."""
+    given = getattr(node, '_parameter_overrides', {})
+    lines = []
+    for name in sorted(given):
+        if node.has_parameter(name) or name.startswith(NOT_OURS):
+            continue
+        if name in RETIRED:
+            lines.append(f"parameter '{name}' is not needed any more: {RETIRED[name]}")
+            continue
+        known = [item.name for item in node.get_parameters_by_prefix('').values()]
+        near = get_close_matches(name, known, 1)
+        lines.append(f"parameter '{name}' is unknown and ignored" + (f"; did you mean '{near[0]}'?" if near else
+                                                                     f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))
+    return lines
+
+
+def _limits(bounds: tuple, largest: float) -> tuple:
     low, high = bounds
     return -largest if low is None else low, largest if high is None else high
 
 
-def _to_ros(default):
+def _to_ros(default: Any) -> Any:
     return list(default) if isinstance(default, tuple) else default
 
 
-def _type_name(default):
+def _from_ros(item: Setting, value: Any) -> Any:
+    return tuple(value) if isinstance(item.default, tuple) else value
+
+
+def _type_name(default: Any) -> str:
     return {bool: 'true or false', int: 'a whole number', float: 'a number with a decimal point', str: 'a text',
             tuple: 'a list of numbers with decimal points'}[type(default)]
 
 
-def _range_text(bounds):
-    low, high = (math.inf * sign if bound is None else bound for bound, sign in zip(bounds, (-1, 1)))
+def _range_text(bounds: tuple) -> str:
+    low, high = (math.inf * sign if bound is None else bound for bound, sign in zip(bounds, (-1, 1), strict=True))
     return '' if bounds == (None, None) else f' in [{low:g}, {high:g}]'

@@ -9,6 +9,7 @@ import sys
 import threading
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 try:
@@ -19,8 +20,8 @@ except ImportError:
 
 BATCH = 256
 """Messages taken in a row at most before the context is looked at."""
-WAIT_NS = 500_000_000
-"""Longest wait; a signal ends it at once."""
+WAIT_NS = 100_000_000
+"""Longest wait, after which another subscription may have taken the place of the one that is waited for; a signal ends it at once."""
 SWITCH_INTERVAL = 5e-4
 """The message thread gets the interpreter back from the other thread within this time, s."""
 
@@ -48,7 +49,7 @@ def available():
     return all(part is not None and all(hasattr(part, name) for name in names) for part, names in needed.items())
 
 
-def relay(node, subscription, publisher, convert):
+def relay(node, source, publisher, convert):
     """
     Publish what `convert` makes of each message until the context ends.
 
@@ -56,11 +57,11 @@ def relay(node, subscription, publisher, convert):
     ----------
     node : rclpy.node.Node
         Its other callbacks run in a second thread.
-    subscription : rclpy.subscription.Subscription
-        In a callback group `OutsideExecutor`.
+    source : inputs.MatchedInput
+        In a callback group `OutsideExecutor`; its subscription may change.
     publisher : rclpy.publisher.Publisher
     convert : callable
-        Serialized message (bytes) -> serialized message, or None to publish nothing.
+        (Serialized message, what the middleware says of it) -> serialized message, or None to publish nothing.
 
     """
     executor = SingleThreadedExecutor(context=node.context)
@@ -71,7 +72,7 @@ def relay(node, subscription, publisher, convert):
     sys.setswitchinterval(SWITCH_INTERVAL)
     thread.start()
     try:
-        _drain(node.context, subscription, publisher, convert)
+        _drain(node.context, source, publisher, convert)
     finally:
         sys.setswitchinterval(before)
         executor.shutdown(timeout_sec=2.0)
@@ -90,27 +91,37 @@ def _spin(executor, failures, context):
         context.try_shutdown()
 
 
-def _drain(context, subscription, publisher, convert):
+def _drain(context, source, publisher, convert):
     guard = SignalHandlerGuardCondition(context)
-    message_type = subscription.msg_type
     try:
-        with subscription.handle, publisher.handle, guard.handle, context.handle:
-            wait_set = _inner.WaitSet(1, 1, 0, 0, 0, 0, context.handle)
-            take, publish = subscription.handle.take_message, _publish_raw(publisher)
+        with publisher.handle, guard.handle, context.handle:
+            wait_set, publish = _inner.WaitSet(1, 1, 0, 0, 0, 0, context.handle), _publish_raw(publisher)
             while context.ok():
-                wait_set.clear_entities()
-                wait_set.add_subscription(subscription.handle)
-                wait_set.add_guard_condition(guard.handle)
-                wait_set.wait(WAIT_NS)
-                for _ in range(BATCH):
-                    taken = take(message_type, True)
-                    if taken is None:
-                        break
-                    converted = convert(taken[0])
-                    if converted is not None:
-                        publish(converted)
+                try:
+                    _drain_one(context, source, wait_set, guard, publish, convert)
+                except InvalidHandle:   # another subscription has just taken its place
+                    continue
     finally:
         guard.destroy()
+
+
+def _drain_one(context, source, wait_set, guard, publish, convert):
+    """Relay the messages of one subscription, until the source has another one."""
+    subscription = source.subscription
+    with subscription.handle:
+        take, message_type = subscription.handle.take_message, subscription.msg_type
+        while context.ok() and source.subscription is subscription:
+            wait_set.clear_entities()
+            wait_set.add_subscription(subscription.handle)
+            wait_set.add_guard_condition(guard.handle)
+            wait_set.wait(WAIT_NS)
+            for _ in range(BATCH):
+                taken = take(message_type, True)
+                if taken is None:
+                    break
+                converted = convert(taken[0], taken[1])
+                if converted is not None:
+                    publish(converted)
 
 
 def _publish_raw(publisher):

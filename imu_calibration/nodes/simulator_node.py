@@ -43,15 +43,15 @@ class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
     table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml',
-                              symptom='joint names are not those expected')
+                              symptom='joint names are not those expected', session=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
-                           'a trajectory comes on joint_trajectory', symptom='the node refuses and lists the names')
+                           'a trajectory comes on joint_trajectory', symptom='the node refuses and lists the names', session=True)
     repeat: bool = setting(False, '', 'start the profile again at its end', symptom='the table rests after one round')
     stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting',
                                 symptom='the node does not end')
     calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
-                                    symptom='another IMU is simulated')
+                                    symptom='another IMU is simulated', session=True)
     grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
                          symptom='noise too large or small')
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')

@@ -9,7 +9,9 @@ SILENT_AFTER = 2.0
 """Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
 RECENT = 10.0
 """Seconds for which a loss is called recent."""
-_MESSAGES = {'imu': 'Imu', 'joints': 'JointState'}
+COLD_AFTER = 10.0
+"""The same for temperatures, of which one per second is usual."""
+_MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 
 
 class StreamHealth(StrEnum):
@@ -35,6 +37,10 @@ class StreamState:
     """One line: what is wrong and what to do."""
     values: dict
     """Figures by name."""
+    silent: tuple = ()
+    """Streams that are needed and do not come: 'imu', 'joints', 'temperature'."""
+    coming: tuple = ()
+    """Streams that come."""
 
 
 class StreamWatch:
@@ -43,13 +49,13 @@ class StreamWatch:
 
     Parameters
     ----------
-    joints : bool
-        Whether joint states are needed.
+    joints, temperature : bool
+        Whether joint states and temperatures are needed.
 
     """
 
-    def __init__(self, joints=True):
-        self._needed = ('imu', 'joints') if joints else ('imu',)
+    def __init__(self, joints=True, temperature=False):
+        self._needed = {'imu': SILENT_AFTER} | ({'joints': SILENT_AFTER} if joints else {}) | ({'temperature': COLD_AFTER} if temperature else {})
         self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
         self._newest = {}
         self._arrived = {}
@@ -99,20 +105,19 @@ class StreamWatch:
         values = {f'{name} messages': count for name, count in self._count.items()}
         values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
-        silent = [name for name in self._needed if now - self._arrived.get(name, float('-inf')) > SILENT_AFTER]
-        if silent and len(self._needed) == 1:
-            return StreamState(SILENT, 'Imu messages do not come; check the topic imu/data_raw', values)
-        if len(silent) == 2:
-            return StreamState(SILENT, 'neither Imu nor JointState messages come; check the topics imu/data_raw and joint_states', values)
+        silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
+        coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
+        return StreamState(*self._word(silent, now), values, silent, coming)
+
+    def _word(self, silent, now):
+        """Return the word and the line that say how the streams are."""
         if silent:
-            missing = {'imu': 'Imu messages do not come (imu/data_raw)',
-                       'joints': 'JointState messages do not come (joint_states)'}[silent[0]]
-            return StreamState(TROUBLE, f'{missing}; nothing can be used meanwhile', values)
+            none = len(silent) == len(self._needed)
+            return SILENT if none else TROUBLE, f'no {" and no ".join(_MESSAGES[name] for name in silent)} messages come' + (
+                '' if none else ', nothing can be used meanwhile')
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
         if self._apart_for(lead, now) > SILENT_AFTER:
-            ahead = 'ahead of' if lead > 0 else 'behind'
-            return StreamState(TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {ahead} the joint stamps; bring the clocks together', values)
+            return TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; bring the clocks together'
         if self._lost_at is not None and now - self._lost_at < RECENT:
-            lost = ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
-            return StreamState(TROUBLE, f'dropped lately: {lost}', values)
-        return StreamState(GOOD, f'{" and ".join(_MESSAGES[name] for name in self._needed)} messages come', values)
+            return TROUBLE, 'dropped lately: ' + ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
+        return GOOD, f'{" and ".join(_MESSAGES[name] for name in self._needed)} messages come'

@@ -48,8 +48,8 @@ def origin_section(result):
 def _settings(options):
     """Return (name, value, unit, meaning, whether it was changed) of the settings in force."""
     options = options or CalibrationOptions()
-    return [(name, text(getattr(options.windows, name)), unit, meaning, getattr(options.windows, name) != default)
-            for name, default, unit, meaning, _, _ in describe(options.windows)]
+    return [(item.name, text(getattr(options.windows, item.name)), item.unit, item.text, getattr(options.windows, item.name) != item.default)
+            for item in describe(options.windows)]
 
 
 @singledispatch

@@ -44,6 +44,10 @@ class MotionChunks:
         """Length of the rests that have a curve of the joints throughout, s."""
         return min(self._settings.settling + self._settings.static_minimum, self.margin)
 
+    def change(self, settings):
+        """Work by other settings from the next chunk on; the length of the chunks and their margin stay."""
+        self._settings = settings
+
     @property
     def n_buffered(self):
         """Samples held, of all streams."""

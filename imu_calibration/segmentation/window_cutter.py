@@ -27,6 +27,10 @@ class WindowCutter:
         self._disturbed = self._ramped = -np.inf
         self._open = None
 
+    def change(self, settings, short_rest):
+        """Decide by other settings from now on."""
+        self._settings, self._short_rest = settings, short_rest
+
     @property
     def n_waiting(self):
         """Samples held."""

@@ -111,6 +111,23 @@ class MotionGatherer:
             windows += self._next_epoch() + self._work()
         return windows + self._end_epoch() + self._cutter.push(None, final=True)
 
+    def change(self, settings):
+        """
+        Find windows by other settings from now on.
+
+        Raises
+        ------
+        InputError
+            When the pieces in which the joints are smoothed, or the time kept out at the start, would change.
+
+        """
+        for name in ('chunk', 'overlap', 'turn_on'):
+            if getattr(settings, name) != getattr(self._settings, name):
+                raise InputError(f"setting '{name}' must stay as it is while a session goes on; start anew with it")
+        self._settings = settings
+        self._chunks.change(settings)
+        self._cutter.change(settings, self._chunks.short_rest)
+
     def _with_table_joints(self, joints):
         if not self._names or not joints.names or tuple(joints.names) == self._names:
             return joints

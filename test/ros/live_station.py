@@ -95,10 +95,9 @@ class Station:
         """Gather the Imu messages of a topic; returns the LiveGatherer."""
         from sensor_msgs.msg import Imu
 
-        from imu_calibration.nodes.batches import BatchSubscription
-        from imu_calibration.nodes.qos import input_qos
+        from imu_calibration.nodes.inputs import BatchInput
         gatherer = LiveGatherer()
-        self.subscriptions.append(BatchSubscription(self.node, Imu, topic, gatherer.add_imu, input_qos(True, 20_000)))
+        self.subscriptions.append(BatchInput(self.node, Imu, topic, gatherer.add_imu, depth=20_000))
         return gatherer
 
     def watch_documents(self, topic='imu/calibration'):

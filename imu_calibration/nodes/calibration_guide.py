@@ -1,0 +1,84 @@
+"""What calibration_node says on the terminal while a session goes on: one line at every change, with what can be done next."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+
+from imu_calibration.diagnosis import live as diagnosis
+from imu_calibration.nodes.calibration_state import WorkerState
+from imu_calibration.nodes.complaints import INFO, WARNING
+from imu_calibration.nodes.inputs import MatchedInput
+
+PATIENCE = 5.0
+"""Seconds between two pieces of advice; what helps most may change with every solution."""
+KINDS = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
+
+
+class CalibrationGuide:
+    """
+    Finds in the state of the worker what a person should hear.
+
+    Parameters
+    ----------
+    inputs : mapping
+        Stream ('imu', 'joints', 'temperature') -> MatchedInput.
+    save_command : str
+        What saves the calibration, for people.
+    noun : str
+        What is gathered: 'window' or 'pose'.
+    clock : callable
+        Seconds of a steady clock.
+
+    """
+
+    def __init__(self, inputs: Mapping[str, MatchedInput], save_command: str, noun: str, clock: Callable[[], float] = time.monotonic):
+        self._inputs, self._save_command, self._noun, self._clock = inputs, save_command, noun, clock
+        self._coming: set[str] = set()
+        self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = 0, '', '', float('-inf'), ''
+
+    def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        """Yield (INFO or WARNING, line) for what has changed since the last call."""
+        yield from self._streams(state)
+        if state.gathered and not self._gathered:
+            yield INFO, f'first {self._noun} gathered'
+        self._gathered = state.gathered
+        yield from self._verdicts(state)
+        yield from self._next(state)
+        yield from self._diagnosis(state)
+
+    def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        coming = set() if state.streams is None else {name for name in state.streams.coming if name in self._inputs}
+        for name in sorted(coming - self._coming):
+            yield INFO, f'{KINDS[name]} messages come on {self._inputs[name].source()}'
+        self._coming = coming
+
+    def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        if state.verdict == self._verdict:
+            return
+        self._verdict = state.verdict
+        if state.verdict == 'good':
+            yield INFO, f'verdict: good; save it with `{self._save_command}`'
+        elif state.verdict:
+            yield WARNING if state.verdict == 'bad' else INFO, f'verdict: {state.verdict}: {state.lines[0] if state.lines else ""}'
+
+    def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        advice = advice_of(state)
+        if advice and advice != self._advice and state.verdict != 'good' and self._clock() - self._advised >= PATIENCE:
+            self._advice, self._advised = advice, self._clock()
+            yield INFO, f'next: {advice}'
+
+    def _diagnosis(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        found = state.diagnosis
+        if found is None or found.word in (diagnosis.WAITING, diagnosis.OFF):
+            return
+        what = f'{found.word}:{found.values.get("effect", "")}'
+        if what != self._diagnosed:
+            self._diagnosed = what
+            yield WARNING if found.word == diagnosis.FAILED else INFO, f'diagnosis: {found.message}'
+
+
+def advice_of(state: WorkerState) -> str:
+    """Return the motion or the thing that helps most now, '' when nothing is known."""
+    if state.hand is not None:
+        return state.hand.values.get('next', '')
+    steps = [line.removeprefix('next: ') for line in state.lines if line.startswith('next: ')]
+    return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')

@@ -1,0 +1,37 @@
+"""What the worker of calibration_node knows, for diagnostics and for the terminal."""
+
+from dataclasses import dataclass, field
+
+from imu_calibration.by_hand.status import HandStatus
+from imu_calibration.diagnosis.live import DiagnosisState
+from imu_calibration.preflight.stream_watch import StreamState
+
+
+@dataclass(frozen=True)
+class WorkerState:
+    """What diagnostics tell; replaced as a whole, so that another thread may read it."""
+
+    groups: list = field(default_factory=list)
+    """GroupState of every effect."""
+    streams: StreamState | None = None
+    """How the streams are."""
+    solution: int = 0
+    """Number of the last solution; 0 before the first."""
+    verdict: str = ''
+    """'good', 'weak' or 'bad'; '' before the first solution."""
+    lines: tuple = ()
+    """Reasons and next steps."""
+    trouble: str = ''
+    """Why there is no new solution."""
+    faults: tuple = ()
+    """What goes wrong at present and should not, a line each."""
+    gathered: int = 0
+    """Windows, or poses by hand."""
+    values: dict = field(default_factory=dict)
+    """Figures by name."""
+    hand: HandStatus | None = None
+    """How far a calibration without a table has come."""
+    diagnosis: DiagnosisState | None = None
+    """What the model gets wrong; None without a table."""
+    place: str = ''
+    """Where the calibration is saved."""

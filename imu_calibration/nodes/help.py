@@ -1,0 +1,25 @@
+"""What ``--help`` prints: what a node does, its topics and services, and every parameter with its default and meaning."""
+
+import inspect
+import sys
+import textwrap
+from collections.abc import Callable
+from typing import Any
+
+from imu_calibration.nodes.parameter_files import meaning, settings_of, value_text
+from imu_calibration.settings import describe
+
+WIDTH = 118
+
+
+def help_text(node_class: Callable[[], Any]) -> str:
+    """Return the help of a node, from the docstring of its module and the settings that it declares."""
+    module = sys.modules[node_class.__module__]
+    name = inspect.getsourcefile(module).rpartition('/')[2].removesuffix('.py')
+    lines = [f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]', '',
+             inspect.getdoc(module), '', 'parameters:']
+    for group in settings_of(name):
+        for item in describe(group):
+            lines.append(f'  {item.name}: {value_text(item.default)}')
+            lines += textwrap.wrap(meaning(item), WIDTH, initial_indent='      ', subsequent_indent='      ')
+    return '\n'.join(lines)

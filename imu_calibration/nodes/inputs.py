@@ -1,0 +1,176 @@
+"""Inputs: subscriptions that connect to any publisher, lose nothing of a reliable one, and know what is wrong with their topic."""
+
+import time
+from collections.abc import Callable
+from difflib import get_close_matches
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from imu_calibration.nodes.qos import DEPTH, input_qos, latched_qos
+
+PERIOD = 0.25
+"""Seconds between two looks at the publishers of the inputs."""
+SEVERAL_AFTER = 3.0
+"""Seconds after which several publishers of one topic are worth a word."""
+DEAD_AFTER = 30.0
+"""The same when they have one name: for so long discovery may still know a node that was killed, beside the one that replaces it."""
+NAP = 0.004
+"""Seconds a callback sleeps after it has taken all: at 2 kHz the executor then wakes once for eight messages."""
+NOT_RAW = ('_corrected', '/residual', '/truth')
+"""Endings of topics that this package publishes, which nobody means to listen to instead."""
+SHOWN = 3
+"""Other topics that are named at most."""
+
+
+class MatchedInput:
+    """
+    A subscription as reliable as the publishers of its topic.
+
+    It asks for reliability, so that nothing is lost of a publisher that offers it, until a publisher appears that does not: such a
+    publisher would never connect. When the last one is gone it asks again.
+
+    Parameters
+    ----------
+    node : Node
+    message_type : type
+    topic : str
+        Relative name, as in a remapping.
+    callback : callable
+        Called with each message, and what the middleware says of it when it takes two arguments.
+    depth : int
+        Messages that may wait.
+    group : CallbackGroup, optional
+    single : bool
+        Whether several publishers at once are a fault.
+    raw : bool
+        Whether messages come serialized.
+    latched : bool
+        Whether the last message that was sent before is wanted too; its publisher is then reliable.
+
+    """
+
+    def __init__(self, node: Node, message_type: type, topic: str, callback: Callable[..., None], *, depth: int = DEPTH,
+                 group: CallbackGroup | None = None, single: bool = True, raw: bool = True, latched: bool = False):
+        self.node, self.message_type, self.topic, self.single = node, message_type, topic, single
+        self._callback, self._depth, self._group, self._raw, self._latched = callback, depth, group, raw, latched
+        self.type_name = '{}/msg/{}'.format(message_type.__module__.partition('.')[0], message_type.__name__)
+        self._several_since: float | None = None
+        self.publishers: list[Any] = []
+        self.reliable = True
+        self.subscription = self._subscribe()
+
+    @property
+    def topic_name(self) -> str:
+        """Full name of the topic."""
+        return self.subscription.topic_name
+
+    def _subscribe(self) -> Subscription:
+        # Without callbacks of our own rclpy warns of every publisher that offers less than is asked for, before we ask for less.
+        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+        qos = latched_qos() if self._latched else input_qos(self.reliable, self._depth)
+        return self.node.create_subscription(self.message_type, self.topic, self._callback, qos, callback_group=self._group,
+                                             event_callbacks=silent, raw=self._raw)
+
+    def look(self) -> None:
+        """Note who publishes, and subscribe anew when that asks for another reliability."""
+        known = self.node.get_publishers_info_by_topic(self.topic_name)
+        self.publishers = [found for found in known if found.topic_type == self.type_name]
+        self.others = [found for found in known if found.topic_type != self.type_name]
+        reliable = self._latched or all(found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for found in self.publishers)
+        if reliable != self.reliable:
+            before, self.reliable = self.subscription, reliable
+            self.subscription = self._subscribe()
+            self.node.destroy_subscription(before)
+        self._several_since = None if len(self.publishers) < 2 else self._several_since or time.monotonic()
+
+    others: list = []
+    """Publishers of another type on the topic."""
+
+    def names(self) -> list[str]:
+        """Return the full names of the nodes that publish."""
+        return [f'{found.node_namespace.rstrip("/")}/{found.node_name}' for found in self.publishers]
+
+    def faults(self) -> list[str]:
+        """Return what is wrong with the topic, a line each."""
+        names = self.names()
+        patience = DEAD_AFTER if len(set(names)) == 1 else SEVERAL_AFTER
+        if not self.single or self._several_since is None or time.monotonic() - self._several_since < patience:
+            return []
+        return [f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): what they send mixes; stop all but one, '
+                f'or remap {self.topic}']
+
+    def source(self) -> str:
+        """Return where messages come from, for people."""
+        return f'{self.topic_name} from {", ".join(sorted(set(self.names()))) or "an unknown node"}, ' + (
+            'reliable' if self.reliable else 'best effort')
+
+    def silence(self) -> str:
+        """Return why nothing may come on the topic, and which other topic there is."""
+        what = f'nothing comes on {self.topic_name} ({self.type_name})'
+        if self.publishers:
+            return f'{what}: {", ".join(sorted(set(self.names())))} publishes it and sends nothing'
+        if self.others:
+            return f'{what}: {self.others[0].node_name} publishes {self.others[0].topic_type} there; remap {self.topic} to another topic'
+        return f'{what}: {self._elsewhere()}'
+
+    def _elsewhere(self) -> str:
+        there = [name for name, types in self.node.get_topic_names_and_types() if self.type_name in types and name != self.topic_name
+                 and not name.endswith(NOT_RAW) and self.node.count_publishers(name)]
+        if not there:
+            return 'no topic of that type has a publisher'
+        near = get_close_matches(self.topic_name, there, SHOWN, 0.0)
+        more = f' (or {", ".join(near[1:])})' if near[1:] else ''
+        return f'there is {near[0]}{more}; listen to it with -r {self.topic}:={near[0]}'
+
+
+class BatchInput(MatchedInput):
+    """
+    An input whose callback hands on all waiting messages at once, so that thousands per second cost little.
+
+    The public executor calls it for the first one; the others are taken through the subscription's handle. Where rclpy has no such
+    handle every message comes by itself, which is slower and otherwise the same.
+
+    Parameters
+    ----------
+    add : callable
+        Called with each serialized message (bytes) and when it was sent, ns.
+
+    """
+
+    def __init__(self, node: Node, message_type: type, topic: str, add: Callable[[bytes, int], None], **options: Any):
+        self._add = add
+        super().__init__(node, message_type, topic, self._arrived, **options)
+
+    def _arrived(self, message: bytes, information: dict) -> None:
+        self._add(message, sent_ns(information))
+        if self.drain():
+            time.sleep(NAP)
+
+    def drain(self) -> bool:
+        """Hand on what waits; return whether that is possible here."""
+        take = getattr(getattr(self.subscription, 'handle', None), 'take_message', None)
+        if take is None:
+            return False
+        while (taken := take(self.message_type, True)) is not None:
+            self._add(taken[0], sent_ns(taken[1]))
+        return True
+
+
+def sent_ns(information: dict) -> int:
+    """Return when a message was sent, or where the middleware does not tell, received; ns."""
+    return information['source_timestamp'] or information['received_timestamp']
+
+
+def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
+    """Look at the publishers of inputs from now on, by the steady clock."""
+    def look() -> None:
+        for each in inputs:
+            each.look()
+    node.create_timer(PERIOD, look, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -1,0 +1,110 @@
+"""Where a live session is kept: the calibration, and beside it the accumulator with which it can go on."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from imu_calibration import files
+from imu_calibration.errors import ImuCalibrationError, shortened
+
+DEFAULT = 'calibration.yaml'
+
+
+class SessionFiles:
+    """
+    The two files of a session; each is written whole or stays as it was, whatever happens to the other.
+
+    Parameters
+    ----------
+    save_file : str
+        Path of the calibration; '': `DEFAULT` in the working directory, and nothing is kept unasked.
+
+    """
+
+    def __init__(self, save_file: str):
+        self.given = bool(save_file)
+        self.calibration = files.user_path(save_file or DEFAULT)
+        self.saved_at, self.n_saved = time.monotonic(), 0
+
+    @property
+    def accumulator(self) -> Path:
+        """Path of the accumulator."""
+        return self.calibration.with_name(self.calibration.stem + '.accumulator.npz')
+
+    def try_place(self) -> str:
+        """Return why nothing can be saved here, '' when it can."""
+        try:
+            for path in (self.calibration, self.accumulator):
+                files.try_place(path)
+        except ImuCalibrationError as error:
+            return f'nothing could be saved now: {error}'
+        return ''
+
+    def earlier(self) -> bytes | None:
+        """
+        Return the accumulator that an earlier session left, or None.
+
+        Raises
+        ------
+        InputError
+            When there is one that cannot be read.
+
+        """
+        return files.read_bytes(self.accumulator, 'accumulator') if self.accumulator.is_file() else None
+
+    def unsaved(self, live: Any) -> int:
+        """Return how many windows or poses of a session are in no file yet."""
+        return max(live.n_windows - self.n_saved, 0)
+
+    def note_saved(self, n_windows: int) -> None:
+        """Take note that so many windows or poses are safe now."""
+        self.saved_at, self.n_saved = time.monotonic(), n_windows
+
+    def save(self, live: Any, text: str | None) -> tuple[bool, str]:
+        """
+        Save both files; return whether both are safe now, and what became of each.
+
+        Parameters
+        ----------
+        live : LiveCalibration or LiveByHand
+        text : str or None
+            The calibration; None: there is none, the accumulator is saved alone.
+
+        """
+        wanted: list[tuple[Path, Callable[[], bytes]]] = [] if text is None else [(self.calibration, text.encode)]
+        done, failed = [], []
+        for path, make in [*wanted, (self.accumulator, lambda: live.saved(pending=True))]:
+            existed = path.exists()
+            try:
+                files.write_whole(path, make())
+                done.append(str(path))
+            except ImuCalibrationError as error:
+                failed.append(f'{error}; {"the earlier one there stays whole" if existed else "there was none before"}')
+        if not failed:
+            self.note_saved(live.n_windows)
+        lines = [f'written: {" and ".join(done)}'] * bool(done) + [f'not written: {line}' for line in failed]
+        return not failed, '; '.join(lines)
+
+    def autosave(self, live: Any, period: float) -> bool:
+        """Save the accumulator when that is due; return whether it was. Raises an InputError when it cannot be written."""
+        if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
+            return False
+        self.saved_at, n_windows = time.monotonic(), live.n_windows   # not again at once when it fails
+        files.write_whole(self.accumulator, live.saved(pending=False), to_disk=False)
+        self.note_saved(n_windows)
+        return True
+
+    def keep(self, live: Any, noun: str) -> str:
+        """Keep what is in no file at the end of a session where a place was given; return what became of it, '' when nothing was left."""
+        unsaved = self.unsaved(live)
+        if not unsaved:
+            return ''
+        ends = f'{unsaved} {noun} were in no file'
+        if not self.given:
+            return f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
+        try:
+            files.write_whole(self.accumulator, live.saved(pending=True))
+        except Exception as error:   # the process ends now, whatever happens
+            return f'{ends} and are lost: {shortened(str(error), 300)}'
+        return f'{ends}: they are kept in {self.accumulator}; resume:=true goes on with them'
