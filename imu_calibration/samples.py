@@ -80,6 +80,8 @@ class SampleBlock:
     """Temperature samples, or None."""
     dropped: dict | None = None
     """Messages that could not be turned into samples: reason -> count."""
+    notes: dict | None = None
+    """Messages that were used in another way than they came, such as those without a stamp: reason -> count."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,11 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from msg_adapters.decode import Decoder, JointDecoder
+from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
@@ -131,8 +130,8 @@ class Recording:
         decoders = self._decoders(joint_names)
         parts, n_samples = {}, 0
         for stretch in self.source.stretches(list(decoders)):
-            for topic, packed in stretch.items():
-                samples = decoders[topic].decode(packed)
+            for topic, arrived in stretch.items():
+                samples = decoders[topic].decode(*arrived)
                 if samples is not None:
                     parts.setdefault(type(samples), []).append(samples)
                     n_samples += len(samples)
@@ -177,12 +176,9 @@ class Recording:
 
 def _block(parts, decoders):
     """Join the parts of a block and take over what the decoders dropped since the last one."""
-    dropped = Counter()
-    for decoder in decoders.values():
-        dropped.update(decoder.dropped)
-        decoder.dropped.clear()
+    dropped, notes = taken_counts(decoders.values())
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
-    return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dict(dropped) or None)
+    return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dropped, notes)
 
 
 def _open_source(path):

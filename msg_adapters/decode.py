@@ -1,6 +1,7 @@
 """Messages of one topic to samples: whole groups of one layout at once, or object by object."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,22 +35,39 @@ class Decoder:
         self.find_layout, self.decode_layout, self.read_row, self.from_rows = _FUNCTIONS[message_type]
         self.name = message_type.rpartition('/')[2]
         self.deserialize = deserialize
-        self.dropped = Counter()
+        self.dropped, self.notes = Counter(), Counter()
 
-    def decode(self, packed):
-        """Return the samples of a Packed in its order, or None when there are none; counts in `dropped` what it cannot use."""
+    def decode(self, packed, arrived_ns=None):
+        """
+        Return the samples of a Packed in its order, or None when there are none; counts in `dropped` what it cannot use.
+
+        Parameters
+        ----------
+        packed : Packed
+        arrived_ns : callable, optional
+            Returns when the messages were sent or received, int64, shape (n,): the time of those whose stamp is zero, counted in `notes`.
+
+        """
         if self.deserialize is not None:
-            objects = (self._deserialized(packed.message(k)) for k in range(len(packed)))
-            return self.decode_objects(message for message in objects if message is not None)
+            objects = [self._deserialized(packed.message(k)) for k in range(len(packed))]
+            return self.decode_objects(objects, arrived_ns)
         groups, rest = group_by_layout(packed, self.find_layout)
         parts = [(index, self._decode_group(layout, group)) for layout, index, group in groups]
         parts += [(rest[k:k + 1], self._decode_alone(packed.message(number))) for k, number in enumerate(rest)]
-        return in_order([(index, samples) for index, samples in parts if samples is not None])
+        return in_order([(index, self._stamped(samples, index, arrived_ns)) for index, samples in parts if samples is not None])
 
-    def decode_objects(self, messages):
-        """Return the samples of message objects, from rclpy or rosbags, or None when there are none."""
-        rows = [row for row in map(self._row, messages) if row is not None]
-        return self.from_rows(rows) if rows else None
+    def decode_objects(self, messages, arrived_ns=None):
+        """Return the samples of message objects, from rclpy or rosbags, or None when there are none; `arrived_ns` as for `decode`."""
+        rows = [(k, row) for k, row in enumerate(map(self._row, messages)) if row is not None]
+        return self._stamped(self.from_rows([row for _, row in rows]), np.array([k for k, _ in rows]), arrived_ns) if rows else None
+
+    def _stamped(self, samples, index, arrived_ns):
+        """Return the samples with the time of arrival where a driver has set no stamp."""
+        unset = samples.stamp_ns == 0
+        if arrived_ns is None or not unset.any():
+            return samples
+        self.notes[f'{self.name} zero stamp'] += int(unset.sum())
+        return replace(samples, stamp_ns=np.where(unset, arrived_ns()[index], samples.stamp_ns))
 
     def _decode_group(self, layout, packed):
         try:
@@ -71,6 +89,8 @@ class Decoder:
             return self._drop(error, 1)
 
     def _row(self, message):
+        if message is None:
+            return None
         try:
             return self.read_row(message)
         except (AttributeError, TypeError, ValueError, IndexError) as error:   # fields of another definition
@@ -104,18 +124,21 @@ class JointDecoder(Decoder):
         self.read_row = lambda message: joint_row(message, self._expected(tuple(message.name)))
         self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
-    def decode(self, packed):
+    def decode(self, packed, arrived_ns=None):
         """As for Decoder; raises InputError when the names have not matched those of the table for long."""
-        return self._checked(super().decode(packed), len(packed) if self.deserialize is None else 0)
+        return self._checked(super().decode(packed, arrived_ns), len(packed) if self.deserialize is None else 0)
 
-    def decode_objects(self, messages):
+    def decode_objects(self, messages, arrived_ns=None):
         """As for Decoder; raises InputError when the names have not matched those of the table for long."""
         messages = list(messages)
-        return self._checked(super().decode_objects(messages), len(messages))
+        return self._checked(super().decode_objects(messages, arrived_ns), len(messages))
 
     def check(self):
         """Raise InputError when no message so far has held the joints of the table."""
         if self.asked and self.seen and not self.n_fitting:
+            if any(set(self.names) <= set(names) for names in self.seen):
+                raise InputError('JointState must hold one position for each joint that it names, the messages so far do not; correct the '
+                                 'driver, or choose another topic', key='joint_topic')
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
             raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}; '
                              'correct the names in the table description, or choose another topic', key='joint_topic')
@@ -133,6 +156,16 @@ class JointDecoder(Decoder):
         if not self.asked and not self.names:
             self.names = names
         return self.names
+
+
+def taken_counts(decoders):
+    """Return ({reason: messages dropped}, {reason: messages used in another way than they came}) since the last call; None for none."""
+    totals = Counter(), Counter()
+    for decoder in decoders:
+        for total, own in zip(totals, (decoder.dropped, decoder.notes), strict=True):
+            total.update(own)
+            own.clear()
+    return tuple(dict(total) or None for total in totals)
 
 
 def in_order(parts):

@@ -3,8 +3,10 @@
 import threading
 from collections import deque
 
+import numpy as np
+
 from imu_calibration.samples import SampleBlock
-from msg_adapters.decode import Decoder, JointDecoder
+from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
 from msg_adapters.stamps import UnusableMessage
@@ -36,15 +38,15 @@ class LiveGatherer:
 
     def add_imu(self, message, sent_ns=0):
         """Add an Imu message: bytes or a message object, and when it was sent, ns."""
-        self._topics['imu'].add(message)
+        self._topics['imu'].add(message, sent_ns)
 
     def add_joints(self, message, sent_ns=0):
         """Add a JointState message: bytes or a message object."""
-        self._topics['joints'].add(message)
+        self._topics['joints'].add(message, sent_ns)
 
     def add_temperature(self, message, sent_ns=0):
         """Add a Temperature message: bytes or a message object."""
-        self._topics['temperature'].add(message)
+        self._topics['temperature'].add(message, sent_ns)
 
     def __len__(self):
         return sum(len(topic.waiting) for topic in self._topics.values())
@@ -60,11 +62,8 @@ class LiveGatherer:
 
         """
         samples = {name: topic.take() for name, topic in self._topics.items()}
-        dropped = {}
-        for topic in self._topics.values():
-            dropped.update(topic.decoder.dropped)
-            topic.decoder.dropped.clear()
-        return SampleBlock(**samples, dropped=dropped or None)
+        dropped, notes = taken_counts(topic.decoder for topic in self._topics.values())
+        return SampleBlock(**samples, dropped=dropped, notes=notes)
 
 
 class FrameDecoder(Decoder):
@@ -99,9 +98,9 @@ class _Topic:
         self.decoder, self.max_messages = decoder, max_messages
         self.lock, self.waiting, self.n_lost = threading.Lock(), deque(), 0
 
-    def add(self, message):
+    def add(self, message, sent_ns):
         with self.lock:
-            self.waiting.append(message)
+            self.waiting.append((message, sent_ns))
             if len(self.waiting) > self.max_messages:
                 self.waiting.popleft()
                 self.n_lost += 1
@@ -112,6 +111,9 @@ class _Topic:
             n_lost, self.n_lost = self.n_lost, 0
         if n_lost:
             self.decoder.dropped[f'{self.decoder.name} message that came faster than it was used'] += n_lost
-        if messages and isinstance(messages[0], (bytes, bytearray, memoryview)):
-            return self.decoder.decode(Packed.join(list(messages)))
-        return self.decoder.decode_objects(messages)
+        sent_ns = np.array([sent for _, sent in messages], np.int64)
+        contents = [message for message, _ in messages]
+        arrived_ns = (lambda: sent_ns) if np.all(sent_ns) else None
+        if contents and isinstance(contents[0], (bytes, bytearray, memoryview)):
+            return self.decoder.decode(Packed.join(contents), arrived_ns)
+        return self.decoder.decode_objects(contents, arrived_ns)

@@ -2,9 +2,13 @@
 
 from collections import defaultdict
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from msg_adapters.layout import Packed
+from msg_adapters.storage import Arrived
 
 STRETCH = 8192
 """Messages per stretch."""
@@ -34,28 +38,37 @@ class Ros1File:
         return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
 
     def stretches(self, topics):
-        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
+        """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
         connections = [c for c in self.reader.connections if c.topic in topics]
         pending, n_pending, n_read = defaultdict(list), 0, 0
         expected = sum(c.msgcount for c in connections)
         messages = self.reader.messages(connections) if connections else iter(())
         while True:
             try:
-                connection, _, data = next(messages)
+                connection, received_ns, data = next(messages)
             except StopIteration:
                 break
             except Exception as error:   # whatever a damaged file makes rosbags raise
                 self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
                 break
-            pending[connection.topic].append(bytes(data))
+            pending[connection.topic].append((bytes(data), received_ns))
             n_pending, n_read = n_pending + 1, n_read + 1
             if n_pending == STRETCH:
-                yield {topic: Packed.join(messages_) for topic, messages_ in pending.items()}
+                yield _arrived(pending)
                 pending, n_pending = defaultdict(list), 0
         if pending:
-            yield {topic: Packed.join(messages_) for topic, messages_ in pending.items()}
+            yield _arrived(pending)
 
     def close(self):
         """Close the file."""
         with suppress(Exception):
             self.reader.close()
+
+
+def _arrived(pending):
+    """Return topic -> Arrived from topic -> [(message, receive time)]."""
+    found = {}
+    for topic, entries in pending.items():
+        messages, times = zip(*entries, strict=True)
+        found[topic] = Arrived(Packed.join(list(messages)), partial(np.array, times, dtype=np.int64))
+    return found

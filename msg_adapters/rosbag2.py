@@ -82,8 +82,8 @@ class Rosbag2:
         return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
 
     def stretches(self, topics):
-        """Yield dicts topic -> Packed in file order."""
-        return self._through(topics, lambda file: file.stretches(topics), lambda stretch: sum(map(len, stretch.values())))
+        """Yield dicts topic -> Arrived in file order."""
+        return self._through(topics, lambda file: file.stretches(topics), lambda found: sum(len(part.packed) for part in found.values()))
 
     def raw_stretches(self, topics):
         """Yield RawMessages of the topics in file order."""

@@ -1,6 +1,7 @@
 """What the readers of storage files have in common: from stretches of rows to messages by topic."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,15 @@ class Stretch(NamedTuple):
     """Index array -> (index array, Packed): rows that turn out unreadable are left out."""
     received_ns: Callable
     """Index array -> receive times, int64."""
+
+
+class Arrived(NamedTuple):
+    """Consecutive messages of one topic, in file order."""
+
+    packed: Packed
+    """The messages."""
+    received_ns: Callable
+    """Called without arguments: receive times, int64, shape (n,); hardly anybody needs them."""
 
 
 class RawMessages(NamedTuple):
@@ -37,13 +47,14 @@ class StorageFile:
     """Bytes -> bytes for each message, when the bag is compressed by message."""
 
     def stretches(self, topics):
-        """Yield dicts topic -> Packed in file order; what the file loses is counted in `lost`."""
+        """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
         for stretch in self._stretches(topics):
             found = {}
             for topic in topics:
                 mine = np.flatnonzero(is_any(stretch.topic_ids, self.topic_ids.get(topic, [])))
                 if len(mine):
-                    found[topic] = self._take(stretch, mine)[1]
+                    mine, packed = self._take(stretch, mine)
+                    found[topic] = Arrived(packed, partial(stretch.received_ns, mine))
             if found:
                 yield found
 

@@ -28,7 +28,8 @@ def add_model_arguments(parser: ArgumentParser) -> None:
     group.add_argument('--nominal', metavar='FILE', help='YAML with accelerometer_offset, accelerometer_scale, gyroscope_offset, '
                        'gyroscope_scale for recordings in volts or counts')
     group.add_argument('--setting', metavar='NAME=VALUE', action='append', default=[],
-                       help='how windows are found; may be repeated: ' + ', '.join(f'{d.name} [{d.unit}]' for d in describe(WindowSettings)))
+                       help='how windows are found; may be repeated: '
+                       + ', '.join(f'{d.name} [{d.unit}]' for d in describe(WindowSettings)))
 
 
 def choices_of(options: Namespace) -> Choices:

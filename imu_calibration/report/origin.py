@@ -48,8 +48,8 @@ def origin_section(result):
 def _settings(options):
     """Return (name, value, unit, meaning, whether it was changed) of the settings in force."""
     options = options or CalibrationOptions()
-    return [(item.name, text(getattr(options.windows, item.name)), item.unit, item.text, getattr(options.windows, item.name) != item.default)
-            for item in describe(options.windows)]
+    values = [(item, getattr(options.windows, item.name)) for item in describe(options.windows)]
+    return [(item.name, text(value), item.unit, item.text, value != item.default) for item, value in values]
 
 
 @singledispatch
