@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.segmentation.sample_times import SampleTimes
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -18,9 +19,10 @@ class StreamCheck:
     """
     Cleans one stream; the outcome does not depend on how it is cut into pieces.
 
-    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays: where stamps are
-    whole milliseconds a second reading belongs to a later, unknown instant), 'backward stamp' (a sample that came late)
-    and 'stray stamp' (one sample far from both neighbours). 'clock reset' counts the jumps, each of which starts a new epoch.
+    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays), 'backward stamp' (a sample that came
+    late) and 'stray stamp' (one sample far from both neighbours). 'clock reset' counts the jumps, each of which starts a new epoch.
+    Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, whole milliseconds, jitter) its samples get times
+    of their own first (see `sample_times`).
     """
 
     def __init__(self):
@@ -32,9 +34,16 @@ class StreamCheck:
         self._newest = None
         self._before_held = None
         self._held = None
+        self._newest_raw = None
+        self._times = None
+
+    @property
+    def line(self):
+        """How the stamps of an IMU are (`stamping.StampLine`); None for other streams, and while too few came to tell."""
+        return None if self._times is None else self._times.line
 
     def push(self, samples):
-        """Return a list of (epoch, samples) that are accepted; the last sample is held while it may be a stray."""
+        """Return a list of (epoch, samples) that are accepted; a few are held while their times are open."""
         if samples is None or not len(samples):
             return []
         return self._accept(self._without_strays(self._finite(samples)))
@@ -42,7 +51,7 @@ class StreamCheck:
     def finish(self):
         """Return what was held, as `push` does."""
         held, self._held = self._held, None
-        return [] if held is None else self._accept(held)
+        return ([] if held is None else self._accept(held)) + self._end_epoch()
 
     def statistics(self, gap=0.1):
         """
@@ -94,23 +103,43 @@ class StreamCheck:
         return samples.select(~stray) if stray.any() else samples
 
     def _accept(self, samples):
+        if self._times is None and isinstance(samples, ImuSamples):
+            self._times = SampleTimes()
         accepted = []
         while len(samples):
             stamps = samples.stamp_ns
-            newest = stamps[0] - 1 if self._newest is None else self._newest
+            newest = stamps[0] - 1 if self._newest_raw is None else self._newest_raw
             before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
             reset = _is_reset(stamps - before)
             end = int(np.argmax(reset)) if reset.any() else len(stamps)
             if end:
-                accepted.append((self.epoch, self._in_order(samples.select(slice(0, end)), before[:end])))
+                self._newest_raw = max(before[end - 1], stamps[end - 1])
+                accepted += self._in_order(self._timed(samples.select(slice(0, end))))
             if end < len(stamps):
+                accepted += self._end_epoch()
                 self._count('clock reset', 1)
-                self.epoch, self._newest = self.epoch + 1, None
+                self.epoch, self._newest, self._newest_raw = self.epoch + 1, None, None
             samples = samples.select(slice(end, None))
         return accepted
 
-    def _in_order(self, samples, before):
+    def _timed(self, samples):
+        if self._times is None:
+            return samples
+        repeated = self._times.n_repeated
+        samples = self._times.push(samples)
+        self._count('repeated stamp', self._times.n_repeated - repeated)
+        return samples
+
+    def _end_epoch(self):
+        return [] if self._times is None else self._in_order(self._times.finish())
+
+    def _in_order(self, samples):
+        """Return [(epoch, samples)] without those that repeat a stamp or step back, [] for none."""
+        if samples is None or not len(samples):
+            return []
         stamps = samples.stamp_ns
+        newest = stamps[0] - 1 if self._newest is None else self._newest
+        before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
         self._count('repeated stamp', np.count_nonzero(stamps == before))
         self._count('backward stamp', np.count_nonzero(stamps < before))
         keep = stamps > before
@@ -121,7 +150,7 @@ class StreamCheck:
             self._span_ns += int(joined[-1] - joined[0])
             self._newest = joined[-1]
             self._n_accepted += len(samples)
-        return samples
+        return [(self.epoch, samples)]
 
 
 def _is_reset(step):

@@ -1,0 +1,144 @@
+"""Times of the samples of an IMU: its stamps where they are regular, else those of a clock drawn through them, in bounded memory."""
+
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.samples import ImuSamples
+from imu_calibration.segmentation.counted_clock import BLOCK, CountedClock
+from imu_calibration.segmentation.stamping import COUNTED, EARLY, IRREGULAR_SHARE, LAG, LATE, LEAST, StampLine, describe_stamps
+
+RARE = 4
+"""Stamps that are counted are looked at again after so many blocks."""
+HISTORY = 4 * LAG
+"""Stamps from which counted and irregular ones are told apart."""
+
+
+class SampleTimes:
+    """
+    Puts regular times on samples whose stamps follow a clock only loosely; the outcome does not depend on how the stream is cut.
+
+    Regular stamps pass as they are and at once, but for the first few; every 64 samples they are looked at again. Repeated messages (same
+    stamp, same readings) are taken out.
+    """
+
+    def __init__(self) -> None:
+        self.line: StampLine | None = None
+        """How the stamps are, as far as that is known."""
+        self.n_rebuilt = self.n_repeated = 0
+        """Samples with a time of their own; repeated messages."""
+        self._last: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._learning, self._clock = True, None
+        self._held: Any = None
+        self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
+
+    def push(self, samples: ImuSamples) -> ImuSamples | None:
+        """Return the samples whose times are known now, in the order of arrival; None for none."""
+        if self._pass(samples):
+            return samples
+        samples, ready = self._without_repeated(samples), []
+        while len(samples):
+            part, samples = samples.select(slice(0, BLOCK - self._unseen)), samples.select(slice(BLOCK - self._unseen, None))
+            self._unseen = (self._unseen + len(part)) % BLOCK
+            self._history = np.concatenate([self._history, part.stamp_ns])[-HISTORY:]
+            ready += self._take(part)
+        return _joined(ready)
+
+    def finish(self) -> ImuSamples | None:
+        """Return what was held; after this the stream begins anew."""
+        if self._learning and self._held is not None:
+            self._judge(describe_stamps(self._held.stamp_ns))
+        ready = self._counted(final=True) if self._clock is not None else [self._held]
+        self._begin()
+        return _joined(ready)
+
+    def _pass(self, samples: ImuSamples) -> bool:
+        """Return whether all steps are those of the clock that is known, as usual: then nothing else has to be looked at."""
+        if self._learning or self._clock is not None or self.line is None or not len(samples):
+            return False
+        step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the whole block that is looked at next
+        if not np.all((step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)):
+            return False
+        self._unseen = (self._unseen + len(samples)) % BLOCK
+        self._history = np.concatenate([self._history, samples.stamp_ns[-HISTORY:]])[-HISTORY:]
+        self._last = samples.select(slice(len(samples) - 1, None))
+        return True
+
+    def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
+        joined = samples if self._last is None else ImuSamples.concatenate([self._last, samples])
+        at = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
+        same = at[np.all(joined.force_s[at] == joined.force_s[at + 1], axis=1) & np.all(joined.rate_s[at] == joined.rate_s[at + 1], axis=1)]
+        self._last = joined.select(slice(len(joined) - 1, None))
+        if not len(same):
+            return samples
+        self.n_repeated += len(same)
+        new = np.arange(len(joined)) >= len(joined) - len(samples)
+        new[same + 1] = False
+        return joined.select(new)
+
+    def _take(self, part: ImuSamples) -> list:
+        """Take a block or the rest of one; return what is ready."""
+        if self._learning:
+            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
+            stamp_ns = self._held.stamp_ns
+            line = describe_stamps(stamp_ns[:LEAST + 1] if len(stamp_ns) < HISTORY else stamp_ns) if len(stamp_ns) > LEAST else None
+            if line is None and len(stamp_ns) < HISTORY:
+                return []
+            self._learning = False
+            return self._judge(line) + self._on(None)
+        ready = self._on(part)
+        if not self._unseen:
+            self._reviewed = (self._reviewed + 1) % RARE
+            if self._odd() if self._clock is None else not self._reviewed:
+                ready += self._judge(describe_stamps(self._history))
+        return ready
+
+    def _on(self, part: ImuSamples | None) -> list:
+        """Hand on what is held and a further part, as they are or through the clock."""
+        if self._clock is None:
+            held, self._held = self._held, None
+            return [held, part]
+        if part is not None:
+            self._clock.push(part.stamp_ns)
+            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
+        return self._counted()
+
+    def _counted(self, final: bool = False) -> list:
+        """Return the samples at the front whose times the clock has told."""
+        times = self._clock.take(final)
+        if not len(times):
+            return []
+        timed, self._held = self._held.select(slice(0, len(times))), self._held.select(slice(len(times), None))
+        self.n_rebuilt += len(times)
+        return [ImuSamples(times, timed.force_s, timed.rate_s, timed.frame_id)]
+
+    def _odd(self) -> bool:
+        """Return whether the steps of the last block are not those of the clock that is known."""
+        if self.line is None:
+            return True
+        step = np.diff(self._history[-BLOCK - 1:])
+        regular = (step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)
+        return bool(np.count_nonzero(~regular) > IRREGULAR_SHARE * len(step))
+
+    def _judge(self, line: StampLine | None) -> list:
+        """Count from now on, or no longer, as the stamps are; return what becomes ready by that."""
+        if line is None:
+            return []
+        counting, self.line = self._clock is not None, line
+        if (line.word == COUNTED) == counting:
+            return []
+        if counting:
+            ready, self._clock = self._counted(final=True), None
+            return ready
+        self._clock = CountedClock(line)
+        if self._held is not None:
+            self._clock.push(self._held.stamp_ns)
+        return []
+
+
+def _joined(parts: list) -> ImuSamples | None:
+    parts = [part for part in parts if part is not None and len(part)]
+    return parts[0] if len(parts) == 1 else ImuSamples.concatenate(parts) if parts else None

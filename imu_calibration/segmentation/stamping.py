@@ -1,0 +1,136 @@
+"""
+How the stamps of one stream relate to its sampling.
+
+An IMU samples by a clock of its own; its stamps are often made when messages arrive: eight at once from a USB packet, late by whatever the bus
+took, in whole milliseconds, or not at all. Where the stamps stay near a line through the number of the sample, counting says when each
+was taken (`COUNTED`); where they run away from every such line the sampling itself is irregular, and the stamps are all there is.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+
+class Stamping(StrEnum):
+    """What a stretch of stamps can be used for."""
+
+    REGULAR = 'regular'
+    """Steps are those of a clock, or whole multiples where samples were lost: the stamps are right as they are."""
+    COUNTED = 'counted'
+    """Steps scatter, but about a line through the number of the sample: times are drawn along that line."""
+    IRREGULAR = 'irregular'
+    """Steps scatter and follow no line: nobody can tell when the samples were taken better than the stamps do."""
+
+
+REGULAR, COUNTED, IRREGULAR = Stamping
+EARLY, LATE = 0.5, 1.5
+"""A step between these many periods is a regular one."""
+WHOLE = 0.1
+"""A longer step that is within this share of a period of a whole number of periods is regular too: samples were lost."""
+IRREGULAR_SHARE = 0.05
+"""Up to this share of the steps may be anything."""
+MOST_LOST = 4
+"""So many samples may be lost for each one that came, before the period is not what the usual step says."""
+LAG = 64
+"""Samples across which the scatter of the stamps is compared with that across one."""
+DRIFTING = 16.0
+"""
+Ratio of those variances from which the steps are independent of one another, so that the stamps run away from every line.
+
+It is about 1 for jitter about a line, `LAG` for independent steps, and below 11 for packets of up to 100 samples.
+"""
+PAUSE_NS = 1_000_000_000
+"""A longer step is a pause; nothing is counted across it."""
+LEAST = 16
+"""Steps from which a period can be told."""
+
+
+@dataclass(frozen=True)
+class StampLine:
+    """How stamps lie about a line through the number of the sample."""
+
+    word: Stamping
+    """What they can be used for."""
+    period_ns: float
+    """Sampling period."""
+    low_ns: float = 0.0
+    """Smallest distance of a stamp from the line, which goes through the sampling times."""
+    high_ns: float = 0.0
+    """Largest distance."""
+    at_once: float = 1.0
+    """Samples that come together, on average."""
+
+    @property
+    def arrivals(self) -> bool:
+        """Whether the stamps are times of arrival, which can only be late."""
+        return self.low_ns >= 0 and self.high_ns > 0
+
+    def __str__(self) -> str:
+        rate = 1e9 / self.period_ns
+        if self.word == REGULAR:
+            return f'stamps are regular at {rate:.4g} Hz'
+        if self.word == IRREGULAR:
+            return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
+        if self.at_once >= 1.5:
+            return f'stamps are those of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn through them'
+        return (f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
+                'through them')
+
+
+def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
+    """
+    Return the StampLine of the stamps of one stretch in the order of arrival, None when they are too few to tell.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Repeated messages taken out; 256 or more tell counted stamps from irregular ones, with fewer that question stays open.
+
+    """
+    step = np.diff(stamp_ns)
+    step = step[np.abs(step) <= PAUSE_NS]
+    if len(step) < LEAST:
+        return None
+    in_order = np.diff(np.sort(stamp_ns))   # neighbours that overtook each other are no fault of the stamps
+    in_order = in_order[in_order <= PAUSE_NS]
+    line = _regular(in_order, float(np.median(in_order)))
+    if line is not None or len(stamp_ns) < 4 * LAG:
+        return line
+    period = float(step.mean())
+    apart = (stamp_ns[LAG:] - stamp_ns[:-LAG]).astype(float)
+    apart = apart[np.abs(apart - LAG * period) <= PAUSE_NS]
+    if period > 0 and len(apart) and apart.var() <= DRIFTING * step.var():
+        return _line(stamp_ns, step, apart / LAG, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
+    # Where more than half of the samples are lost the usual step is two periods.
+    return _regular(in_order, float(np.quantile(in_order, 0.1))) or StampLine(IRREGULAR, max(period, 1.0))
+
+
+def _regular(step: np.ndarray, usual: float) -> StampLine | None:
+    if usual <= 0 or regular_share(step, usual) < 1 - IRREGULAR_SHARE:
+        return None
+    return StampLine(REGULAR, float(step[(step > EARLY * usual) & (step <= LATE * usual)].mean()))
+
+
+def regular_share(step: np.ndarray, period: float) -> float:
+    """Return the share of steps that one clock with lost samples makes; 0 when more would be lost than `MOST_LOST` allows."""
+    number = np.rint(step / period)
+    whole = np.abs(step / period - number)
+    good = ((step > EARLY * period) & (step <= LATE * period)) | ((number >= 2) & (whole <= WHOLE))
+    lost = float(np.sum(number[good] - 1, where=number[good] > 1))
+    return 0.0 if lost > MOST_LOST * len(step) else float(good.mean())
+
+
+def _line(stamp_ns: np.ndarray, step: np.ndarray, apart: np.ndarray, resolution: float) -> StampLine:
+    """Return the line of stamps that stay near one: through the earliest of them when they are times of arrival, else through their middle."""
+    off = np.abs(apart - np.median(apart))
+    usual = off <= 3 * np.median(off) + (0.5 * np.median(apart) + resolution) / LAG   # without lost samples and pauses
+    period = float(apart[usual].mean())
+    number = np.arange(len(stamp_ns))
+    residual = (stamp_ns - stamp_ns[0]) - period * number
+    residual = residual - np.polynomial.Polynomial.fit(number, residual, 1)(number)
+    low, middle, high = np.quantile(residual, (0.02, 0.5, 0.98))
+    arrivals = high - low > period and np.all(step >= 0)
+    origin = low if arrivals else middle
+    late = int(np.count_nonzero(step > EARLY * period))
+    return StampLine(COUNTED, period, low - origin, high - origin, len(step) / max(late, 1) if arrivals else 1.0)
