@@ -31,7 +31,8 @@ class SampleTimes:
         self._begin()
 
     def _begin(self) -> None:
-        self._learning, self._clock = True, None
+        self._learning = True
+        self._clock: Any = None
         self._held: Any = None
         self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
 
