@@ -10,7 +10,8 @@ KEYS = {
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster', 'setting': 'how windows are found',
     'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
-    'temperature_topic': 'the topic of the temperature',
+    'temperature_topic': 'the topic of the temperature', 'imu_link': 'the link that carries the IMU', 'up': 'where up is',
+    'urdf': 'the robot description',
 }
 """What an error may ask for."""
 

@@ -73,6 +73,20 @@ def read_tolerances(path, catalogue=CATALOGUE):
     return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
 
 
+def read_robot_description(path):
+    """Return the text of a robot description; macros of a .xacro file are expanded."""
+    if Path(path).suffix != '.xacro':
+        return read_text(path, 'robot description')
+    read_text(path, 'robot description')
+    import xacro
+    try:
+        return xacro.process_file(str(path)).toxml()
+    except Exception as error:   # macros raise whatever their expressions do
+        said = ' '.join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {said}; correct it, or expand it '
+                         'yourself to a .urdf') from error
+
+
 def read_calibration(path):
     """Return the calibration in a file."""
     return calibration_from_text(read_text(path, 'calibration'))

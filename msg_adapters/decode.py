@@ -140,8 +140,10 @@ class JointDecoder(Decoder):
                 raise InputError('JointState must hold one position for each joint that it names, the messages so far do not; correct the '
                                  'driver, or choose another topic', key='joint_topic')
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
-            raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}; '
-                             'correct the names in the table description, or choose another topic', key='joint_topic')
+            missing = min(([name for name in self.names if name not in names] for names in self.seen), key=len)
+            raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
+                             f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
+                             key='joint_topic')
 
     def _checked(self, samples, n_messages):
         self.n_messages += n_messages

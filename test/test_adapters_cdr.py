@@ -168,7 +168,7 @@ def test_joint_states_that_do_not_fit_are_counted_by_reason():
 def test_names_that_never_match_are_refused_with_what_came():
     decoder = JointDecoder(('outer', 'inner'))
     decoder.decode(Packed.join([serialize(joint_message((1, 0), '', ['pan', 'tilt'], [1, 2]))]))
-    with pytest.raises(InputError, match='joints of the table .outer, inner., got pan, tilt;'):
+    with pytest.raises(InputError, match='joints of the table .outer, inner., got pan, tilt, which lacks outer, inner;'):
         decoder.check()
     with pytest.raises(InputError):
         decoder.decode(Packed.join([serialize(joint_message((1, 0), '', ['pan', 'tilt'], [1, 2]))] * 1000))

@@ -30,6 +30,8 @@ def document(solution, tolerances, table, gathered, needed, provenance=None):
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
     centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
+    if model.joint_names.angle_sd is not None:
+        gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
                               statistics(solution, gathered), conditions(gathered, table.gravity_value), {'software': imu_calibration.__version__, **(provenance or {})})
     return judged(calibration, tolerances)

@@ -6,6 +6,7 @@ from typing import cast
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import describe
 from imu_calibration.use_cases.choices import Choices
+from imu_calibration.use_cases.stand import Arm, Stand
 
 
 def add_topic_arguments(parser: ArgumentParser) -> None:
@@ -14,6 +15,25 @@ def add_topic_arguments(parser: ArgumentParser) -> None:
     group.add_argument('--imu-topic', metavar='TOPIC', help='sensor_msgs/Imu, default /imu/data_raw')
     group.add_argument('--joint-topic', metavar='TOPIC', help='sensor_msgs/JointState, default /joint_states')
     group.add_argument('--temperature-topic', metavar='TOPIC', help='sensor_msgs/Temperature, default /imu/temperature')
+
+
+def add_stand_arguments(parser: ArgumentParser, without: str) -> None:
+    """Add the options of the table or arm that moves the IMU; `without` says what happens without any, or why it is needed."""
+    group = parser.add_argument_group('table or arm', without)
+    group.add_argument('--table', metavar='TABLE', help='table description (YAML); beside a robot description: where the robot '
+                       'stands (up, gravity, latitude, mount, limits of joints by name)')
+    group.add_argument('--urdf', metavar='FILE', help='description (.urdf or .xacro) of the robot that carries the IMU')
+    group.add_argument('--imu-link', metavar='LINK', help='link that carries the IMU, default the frame_id of its messages; '
+                       'without --urdf: of the description on /robot_description in the recording')
+    group.add_argument('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+                       help="up in the frame of the robot's root, default as in TABLE, else from /tf_static, else z")
+
+
+def stand_of(options: Namespace) -> Stand | None:
+    """Return the table or arm that parsed arguments name."""
+    if options.urdf is None and options.imu_link is None:
+        return options.table
+    return Arm(options.urdf, options.imu_link, options.table, options.up)
 
 
 def add_model_arguments(parser: ArgumentParser) -> None:

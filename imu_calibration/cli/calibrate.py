@@ -1,7 +1,7 @@
 """``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
 
 from imu_calibration import files
-from imu_calibration.cli.arguments import add_model_arguments, add_topic_arguments, choices_of
+from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.show import show_calibration, warn
 from imu_calibration.use_cases.calibrate import calibrate
@@ -13,11 +13,11 @@ HELP = 'Write calibration.yaml and report.html from one or several recordings of
 def add_arguments(parser):
     """Declare the arguments."""
     parser.add_argument('bags', nargs='+', metavar='BAG', help='rosbag2 folder, .db3, .mcap or ROS 1 .bag')
-    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); without it: by hand, gravity as the reference')
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for calibration by hand, default 9.80665')
+    parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for calibration by hand or with --urdf, default 9.80665')
     parser.add_argument('--no-report', action='store_true', help='write calibration.yaml only')
     parser.add_argument('--jobs', type=int, help='recordings read side by side, default one per processor')
+    add_stand_arguments(parser, 'without any: by hand, gravity as the reference')
     add_topic_arguments(parser)
     add_model_arguments(parser)
 
@@ -25,7 +25,7 @@ def add_arguments(parser):
 def run(options):
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
     with files.output_folder(options.output) as folder:
-        found = calibrate(options.bags, options.table, jobs=options.jobs, **choices_of(options))
+        found = calibrate(options.bags, stand_of(options), jobs=options.jobs, **choices_of(options))
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, hints_of(options), report=not options.no_report)

@@ -6,24 +6,27 @@ import math
 
 from imu_calibration import files
 from imu_calibration.calibration.fleet import FleetStep, fleet_exit_code, summarise
-from imu_calibration.cli.arguments import choices_of
+from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.show import console, warn
-from imu_calibration.errors import with_hint
+from imu_calibration.errors import InputError, with_hint
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
+from imu_calibration.use_cases.choices import topics_of
 from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.use_cases.progress import progress_bar
+from imu_calibration.use_cases.stand import table_of
 
 HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
             'highest_unit')
 
 
-def run_fleet(options, table, settings):
+def run_fleet(options, settings):
     """Calibrate every unit of a folder; return the exit code."""
     found = find_units(options.folder, options.output)
+    table = _table(options, [path for _, paths in found for path in paths])
     units = [unit_of(name, paths, choices_of(options), table.joint_names) for name, paths in found]
     folder = files.make_folder(options.output)
     with progress_bar('units', len(units), 'units') as advance:
@@ -38,6 +41,19 @@ def run_fleet(options, table, settings):
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
     show_fleet(results, spreads, folder, hints_of(options))
     return fleet_exit_code(results)
+
+
+def _table(options, bags):
+    """Return the chain of joints; what a recording has to say of it comes from the first that can be read."""
+    stand = stand_of(options)
+    if stand is None:
+        raise InputError('a fleet is calibrated on a table or an arm, got none; describe it', key='table')
+    for bag in bags[:-1]:
+        try:
+            return table_of(stand, [bag], topics_of(choices_of(options)))
+        except InputError:
+            pass
+    return table_of(stand, bags[-1:], topics_of(choices_of(options)))
 
 
 def _mapper(options, n_units, done):

@@ -3,10 +3,9 @@
 from collections import Counter
 from dataclasses import dataclass
 
-from imu_calibration import files
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.result import exit_code
-from imu_calibration.cli.arguments import add_model_arguments, add_topic_arguments, choices_of
+from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError, with_hint
@@ -15,7 +14,8 @@ from imu_calibration.preflight.finding import REFUSE
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
 from imu_calibration.use_cases.choices import calibration_options, topics_of
 from imu_calibration.use_cases.progress import progress_bar
-from imu_calibration.use_cases.recordings import existing, open_bag, source_of
+from imu_calibration.use_cases.recordings import Topics, existing, open_bag, source_of
+from imu_calibration.use_cases.stand import table_of
 from msg_adapters.bag import KEYS, Recording, imu_topics, list_topics
 
 NAME = 'inspect'
@@ -26,8 +26,7 @@ TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic',
 def add_arguments(parser):
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
-    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); with it axes and units are compared with the joints, '
-                        'and the motions are found and judged')
+    add_stand_arguments(parser, 'with it axes and units are compared with the joints, and the motions are found and judged')
     add_topic_arguments(parser)
     add_model_arguments(parser)
 
@@ -59,9 +58,11 @@ class Look:
 
 def run(options):
     """Read each Imu topic once for streams and checks, and once more with the table for the motions."""
-    table = files.read_table(options.table) if options.table else None
+    topics = _topics(options)
+    stand = stand_of(options)
+    table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0]))
     settings = calibration_options(choices_of(options))
-    looks = [_look(options, table, settings.nominal, topic) for topic in _topics(options)]
+    looks = [_look(options, table, settings.nominal, topic) for topic in topics]
     out = console()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints_of(options))

@@ -1,5 +1,6 @@
 """``imu_calibration simulate``: a bag from a simulated session, and the truth beside it."""
 
+from imu_calibration.cli.arguments import add_stand_arguments, stand_of
 from imu_calibration.simulation.profiles import profile_names
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.simulate import simulate
@@ -7,14 +8,13 @@ from msg_adapters.storages import identifiers
 
 NAME = 'simulate'
 HELP = 'Write a bag from a simulated session on a turntable, and truth.yaml beside its data.'
-NAMES = ('table', 'calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
+NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
          'stamp_jitter_us', 'temperature')
 """Options that are arguments of `simulate` by the same name."""
 
 
 def add_arguments(parser):
     """Declare the arguments."""
-    parser.add_argument('--table', metavar='TABLE', help='table description (YAML); default: a three-axis table')
     parser.add_argument('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
     parser.add_argument('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
     parser.add_argument('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
@@ -31,13 +31,14 @@ def add_arguments(parser):
     parser.add_argument('--stamp-jitter-us', type=float, default=0.0,
                         help='standard deviation of the IMU stamps, microseconds, default none')
     parser.add_argument('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
+    add_stand_arguments(parser, 'default: a three-axis table')
     parser.add_argument('--storage', choices=identifiers(), default='sqlite3')
     parser.add_argument('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
 def run(options):
     """Simulate and write."""
-    made = simulate(options.profile, effects=options.effect, **{name: getattr(options, name) for name in NAMES})
+    made = simulate(options.profile, effects=options.effect, table=stand_of(options), **{name: getattr(options, name) for name in NAMES})
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
     print(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu)} Imu, {len(samples.joints)} JointState), '

@@ -41,11 +41,18 @@ def parse_effects(sensor, text, joint_names=JOINTS, catalogue=CATALOGUE):
 
 
 def parse_reference(text, table):
-    """Return effect names of table and clock from names joined by '+' or 'none'; None: the tilt, and the Earth's rate where the table does not tell it."""
+    """
+    Return effect names of table and clock from names joined by '+' or 'none'.
+
+    None: the tilt, the Earth's rate where the table does not tell it, and errors of the joints where the table says how large they may be.
+    """
     if text is not None:
         return tuple(name for name in text.split('+') if name not in ('', 'none'))
-    return tuple(name for name in ('table_tilt', 'earth_rate') if CATALOGUE.find('reference', name).moot is None
-                 or CATALOGUE.find('reference', name).moot(table) is None)
+    names = table.joint_names
+    said = {'axis_non_orthogonality': names.angle_sd and names.angles, 'encoder_zero': names.angle_sd and names.zeros,
+            'axis_offset': names.place_sd and names.places}
+    return tuple(name for name in ('table_tilt', *said, 'earth_rate') if said.get(name, True) and (
+        CATALOGUE.find('reference', name).moot is None or CATALOGUE.find('reference', name).moot(table) is None))
 
 
 def with_common_arm(model):

@@ -132,11 +132,22 @@ def _halved(system, values, step, free, factors, cost):
 
 
 def _undetermined(system, values, factors, free):
-    """Return a mask of the parameters whose standard deviation stays above a share of the prior's."""
-    jacobian = np.concatenate([system.jacobian(values, factors), system.prior.root])
-    sd = np.zeros(len(values))
-    sd[free] = np.sqrt(np.diag(inverse_gram(jacobian[:, free])))
-    return free & (sd > HELD_SHARE * system.prior.sd)
+    """
+    Return a mask of the parameters whose standard deviation stays above a share of the prior's.
+
+    First those that the data would not show even if all others were known; then one after the other, each judged with those before it
+    held: of parameters of which only the sum is seen, one stays free.
+    """
+    data, prior = system.jacobian(values, factors), system.prior
+    jacobian = np.concatenate([data, prior.root])
+    held = free & (HELD_SHARE * prior.sd * np.linalg.norm(data, axis=0) < 1)
+    while True:
+        left, share = free & ~held, np.zeros(len(values))
+        share[left] = np.sqrt(np.diag(inverse_gram(jacobian[:, left]))) / prior.sd[left]
+        if not np.any(share > HELD_SHARE):
+            return held
+        # Of equals the first, whatever rounding says.
+        held[np.argmax(share > 0.99 * share.max())] = True
 
 
 def _fit_quality(system, values, noises):

@@ -72,6 +72,28 @@ def axis_error_directions(axis: np.ndarray) -> np.ndarray:
     return np.array([first, np.cross(axis, first)])
 
 
+def with_axis_places(table: Table, errors: np.ndarray) -> Table:
+    """
+    Return the table with its turning axes, but the first, shifted sideways.
+
+    Parameters
+    ----------
+    table : Table
+        The nominal table.
+    errors : array, shape (2 (n_turning - 1),)
+        For each of these axes how far it lies along its `axis_error_directions`, m; the chain behind it goes along.
+
+    """
+    shifts, joints, first = iter(np.reshape(errors, (-1, 2))), [], True
+    for joint in table.joints:
+        if joint.turns and not first:
+            step = joint.mat_before @ (next(shifts) @ axis_error_directions(np.array(joint.axis)))
+            joint = replace(joint, xyz=tuple((np.array(joint.xyz) + step).tolist()))
+        first &= not joint.turns
+        joints.append(joint)
+    return replace(table, joints=tuple(joints))
+
+
 def with_axis_angles(table: Table, errors: np.ndarray) -> Table:
     """
     Return the table with its axes turned by small angles.

@@ -1,7 +1,7 @@
 """One joint of a chain: how it moves, where it sits, how far and how fast it may go; and the names that a chain's joints go by."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -94,29 +94,46 @@ class JointNames(Sequence):
     """Those whose zero is an error of its own: the first one's is the azimuth, the last one's belongs to the mount."""
     angles: tuple[str, ...]
     """Angles between neighbouring axes."""
+    places: tuple[str, ...] = ()
+    """Directions in which an axis may pass beside the place it should: those of the first axis are nobody's business."""
+    angle_sd: float | None = None
+    """What zeros and angles may be off by, rad; None: not said."""
+    place_sd: float | None = None
+    """What places may be off by, m; None: they are taken as described."""
 
     @classmethod
-    def of(cls, names: Sequence[str], errors: Mapping[str, Sequence[str]] | None = None) -> 'JointNames':
+    def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
         """Return `names` as they are, or those of a chain of turning joints of which no two neighbours are parallel, unless `errors` says."""
         if isinstance(names, cls):
             return names
         names = tuple(names)
         if errors is not None:
-            return cls(names, *(tuple(errors[key]) for key in ('turning', 'zeros', 'angles')))
-        return cls(names, names, names[1:-1], tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)))
+            return cls(names, **{key: tuple(value) if isinstance(value, list) else value for key, value in errors.items()})
+        return cls(names, names, names[1:-1], tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)), place_names(names))
 
     @property
-    def errors(self) -> dict[str, list[str]] | None:
+    def errors(self) -> dict[str, Any] | None:
         """Return what `of` needs beside the names that are read, or None when these say it all."""
         if self == self.of(self.read):
             return None
-        return {'turning': list(self.turning), 'zeros': list(self.zeros), 'angles': list(self.angles)}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'read'}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    @property
+    def taken_as_described(self) -> tuple[str, ...]:
+        """Joints whose zero is the azimuth or belongs to the mount, so that nothing can tell it from them."""
+        return tuple(name for name in self.turning if name not in self.zeros)
 
     def __getitem__(self, index: int | slice) -> Any:
         return self.read[index]
 
     def __len__(self) -> int:
         return len(self.read)
+
+
+def place_names(turning: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the places of all axes but the first: two directions across each."""
+    return tuple(f'{name}_{letter}' for name in turning[1:] for letter in 'uv')
 
 
 LIMIT_KEYS = {'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2'), 'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2')}

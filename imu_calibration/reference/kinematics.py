@@ -132,7 +132,7 @@ class _Constants(NamedTuple):
     gravity: float
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def _constants(table):
     """Return the `_Constants`: thousands of short windows share one table."""
     columns = {name: column for column, name in enumerate(table.joint_names)}

@@ -11,7 +11,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.axis_angles import axis_angles
 from imu_calibration.reference.checked_values import finite_number, require_keys, three_numbers, unit_vector
 from imu_calibration.reference.earth import normal_gravity
-from imu_calibration.reference.joint import Joint, JointNames, joint_from_mapping, joint_to_mapping
+from imu_calibration.reference.joint import Joint, JointNames, joint_from_mapping, joint_to_mapping, place_names
 from imu_calibration.reference.rotations import align, rotation_from_rpy
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
@@ -44,6 +44,8 @@ class Table:
     """Noise or resolution of the encoders, rad; None: estimated from the data."""
     joint_error_rad: float | None = None
     """What zeros and axes of the joints may be off by, a standard deviation, rad; None: they are taken as described unless asked for."""
+    joint_error_m: float | None = None
+    """What the places of the axes may be off by, a standard deviation, m; None: they are taken as described."""
     mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Inner link to sensor frame, roll, pitch, yaw about fixed axes as in URDF, degrees."""
     mount_xyz: tuple[float, float, float] | None = None
@@ -93,7 +95,9 @@ class Table:
         apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
         read, turning = (tuple(dict.fromkeys(names)) for names in ((joint.source for joint in self.joints), turning))
         angles = tuple(angle.name for angle in axis_angles(self.joints))
-        return JointNames(read, turning, tuple(name for name in turning if name not in apart), angles)
+        places = place_names([joint.name for joint in self.joints if joint.turns])
+        return JointNames(read, turning, tuple(name for name in turning if name not in apart), angles, places,
+                          self.joint_error_rad or None, self.joint_error_m or None)
 
     @property
     def gravity_value(self) -> float:
@@ -124,6 +128,7 @@ _NUMBERS = {
     'azimuth_deg': (-720.0, 720.0, 'give it in degrees clockwise from true north'),
     'joint_noise_rad': (0.0, 0.1, 'give it in rad'),
     'joint_error_rad': (0.0, 0.1, 'give it in rad'),
+    'joint_error_m': (0.0, 0.1, 'give it in m'),
 }
 
 

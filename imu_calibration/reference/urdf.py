@@ -16,8 +16,8 @@ from imu_calibration.reference.joint import LIMIT_KEYS, Joint, JointLimits, Mimi
 from imu_calibration.reference.rotations import rotation_from_rpy, rpy_from_rotation
 from imu_calibration.reference.table import Table, joint_entries, site_from_mapping
 
-JOINT_ERROR = 1e-3
-"""What zeros and axes of an arm's joints may be off by unless the site says better, rad: 0.1 to 1 mrad is what calibrated arms have."""
+JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
+"""What an arm's joints may be off by unless the site says better: 0.1 to 1 mrad, 0.1 to 1 mm is what arms have."""
 
 _MOVING = {'revolute': 'revolute', 'continuous': 'revolute', 'prismatic': 'prismatic'}
 _READ = {'link': (), 'joint': ('origin', 'parent', 'child', 'axis', 'limit', 'mimic')}
@@ -56,7 +56,16 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     xyz, rpy_deg = (three_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}') for name in ('xyz', 'rpy_deg'))
     mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
-    return Table(**{'joint_error_rad': JOINT_ERROR} | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)})
+    return Table(**JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)})
+
+
+def root_of(text: str | bytes) -> str:
+    """Return the name of the link that all others hang on."""
+    robot = _read(text)
+    roots = [link for link in robot.link_map if link not in robot.parent_map]
+    if len(roots) != 1:
+        raise InputError(f'a robot description must have one link that all others hang on, it has {_listed(roots) or "none"}; correct it')
+    return roots[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +108,7 @@ def _chain(robot, link):
     """Return the moving joints from the root to `link`, and the placement of the link behind the last of them."""
     if link not in robot.link_map:
         raise InputError(f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
-                         'name one of these')
+                         'name one of these', key='imu_link')
     on_the_way = []
     while link in robot.parent_map:
         name, link = robot.parent_map[link]

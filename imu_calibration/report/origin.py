@@ -52,6 +52,17 @@ def _settings(options):
     return [(item.name, text(value), item.unit, item.text, value != item.default) for item, value in values]
 
 
+def _joint(joint):
+    said = [f'{"turns about" if joint.turns else "slides along"} ({", ".join(text(a) for a in joint.axis)})']
+    if any(joint.xyz):
+        said.append(f'at ({", ".join(text(a) for a in joint.xyz)}) m')
+    if any(joint.rpy_deg):
+        said.append(f'turned by roll, pitch, yaw ({", ".join(text(a) for a in joint.rpy_deg)})°')
+    if joint.mimic is not None:
+        said.append(f'follows {joint.mimic.joint} times {text(joint.mimic.multiplier)}')
+    return ', '.join(said)
+
+
 @singledispatch
 def table_rows(_result):
     """Return (what, value) of the table; nothing for a calibration without one."""
@@ -61,8 +72,10 @@ def table_rows(_result):
 @table_rows.register
 def _(result: TableResult):
     table = result.table
-    rows = [(f'joint {joint.name}', f'axis ({", ".join(text(a) for a in joint.axis)})' +
-             (f', at ({", ".join(text(a) for a in joint.xyz)}) m' if any(joint.xyz) else '')) for joint in table.joints]
+    rows = [(f'joint {joint.name}', _joint(joint)) for joint in table.joints]
+    if table.joint_error_rad or table.joint_error_m:
+        rows.append(('joints may be off by', ' and '.join(in_unit(value, unit) for value, unit in (
+            (table.joint_error_rad, 'rad'), (table.joint_error_m, 'm')) if value) + ' (sd)'))
     rows += [('up', f'({", ".join(text(a) for a in table.up)})'),
              ('gravity', f'{fixed(table.gravity_value, 5)} m/s²' + (' as given' if table.gravity is not None else ', WGS 84 normal gravity')
               + (f', sd {text(table.gravity_sd)} m/s²' if table.gravity_sd else ''))]

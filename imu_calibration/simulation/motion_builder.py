@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.motion_limits import free_limits
 
 # Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
 # by the quintic both leave position, rate, acceleration and jerk continuous where segments meet.
@@ -17,6 +18,8 @@ PEAK_RATE_OF_MOVE = 2.1875
 """Largest rate of a move, in units of distance over duration."""
 PEAK_ACCELERATION_OF_MOVE = 7.5132
 """Largest acceleration of a move, in units of distance over duration squared."""
+SHORTEST_MOVE = 0.5
+"""No move or ramp is shorter, s."""
 SHORTEST_DWELL = 0.8
 """Rests and spins cut to less than this share would be too short for windows."""
 PEAK_ACCELERATION_OF_RAMP = 1.875
@@ -158,15 +161,16 @@ class MotionBuilder:
     """
     Writes segments one after the other, each starting where the last one ended.
 
-    Angles in degrees here, as people state motions; the segments hold radians.
+    Angles in degrees here, as people state motions; the segments hold radians. Where joints slide, use the methods that speak SI.
     """
 
-    def __init__(self, n_joints, dwell=1.0, rate_limit_deg=150.0, acceleration_limit_deg=300.0):
-        """Start at rest at zero; `dwell` stretches rests, spins and oscillations, the limits time moves and ramps."""
+    def __init__(self, n_joints, dwell=1.0, limits=None):
+        """Start at rest at zero; `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps."""
         self.segments = []
         self.dwell = dwell
-        self._limits = np.radians([rate_limit_deg, acceleration_limit_deg])
-        self._position = np.zeros(n_joints)
+        self.limits = limits or free_limits(n_joints)
+        self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
+        self._position = self.home
 
     @property
     def n_joints(self):
@@ -179,16 +183,17 @@ class MotionBuilder:
 
     def move(self, angles_deg, shortest=True):
         """Move to the joint angles (NaN: leave that joint), each by less than half a turn when `shortest`."""
-        target = np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints))
+        self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
+
+    def move_to(self, target, shortest=True):
+        """Move to joint positions in rad and m; endless joints by less than half a turn when `shortest`."""
         shift = np.where(np.isnan(target), 0.0, target - self._position)
         if shortest:
-            shift = (shift + np.pi) % (2.0 * np.pi) - np.pi
-        distance = np.max(np.abs(shift))
-        if distance < 1e-9:
+            shift = np.where(self.limits.endless, (shift + np.pi) % (2.0 * np.pi) - np.pi, shift)
+        distance = np.abs(shift)
+        if np.max(distance) < 1e-9:
             return
-        rate, acceleration = self._limits
-        duration = max(0.5, PEAK_RATE_OF_MOVE * distance / rate, np.sqrt(PEAK_ACCELERATION_OF_MOVE * distance / acceleration))
-        self._append('move', duration, shift=shift)
+        self._append('move', move_time(distance, self.limits), shift=shift)
 
     def spin(self, rates_deg, duration):
         """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
@@ -201,16 +206,20 @@ class MotionBuilder:
 
     def oscillate(self, amplitude_deg, frequency, duration, phase=0.0, fade=None):
         """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
-        amplitude = np.radians(np.atleast_2d(np.asarray(amplitude_deg, float)))
+        self.swing(np.radians(amplitude_deg), frequency, duration, phase, fade)
+
+    def swing(self, amplitude, frequency, duration, phase=0.0, fade=None):
+        """Do the same with amplitudes in rad and m."""
+        amplitude = np.atleast_2d(np.asarray(amplitude, float))
         frequency, phase = (np.broadcast_to(np.asarray(value, float), amplitude.shape) for value in (frequency, phase))
         duration = duration * self.dwell
         fade = min(0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade)
         self._append('oscillation', duration, amplitude=amplitude, frequency=frequency, phase=phase, fade=fade)
 
     def _ramp(self, rate_from, rate_to):
-        change = np.max(np.abs(rate_to - rate_from))
+        change = np.max(np.abs(rate_to - rate_from) / self.limits.acceleration)
         if change > 0.0:
-            self._append('ramp', max(0.5, PEAK_ACCELERATION_OF_RAMP * change / self._limits[1]), rate_from, rate_to)
+            self._append('ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to)
 
     def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
         zero = np.zeros(self.n_joints)
@@ -218,6 +227,12 @@ class MotionBuilder:
         segment = Segment(kind, float(duration), self._position, *parts, **sines)
         self.segments.append(segment)
         self._position = segment.end
+
+
+def move_time(distance, limits):
+    """Return how long a move of all joints by `distance`, shape (n_joints,), takes within the limits, s."""
+    rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
+    return float(max(SHORTEST_MOVE, rate, np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))))
 
 
 def stretch(build, duration):

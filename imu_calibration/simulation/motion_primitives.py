@@ -63,8 +63,8 @@ def tumble(builder, amplitude_deg, frequency, phase, duration):
 
 
 def rest_at_zero(builder, dwell):
-    """Rest at the reference pose."""
-    builder.move(np.zeros(builder.n_joints))
+    """Rest at the reference pose: zero, or what is nearest to it within the limits."""
+    builder.move_to(builder.home)
     builder.rest(dwell)
 
 

@@ -7,7 +7,10 @@ from typing import Callable
 import numpy as np
 
 from imu_calibration.errors import InputError
+from imu_calibration.reference.motion_limits import free_limits, limits_of
+from imu_calibration.reference.table import Table
 from imu_calibration.simulation import paper_profiles
+from imu_calibration.simulation.limited_profile import within_limits, within_limits_short
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, stretch
 from imu_calibration.simulation.motion_primitives import (
     CORNERS,
@@ -41,7 +44,7 @@ class _Entry:
     n_joints: int | None = None
     """Joints that it needs; None: any number."""
     adapts: bool = False
-    """Whether a table with another number of joints gets `any_table` instead."""
+    """Whether a table with another number of joints gets `any_table` instead, and one whose joints have ends `within_limits`."""
 
 
 def profile_names():
@@ -61,14 +64,15 @@ def make_profile(name, seed=0, table=None, duration=None):
         Seed of what is drawn: the order of the session, and in 'random' the motions themselves.
     table : Table, optional
         The table to be moved; default three axes. Sessions for three axes become poses, spins and swings of every joint
-        on a table with another number of joints. Profiles that bring their own table (`Profile.table`) ignore it.
+        on a table with another number of joints, and stay within the limits where joints have ends. Profiles that bring their own
+        table (`Profile.table`) ignore it.
     duration : float, optional
         Wanted length, s; rests and spins are stretched to reach it.
 
     Raises
     ------
     InputError
-        When the name is unknown, the table does not suit the profile, or the duration is too short.
+        When the name is unknown, the table does not suit the profile, a joint would go beyond its limits, or the duration is too short.
 
     """
     if name not in _REGISTRY:
@@ -78,15 +82,32 @@ def make_profile(name, seed=0, table=None, duration=None):
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
         raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'")
-    build = entry.build if fits else _any_table
+    limits = limits_of(table) if isinstance(table, Table) and entry.table is None else free_limits(len(joint_names))
+    build = within_limits if entry.adapts and not limits.endless.all() else entry.build if fits else _any_table
 
     def segments(dwell):
-        builder = MotionBuilder(len(joint_names), dwell)
+        builder = MotionBuilder(len(joint_names), dwell, limits)
         build(builder, np.random.default_rng(seed))
         return builder.segments
 
     chosen = segments(1.0) if duration is None else stretch(segments, duration)
-    return Profile(name, tuple(chosen), joint_names, entry.table)
+    profile = Profile(name, tuple(chosen), joint_names, entry.table)
+    _require_within(profile, limits)
+    return profile
+
+
+def _require_within(profile, limits):
+    """Refuse a motion that leaves the range of a joint."""
+    if limits.endless.all():
+        return
+    position = profile.at(np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)).position
+    for column, name in enumerate(profile.joint_names):
+        reached = np.array([position[:, column].min(), position[:, column].max()])
+        if reached[0] < limits.lower[column] - 1e-6 or reached[1] > limits.upper[column] + 1e-6:
+            unit, factor = ('deg', np.degrees(1.0)) if limits.turns[column] else ('m', 1.0)
+            lower, upper, least, most = (f'{factor * end:.4g}' for end in (limits.lower[column], limits.upper[column], *reached))
+            raise InputError(f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would go from "
+                             f"{least} to {most}; choose 'within_limits'")
 
 
 def _joint_names(entry, table):
@@ -243,6 +264,8 @@ _REGISTRY = {
     'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling', _navigation, n_joints=3),
     'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)', _tumbling, n_joints=3),
     'two_axis': _Entry('poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2),
+    'within_limits': _Entry('poses, swings and, where a joint has no end, spins, within the limits of every joint', within_limits),
+    'within_limits_short': _Entry('the same with fewer of them', within_limits_short),
     'any_table': _Entry('poses, spins, swings and simultaneous turns of whatever joints the table has', _any_table),
     **{name: _Entry(*entry) for name, entry in paper_profiles.REGISTRY.items()},
 }

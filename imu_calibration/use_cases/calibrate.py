@@ -14,13 +14,13 @@ from imu_calibration.calibration.calibrate import calibrate as calibrate_on_tabl
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.verdict import Verdict
-from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.pool import jobs_for, process_mapper
 from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
+from imu_calibration.use_cases.stand import Stand, table_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Calibrated:
         return f'<p><b>{self.verdict.word}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
 
 
-def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: str | PathLike | Table | None = None, *, jobs: int | None = 1,
+def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand | None = None, *, jobs: int | None = 1,
               **choices: Unpack[Choices]) -> Calibrated:
     """
     Calibrate from one or several recordings of the same IMU.
@@ -84,8 +84,9 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: str | 
     ----------
     recordings : path-like, SampleBlock, or a sequence of them
         Bags, or samples in memory.
-    table : path-like or Table, optional
-        The reference; without it gravity is: poses held still and the turns between them.
+    table : path-like, Table or Arm, optional
+        The reference: a table description, a robot description (.urdf, .xacro), or what was read of them; without it gravity is: poses
+        held still and the turns between them.
     jobs : int or None
         Recordings that are read side by side, in processes; None: one per processor.
     choices
@@ -100,7 +101,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: str | 
     check_names(choices)
     options, topics = calibration_options(choices), topics_of(choices)
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    table = files.read_table(table) if isinstance(table, (str, PathLike)) else table
+    table = None if table is None else table_of(table, recordings, topics, choices.get('gravity'))
     for path in recordings:
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=table is not None).close()

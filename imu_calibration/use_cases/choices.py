@@ -32,7 +32,7 @@ class Choices(TypedDict, total=False):
     reference_model: str | None
     """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when latitude or azimuth is unknown."""
     gravity: float | None
-    """Local gravity for work by hand, m/s^2; default the standard gravity with its uncertainty."""
+    """Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity with its uncertainty."""
     tolerances: str | PathLike | Mapping | None
     """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
     nominal: str | PathLike | NominalScaling | None

@@ -16,6 +16,7 @@ from imu_calibration.use_cases.choices import Choices, calibration_options, chec
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import provenance_of, source_of
+from imu_calibration.use_cases.stand import table_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +97,10 @@ def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Ta
     """
     check_names(choices)
     options = calibration_options(choices)
-    table = files.read_table(table) if isinstance(table, (str, PathLike)) else table
+    topics = topics_of(choices)
+    table = None if table is None else table_of(table, [recording], topics, choices.get('gravity'))
     names = None if table is None else table.joint_names
-    source = source_of(recording, topics_of(choices), names, want_joints=table is not None)
+    source = source_of(recording, topics, names, want_joints=table is not None)
     provenance = provenance_of([recording], kept(choices))
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:

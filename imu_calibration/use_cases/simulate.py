@@ -22,6 +22,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
 from imu_calibration.simulation.session import simulate as run_session
+from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Simulated:
         return f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu, {len(self.samples.joints)} JointState>'
 
 
-def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | None = None,
+def simulate(profile: str = 'calibration', *, table: Stand | None = None,
              calibration: str | PathLike | Calibration | None = None, effects: Sequence[str] = (), size: float = 0.3,
              grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None, duration: float | None = None, imu_rate: float = 100.0,
              joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0, stamp_jitter_us: float = 0.0,
@@ -88,7 +89,7 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
         When a name is unknown, or table, profile and calibration do not fit together.
 
     """
-    given = table if isinstance(table, Table) else files.read_table(table or config_file('table_three_axis.yaml'))
+    given = table_of(table or config_file('table_three_axis.yaml'))
     motion = make_profile(profile, seed, given, duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue)
@@ -96,7 +97,8 @@ def simulate(profile: str = 'calibration', *, table: str | PathLike | Table | No
         model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
-    options = SimulationOptions(imu_rate, joint_rate, noise, temperature_start_c=25.0 if warm else None)
+    frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
+    options = SimulationOptions(imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None)
     samples = SampleBlock(*run_session(model, values, mover, motion, options, seed))
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), options.frame_id,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},

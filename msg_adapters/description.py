@@ -1,0 +1,62 @@
+"""What a recording says about the robot: its description, the frame of the IMU, how the robot's root stands."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from msg_adapters.bag import open_recording
+from msg_adapters.definitions import deserializer
+
+DESCRIPTION_TOPIC = '/robot_description'
+STRING_TYPE = 'std_msgs/msg/String'
+STATIC_TOPIC = '/tf_static'
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
+
+
+def frame_of(path: str, imu_topic: str | None = None) -> str:
+    """Return the frame_id of the first Imu message."""
+    with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
+        for block in recording.blocks(block_samples=1):
+            if block.imu is not None and len(block.imu):
+                return block.imu.frame_id
+    return ''
+
+
+def description_in(path: str, imu_topic: str | None = None) -> str:
+    """
+    Return the last robot description of a recording.
+
+    Raises
+    ------
+    InputError
+        When it holds none.
+
+    """
+    texts = [message.data for message in _messages(path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE)]
+    if not texts:
+        raise InputError(f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
+                         'topic, or give the file', key='urdf')
+    return texts[-1]
+
+
+def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str, str, np.ndarray]]:
+    """Return (parent, child, quaternion x y z w of the child in the parent) of every static transform of a recording."""
+    return [row for message in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE) for row in transform_rows(message)]
+
+
+def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
+    """Return (parent, child, quaternion) of each transform of a TFMessage, as an object of rclpy or rosbags."""
+    return [(t.header.frame_id.lstrip('/'), t.child_frame_id.lstrip('/'), np.array([getattr(t.transform.rotation, a) for a in 'xyzw']))
+            for t in message.transforms]
+
+
+def _messages(path, imu_topic, topic, message_type) -> Iterator[Any]:
+    """Yield the messages of a topic as objects, none when the recording lacks it."""
+    with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
+        if recording.source.types.get(topic) == message_type:
+            deserialize = deserializer(message_type, recording.source.definitions, recording.source.ros1)
+            for raw in recording.source.raw_stretches([topic]):
+                for k in range(len(raw.packed)):
+                    yield deserialize(raw.packed.message(k))
