@@ -212,7 +212,7 @@ def test_discrete_figures_follow_the_rate(quiet):
     found = figures.densities('accelerometer')
     assert found.sample_sd(400.0) == pytest.approx(2 * found.sample_sd(100.0))
     assert found.step_sd(400.0) == pytest.approx(0.5 * found.step_sd(100.0))
-    assert len(filter_lines(figures, [50.0, 400.0])) == 6
+    assert len(filter_lines(figures, [50.0, 400.0])) == 8
 
 
 def test_the_report_holds_the_plots_and_is_the_same_each_time(quiet):
@@ -244,7 +244,7 @@ def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys
     write_session(tmp_path / 'bag', imu, None, None)
     assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
     said = capsys.readouterr().out
-    assert 'accelerometer.x white noise N' in said and 'at 200 Hz' in said and 'to determine all of them: record' in said
+    assert 'accelerometer, white noise N, µg/√Hz' in said and 'at 200 Hz' in said and max(map(len, said.splitlines()[:-1])) <= 80 and 'to determine all of them: record' in said
     figures = files.read_noise(tmp_path / 'out/noise.yaml')
     assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
     assert figures.provenance['bags'][0]['name'] == 'bag'

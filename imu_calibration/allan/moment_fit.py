@@ -11,7 +11,6 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from imu_calibration.allan.processes import NoiseProcess, gauss_markov
@@ -144,6 +143,7 @@ class Whitener:
         self._sd = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(self._sd, self._sd)
         self._factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
+        self._inverse = np.linalg.inv(self._factor)   # well conditioned with the ridge; a triangular solve of this size waits for threads
 
     @property
     def log_determinant(self) -> float:
@@ -153,11 +153,11 @@ class Whitener:
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Return vectors (or the columns of a matrix) of unit covariance."""
         scaled = rows / (self._sd if rows.ndim == 1 else self._sd[:, None])
-        return solve_triangular(self._factor, scaled, lower=True)
+        return self._inverse @ scaled
 
     def weights(self, whitened: np.ndarray) -> np.ndarray:
         """Return the weights of the original vector whose sum is the product with a whitened one."""
-        return solve_triangular(self._factor, whitened, lower=True, trans='T') / self._sd
+        return self._inverse.T @ whitened / self._sd
 
 
 def _cholesky(matrix):

@@ -64,9 +64,24 @@ def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
     scored, tail = _Average([_ScoreOfTime(moments, fit, excess) for fit in fits], weights), TAIL
-    upper = next((times[k] for k in range(best + 1, len(times)) if scored.tail_below(times[k]) < tail), np.inf)
-    lower = next((times[k] for k in range(best - 1, -1, -1) if scored.tail_above(times[k]) < tail), 0.0)
-    return float(lower), float(upper)
+    upper = _first(times[best + 1:], lambda time: scored.tail_below(time) < tail)
+    lower = _first(times[:best][::-1], lambda time: scored.tail_above(time) < tail)
+    return 0.0 if lower is None else lower, np.inf if upper is None else upper
+
+
+def _first(values, refused):
+    """Return the first of the values that is refused, None without; from one that is, all are."""
+    if not len(values):
+        return None
+    near, far, last = -1, 0, len(values) - 1
+    while not refused(values[far]):
+        if far == last:
+            return None
+        near, far = far, min(2 * far + 1, last)
+    while far - near > 1:
+        middle = (near + far) // 2
+        near, far = (near, middle) if refused(values[middle]) else (middle, far)
+    return float(values[far])
 
 
 class _Average:

@@ -14,10 +14,7 @@ from imu_calibration.units import SHOWN_OF_NOISE, significant
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
-
-
-BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise that was found',
-         'bound': 'none was seen: the largest that the curve allows'}
+BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise found', 'bound': 'none seen: the largest possible'}
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def _row(sensor, letter, axis, term):
     factor, unit = SHOWN_OF_NOISE[UNITS[sensor][term.name]]
     lower, upper = (end * factor for end in term.interval)
     value = f'< {significant(upper)}' if term.value is None else _digits(term.value * factor, upper - lower)
-    interval = ' … '.join(_digits(end, upper - lower) for end in (lower, upper))
+    interval = ' … '.join(_digits(end, upper - lower) for end in (lower, upper) if term.value is not None)
     return FigureRow(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
 
 
@@ -74,7 +71,7 @@ def _note(axis, term):
     parts = [term.reason] if term.reason else []
     if term.name in axis.record_for:
         seconds = axis.record_for[term.name]
-        parts.append('record for more than two days' if seconds is None else f'record for {duration(seconds)}')
+        parts.append('takes over two days' if seconds is None else f'takes {duration(seconds)}')
     return '; '.join(parts)
 
 
@@ -170,9 +167,8 @@ def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HOR
     for sensor in SENSORS:
         densities = figures.densities(sensor, horizon)
         units = UNITS[sensor]
-        found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]}, '
-                     f'random walk {significant(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
-        for rate in rates:
-            found.append(f'    at {rate:.6g} Hz: a sample scatters by {significant(densities.sample_sd(rate))} {UNIT[sensor]}, '
-                         f'the bias steps by {significant(densities.step_sd(rate))} {UNIT[sensor]}')
+        found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},')
+        found.append(f'    random walk {significant(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
+        found += [f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNIT[sensor]}, '
+                  f'bias step sd {significant(densities.step_sd(rate))} {UNIT[sensor]}' for rate in rates]
     return found

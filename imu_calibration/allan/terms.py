@@ -151,12 +151,12 @@ def _term(name, value, interval):
     lower, upper = (float(end) for end in interval)
     if lower > 0 and upper / lower <= DETERMINED_RATIO:
         return Term(name, float(value), (lower, upper), DETERMINED)
-    return Term(name, float(value), (lower, upper), WEAK, 'recording too short' if lower > 0 else 'the curve can do without it')
+    return Term(name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none')
 
 
 def _held(term):
     return replace(term, value=None, status=HELD, interval=(0.0, term.interval[1]),
-                   reason='not seen: at most so much')
+                   reason='not seen')
 
 
 def _doubted(terms, best, rivals):
@@ -166,6 +166,6 @@ def _doubted(terms, best, rivals):
         without = [rival.form for rival in rivals if name in best.form and name not in rival.form]
         if without and term.status == DETERMINED:
             other = ' and '.join(without[0]).replace('_', ' ')
-            term = replace(term, status=WEAK, reason=f'{other} explains it as well')
+            term = replace(term, status=WEAK, reason=f'{other} fits too')
         doubted[name] = term
     return doubted

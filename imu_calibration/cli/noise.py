@@ -1,11 +1,12 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
 import sys
+from itertools import groupby
+from textwrap import fill
 
 from imu_calibration import files
 from imu_calibration.allan import summary
 from imu_calibration.allan.figures import HORIZON
-from imu_calibration.cli.show import console
 from imu_calibration.use_cases.noise import noise
 
 NAME = 'noise'
@@ -40,16 +41,12 @@ def run(options):
 
 
 def _show(found, rates, folder, names):
-    """Print the figures, what to know about them, and what filters ask for."""
-    from rich.table import Table
-    out, table = console(), Table(box=None, pad_edge=False)
-    for heading in ('figure', 'value', '95 %', 'unit', 'status', ''):
-        table.add_column(heading, justify='right' if heading in ('value', '95 %') else 'left', overflow='ellipsis' if heading else 'fold')
-    for row in summary.rows(found.figures):
-        table.add_row(f'{row.sensor}.{row.axis} {row.title}', row.value, row.interval, row.unit, row.status, row.note)
-    out.print(table)
-    for line in summary.lines(found.figures):
-        out.print(line, soft_wrap=True)
-    for line in summary.filter_lines(found.figures, rates, found.horizon):
-        out.print(line, soft_wrap=True)
-    out.print(f'written: {names} in {folder}', soft_wrap=True)
+    """Print the figures, what to know about them, and what filters ask for, in 80 columns."""
+    for head, rows in groupby(summary.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
+        print(head)
+        for row in rows:
+            print(f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip())
+    print()
+    for line in [*summary.lines(found.figures), *summary.filter_lines(found.figures, rates, found.horizon)]:
+        print(fill(line, 80, subsequent_indent='    '))
+    print(f'written: {names} in {folder}')
