@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from imu_calibration.by_hand.status import Findings, hand_status
 from imu_calibration.cli.hints import hints_of
@@ -64,7 +63,7 @@ def test_every_key_is_an_option_of_some_verb():
 
 @pytest.mark.parametrize('node', HINTS)
 def test_a_node_names_only_parameters_and_topics_that_it_has(node):
-    parameters = yaml.safe_load((ROOT / f'config/{node}.yaml').read_text())['/**']['ros__parameters']
+    parameters = re.findall(r'^    (?:# )?(\w+):', (ROOT / f'config/{node}.yaml').read_text(), flags=re.M)
     source = (ROOT / f'imu_calibration/nodes/{node}.py').read_text()
     assert set(HINTS[node]) <= set(KEYS)
     for hint in HINTS[node].values():
