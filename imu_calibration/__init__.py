@@ -57,6 +57,7 @@ From the ground up; each package imports only what stands above it. The words ar
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
 `by_hand`         calibration without a table; the arm between two IMUs
 `report`          pages that people look at
+`exports`         a calibration in the words of other programs, and back; what each of them loses
 `diagnosis`       what the model gets wrong, and why
 `files`           files written whole or not at all; `resources` finds those that are installed
 `use_cases`       from files to files: what the command line and notebooks call

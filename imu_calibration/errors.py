@@ -8,8 +8,8 @@ that is called there: an option of the command line, a parameter or topic of a n
 KEYS = {
     'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document', 'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
-    'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster', 'setting': 'how windows are found',
-    'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
+    'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
+    'setting': 'how windows are found', 'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
     'temperature_topic': 'the topic of the temperature', 'imu_link': 'the link that carries the IMU', 'up': 'where up is',
     'urdf': 'the robot description',
 }

@@ -23,11 +23,11 @@ class Row:
     second: float
     """Value in the second document."""
     sd: float
-    """Combined standard deviation."""
+    """Combined standard deviation, of what is known of both."""
     unit: str
     """SI unit."""
     ratio: float | None
-    """Difference in combined standard deviations; None when either is held."""
+    """Difference in combined standard deviations; None when either is held, or the uncertainty of neither is known."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Comparison:
 
     rows: tuple
     """One Row per common parameter."""
-    agree: bool
-    """Whether no group differs beyond chance, with the number of groups accounted for."""
+    agree: bool | None
+    """Whether no group differs beyond chance, with the number of groups accounted for; None when nobody can tell."""
     lines: tuple
     """The verdict in words."""
 
@@ -68,17 +68,21 @@ def compare(first, second):
     notes = _notes(first, second)
     a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
     difference = second.values[b] - first.values[a]
-    covariance = first.covariance[np.ix_(a, a)] + second.covariance[np.ix_(b, b)]
+    parts = [c.covariance[np.ix_(at, at)] for c, at in ((first, a), (second, b)) if c.uncertainty_known]
+    covariance = sum(parts, np.zeros((len(common), len(common))))
     held = np.array([first.status[i] == HELD or second.status[j] == HELD for i, j in zip(a, b)])
     sd = np.sqrt(np.diag(covariance))
     units = {name: effect.unit_of(k) for effect in first.model.effects for k, name in enumerate(effect.param_names())}
-    rows = tuple(Row(name, float(first.values[i]), float(second.values[j]), float(s), units[name], None if h else _ratio(d, s))
+    rows = tuple(Row(name, float(first.values[i]), float(second.values[j]), float(s), units[name], None if h or not parts else _ratio(d, s))
                  for name, i, j, s, h, d in zip(common, a, b, sd, held, difference))
-    groups = _groups(common, difference, covariance, held)
+    groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
     rejected = _holm(groups)
     lines = notes + [f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}' for name, chi2, k, p in groups if name in rejected]
     if held.any():
         lines.append(f'{int(held.sum())} parameters are held in one of them and were not compared')
+    if len(parts) < 2:
+        lines.append('whether the calibrations agree cannot be told: the uncertainties of imported values are not known')
+        return Comparison(rows, None, tuple(lines))
     lines.append('the calibrations disagree' if rejected else 'the calibrations agree')
     return Comparison(rows, not rejected, tuple(lines))
 

@@ -15,6 +15,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
 
 FORMAT = 'imu_calibration/1'
+UNKNOWN = 'unknown'
+"""What the provenance says of the uncertainty of imported values."""
 _WHERE_KNOWN = ('verdict', 'verdict_reasons', 'proof')
 """Parts of a document that are left out while nobody knows them."""
 
@@ -78,6 +80,11 @@ class Calibration:
         found = self.statistics.get(sensor, {})
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
         return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
+
+    @property
+    def uncertainty_known(self):
+        """Whether somebody knows how certain the values are: of those that another program made nobody does."""
+        return self.provenance.get('uncertainty') != UNKNOWN
 
     @property
     def requested(self):

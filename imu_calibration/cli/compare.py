@@ -27,7 +27,7 @@ def run(options):
         factor, unit = for_people(row.unit)
         difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
         table.add_row(row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
-                      'held' if row.ratio is None else f'{row.ratio:.1f}')
+                      '-' if row.ratio is None else f'{row.ratio:.1f}')
     out.print(table)
     for line in result.lines:
         out.print(line, soft_wrap=True)

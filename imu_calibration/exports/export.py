@@ -1,0 +1,175 @@
+"""The export itself: a calibration and its noise become a file for a target, with what that loses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import imu_calibration
+from imu_calibration.allan.figures import Densities, NoiseFigures
+from imu_calibration.calibration.document import Calibration, to_mapping
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.errors import InputError
+from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
+from imu_calibration.exports.holdings import ARMS, MATRICES
+from imu_calibration.exports.loss import NOTHING, UNIT, Loss, loss_of
+from imu_calibration.exports.motion import TrialMotion, standard_motion
+from imu_calibration.exports.target import Noise, Numbers, Page, Readings, Target
+from imu_calibration.units import significant
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """A file for a target."""
+
+    content: bytes
+    """The file."""
+    numbers: Numbers
+    """What it holds of the calibration."""
+    placement: Placement
+    """Frame, origin and axes of these numbers."""
+    loss: Loss
+    """What is lost."""
+    lines: tuple[str, ...]
+    """What to know about it: the same in the file and on the terminal."""
+
+
+def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | None = None, rate: float | None = None,
+           motion: TrialMotion | None = None) -> Export:
+    """
+    Return the file of a target.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    target : Target
+    noise : NoiseFigures, optional
+        From a noise document; without one the white noise of the calibration's recording is taken, and no random walk is known.
+    rate : float, optional
+        Rate at which the target gets the readings, Hz; default that of the noise document.
+    motion : TrialMotion, optional
+        Where the loss is measured; default `motion.standard_motion`.
+
+    Raises
+    ------
+    InputError
+        When the target needs noise that is not there, or the calibration cannot be brought into its axes.
+
+    """
+    if rate is not None and not 0 < rate < np.inf:
+        raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it')
+    found, unknown = _noise_numbers(calibration, target, noise, rate)
+    placement, numbers = placed_numbers(calibration, target)
+    motion = motion or standard_motion(calibration)
+    loss = loss_of(target, calibration, numbers, placement, motion)
+    lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*target.ignored(numbers), *unknown))]
+    head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
+    rate = rate or (noise.rate if noise else None)
+    assert target.write is not None   # `registry.find_target` gives no other
+    content = target.write(Page(numbers, found, [*head, *lines, *([target.hint] if target.hint else [])], calibration, rate))
+    return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines))
+
+
+def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement, Numbers]:
+    """Return the placement of a target for a calibration and the numbers there."""
+    if target.whole:
+        return Placement(), to_mapping(calibration)
+    held = affine_of(calibration, target.holds)
+    placement = target.placement(_with_arms_and_matrices(calibration, held))
+    return placement, target.numbers(moved(held, placement))
+
+
+def _with_arms_and_matrices(calibration, held) -> AffineImu:
+    """Return the IMU by which a target chooses its axes: with whole matrices, also where it holds diagonals only."""
+    return affine_of(calibration, MATRICES + ARMS) if np.any(held.arms) else affine_of(calibration, MATRICES)
+
+
+def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:
+    """Return (noise in the target's words or None, what is not known of it)."""
+    if target.noise is None:
+        return None, []
+    found = _noise_of(calibration, figures, rate)
+    if found is None or (target.needs_walk and not found.walk_known):
+        lacks = 'noise with random walks' if target.needs_walk else 'noise and the rate at which the readings come'
+        if target.only_noise:
+            raise InputError(f'{target.title} must be given {lacks}, none came; give a noise document', key='noise')
+        return None, [f'the noise figures are left out: {lacks} must come from a noise document']
+    return target.noise(found), []
+
+
+def _noise_of(calibration, figures, rate) -> Noise | None:
+    if figures is not None:
+        accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
+        return Noise(accelerometer, gyroscope, rate or figures.rate)
+    white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
+    if rate is None or not all(white.values()):
+        return None
+    accelerometer, gyroscope = (Densities(white[sensor] / float(np.sqrt(rate)), 0.0, 'bound') for sensor in SENSORS)
+    return Noise(accelerometer, gyroscope, rate, walk_known=False)
+
+
+def _placement_lines(calibration, target, placement) -> list[str]:
+    """Say where the numbers stand against our sensor frame."""
+    name = calibration.frame_id or 'the sensor frame'
+    if target.only_noise:
+        return []
+    if np.array_equal(placement.mat_readings, np.eye(3)) and np.array_equal(placement.mat_ts, np.eye(3)) and not np.any(placement.origin_s):
+        return [f'frame: {name}, axes as in the calibration']
+    if not np.array_equal(placement.mat_readings, np.eye(3)):
+        return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
+    turn = Rotation.from_matrix(placement.mat_ts.T).as_quat().tolist()
+    pose = {key: f'{value:.12g}' for key, value in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), [*placement.origin_s, *turn])}
+    options = pose | {'frame-id': name, 'child-frame-id': f'{name}_{target.name}'}
+    return [f"frame: {name}_{target.name}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
+            '  static_transform_publisher ' + ' '.join(f'--{key} {value}' for key, value in options.items())]
+
+
+def _worked_sample(target, numbers, placement, calibration) -> list[str]:
+    """Show one reading before and after the target's formula."""
+    if target.whole or target.only_noise or target.estimates:
+        return []
+    temperature = np.array([calibration.model.temperature_ref_c])
+    raw = np.array([[0.5, -0.3, 9.7]]), np.array([[0.1, -0.2, 0.3]])
+    force, rate = placement.readings(*raw)
+    made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
+    shown = [', '.join(f'{value:.9g}' for value in values[0]) for values in (force, rate, *made)]
+    return [f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}], [{shown[3]}]']
+
+
+def loss_lines(target: Target, loss: Loss) -> list[str]:
+    """Return what is lost, a line each."""
+    if target.only_noise:
+        left = ', '.join(f'{sensor} {significant(value)} {UNIT[sensor]}' for sensor, value in loss.left.items())
+        return ['takes no calibration: feed it compensated readings (compensator_node, or the verb compensate)',
+                f'fed with raw readings it is left with an error of rms {left} beside a constant bias, on {loss.motion}']
+    lines = []
+    if loss.estimated:
+        lines.append('not written, because the target estimates it while it runs: ' + _names(loss.estimated))
+    if loss.nothing:
+        return [*lines, 'lost: nothing']
+    for lost in loss.effects:
+        what = 'held in part' if lost.in_part else 'lost'
+        lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {significant(lost.rms)} {UNIT[lost.effect.sensor]} rms')
+    for sensor in SENSORS:
+        left = f'{significant(loss.left[sensor])} {UNIT[sensor]} rms' if loss.left[sensor] > NOTHING else 'none'
+        lines.append(f'error that this leaves in the {sensor}: {left} (raw readings: {significant(loss.raw[sensor])}), on {loss.motion}')
+    return lines
+
+
+def _names(effects) -> str:
+    return ', '.join(f'{effect.sensor} {effect.name}' for effect in effects)
+
+
+def holds_in_words(target: Target) -> str:
+    """Return what a target can hold, in a few words."""
+    if target.whole:
+        return 'everything'
+    parts: dict[str, list[str]] = {}
+    for holding in target.holds:
+        name = 'scale factors' if holding.own_axis else 'matrix' if holding.role is Role.LINEAR else holding.effect.heading
+        name = name.split(' (')[0].split(':')[0]
+        for sensor in SENSORS:   # a heading may begin with its sensor
+            name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
+        parts.setdefault(name, []).append(holding.sensor)
+    return ', '.join(name if len(sensors) == 2 else f'{name} ({sensors[0]})' for name, sensors in parts.items()) or '-'

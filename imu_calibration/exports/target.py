@@ -1,0 +1,128 @@
+"""What a target of an export is: one record that says all of one program, its own formula included."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from imu_calibration.allan.figures import Densities
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.exports.affine import AffineImu, Placement
+from imu_calibration.exports.gauges import as_mounted
+from imu_calibration.exports.holdings import Holding
+
+Numbers = dict[str, Any]
+"""Name in the file -> number, list or mapping, in the units of the program."""
+
+
+class Readings(NamedTuple):
+    """What an IMU gave, in the axes of a program."""
+
+    force: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
+    rate: np.ndarray
+    """Measured rate, rad/s, shape (n, 3)."""
+    alpha: np.ndarray
+    """True angular acceleration in the program's frame, rad/s^2, shape (n, 3): what estimators have from their own trajectory."""
+    temperature_c: np.ndarray
+    """Degrees Celsius, shape (n,)."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """White noise and random walk of both sensors, and the rate at which they are used."""
+
+    accelerometer: Densities
+    """Continuous, m/s^2/sqrt(Hz) and m/s^3/sqrt(Hz)."""
+    gyroscope: Densities
+    """Continuous, rad/s/sqrt(Hz) and rad/s^2/sqrt(Hz)."""
+    rate: float
+    """Sampling rate, Hz."""
+    walk_known: bool = True
+    """Whether the random walks are known: those of a noise document are, a calibration knows the white noise only."""
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What a writer puts into a file."""
+
+    numbers: Numbers
+    """Of the calibration, by `Target.numbers`."""
+    noise: Numbers | None
+    """Of the noise, by `Target.noise`; None: not known."""
+    comments: list[str]
+    """Lines to stand before the numbers."""
+    calibration: Calibration
+    """What is exported."""
+    rate: float | None
+    """Sampling rate, Hz, where known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """What a reader found in a file."""
+
+    numbers: Numbers
+    """As `Target.numbers` makes them."""
+    lacks: tuple[Holding, ...] = ()
+    """What the program could hold and this file does not."""
+    sample_sd: dict[str, float] = field(default_factory=dict)
+    """Sensor -> standard deviation of the noise of a sample, where the file says it."""
+    temperature_range_c: list[float] | None = None
+    """Range in which thermal numbers hold, where the file says it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Target:
+    """A program that takes numbers of an IMU."""
+
+    name: str
+    """By which it is asked for."""
+    title: str
+    """What it is, for people."""
+    formula: str
+    """How the program uses the numbers, in its own names."""
+    source: str
+    """Where that was read: project, file."""
+    holds: tuple[Holding, ...] = ()
+    """Effects that it can hold."""
+    estimates: tuple[Holding, ...] = ()
+    """Effects that it finds by itself while it runs: no loss, whatever the file says."""
+    whole: bool = False
+    """Whether it holds the whole document: `numbers` are then the document's mapping."""
+    placement: Callable[[AffineImu], Placement] = as_mounted
+    """Its frame, origin and axes of readings."""
+    numbers: Callable[[AffineImu], Numbers] = lambda _imu: {}
+    """The numbers of an IMU that stands in its placement."""
+    corrected: Callable[[Numbers, Readings], tuple[np.ndarray, np.ndarray]] = lambda _numbers, readings: (readings.force, readings.rate)
+    """The program's own formula: specific force and rate that it makes of readings with these numbers."""
+    noise: Callable[[Noise], Numbers] | None = None
+    """The noise in its names and units; None: it takes none."""
+    noise_is: str = ''
+    """Which noise that is: continuous or discrete, with units."""
+    needs_walk: bool = True
+    """Whether its noise includes random walks, which only a noise document has."""
+    suffix: str = '.yaml'
+    """Ending of its files."""
+    comment: str = '# '
+    """Beginning of a line of comment; '' where the format has none."""
+    write: Callable[[Page], str | bytes] | None = None
+    """The file; None: its files are read only."""
+    read: Callable[[bytes, Any], Read] | None = None
+    """``read(content, path)``; None: nothing of the calibration stands in its files."""
+    imu: Callable[[Numbers], AffineImu] | None = None
+    """The IMU of numbers, in the program's placement: the other way of `numbers`."""
+    back: Callable[[AffineImu], Placement] = as_mounted
+    """The placement of our calibration against an IMU that was read."""
+    axes: str = 'mount'
+    """The axes of a calibration that was read, as its gauge says them."""
+    ignored: Callable[[Numbers], list[str]] = lambda _numbers: []
+    """What of these numbers the program does not take notice of, and its limits, a line each."""
+    hint: str = ''
+    """What to do with the file, or with the program."""
+
+    @property
+    def only_noise(self) -> bool:
+        """Whether it takes noise and nothing of the calibration."""
+        return self.noise is not None and not self.holds and not self.whole

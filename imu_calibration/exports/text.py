@@ -1,0 +1,112 @@
+"""The formats of targets: YAML with comments before it, and lists of parameters; written and read."""
+
+import json
+import re
+
+import numpy as np
+
+from imu_calibration.documents import from_text, to_text
+from imu_calibration.errors import InputError, shortened
+
+
+def commented(lines: list[str], mark: str = '# ') -> str:
+    """Return lines as comments."""
+    return ''.join(f'{mark}{line}'.rstrip() + '\n' for line in lines)
+
+
+def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
+    """Return a YAML file with comments before the content; `head` is a line that must come first."""
+    return head + commented(comments) + to_text(plain(mapping))
+
+
+def plain(value):
+    """Return a value with arrays as lists and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_yaml(content: bytes, what: str) -> dict:
+    """Return the mapping in a YAML file; the line ``%YAML:1.0`` of OpenCV may stand before it."""
+    lines = text_of(content, what).splitlines()
+    kept = '\n'.join(line for line in lines if not line.startswith('%YAML'))
+    return from_text(kept, what)
+
+
+def read_json(content: bytes, what: str) -> dict:
+    """Return the mapping in a JSON file."""
+    try:
+        found = json.loads(text_of(content, what))
+    except ValueError as error:
+        raise InputError(f'the {what} must be JSON: {shortened(str(error))}; give another file') from error
+    if not isinstance(found, dict):
+        raise InputError(f'the {what} must hold a mapping, got {type(found).__name__}; give another file')
+    return found
+
+
+def text_of(content: bytes, what: str) -> str:
+    """Return a file's text."""
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f'the {what} must be a text file, it is none; give another file') from error
+
+
+def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """
+    Return an entry of a mapping as an array.
+
+    Raises
+    ------
+    InputError
+        When it is missing, or not finite numbers of that shape.
+
+    """
+    try:
+        array = np.asarray(mapping[name], float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
+                         'correct it') from error
+    if array.size != np.prod(shape, dtype=int) or not np.all(np.isfinite(array)):
+        raise InputError(f"'{name}' of the {what} must be finite numbers of shape {shape}, got {shortened(repr(mapping[name]))}; "
+                         'correct it')
+    return array.reshape(shape)
+
+
+def section(mapping: dict, name: str, what: str) -> dict:
+    """Return a mapping in a mapping."""
+    found = mapping.get(name)
+    if not isinstance(found, dict):
+        raise InputError(f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another file")
+    return found
+
+
+def read_parameters(content: bytes, what: str) -> dict[str, float]:
+    """
+    Return {name: value} from a list of parameters, one a line, comments after ``#``.
+
+    The last word of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in QGroundControl's
+    (``vehicle component NAME VALUE type``).
+    """
+    found = {}
+    for line in text_of(content, what).splitlines():
+        words = re.split(r'[\s,=]+', line.partition('#')[0].strip())
+        name = next((k for k, word in enumerate(words) if re.fullmatch(r'[A-Z][A-Z0-9_]+', word)), None)
+        if name is None or name + 1 >= len(words):
+            continue
+        try:
+            found[words[name]] = float(words[name + 1])
+        except ValueError as error:
+            raise InputError(f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])}; correct it") from error
+    if not found:
+        raise InputError(f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file')
+    return found
+
+
+def diagonal(values) -> np.ndarray:
+    """Return a diagonal matrix."""
+    return np.diag(np.asarray(values, float))

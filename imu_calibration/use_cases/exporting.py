@@ -1,0 +1,95 @@
+"""From calibration.yaml to the files of other programs, and back."""
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from imu_calibration import files
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.compensation.evaluation import session_truth
+from imu_calibration.exports.export import Export, export
+from imu_calibration.exports.imported import import_file
+from imu_calibration.exports.motion import TrialMotion, motion_of, recorded_motion, temperature_at
+from imu_calibration.exports.registry import find_reader, find_target
+from imu_calibration.samples import ImuSamples
+from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
+
+
+def export_calibration(calibration: str | PathLike | Calibration, to: str, *, output: str | PathLike | None = None,
+                       noise: str | PathLike | None = None, rate: float | None = None, bag: str | PathLike | None = None,
+                       table: str | PathLike | None = None, topics: Topics = Topics()) -> Export:
+    """
+    Write a calibration as another program wants it.
+
+    Parameters
+    ----------
+    calibration : Calibration or path-like
+    to : str
+        Name of the target, as `exports.registry.all_targets` lists them.
+    output : path-like, optional
+        The file; None: nothing is written.
+    noise : path-like, optional
+        A noise document.
+    rate : float, optional
+        Rate at which the target gets the readings, Hz; default that of the noise document.
+    bag, table : path-like, optional
+        Recording on which the loss is measured, and the table that says its true motion; default `exports.motion.standard_motion`.
+    topics : Topics
+        Of the bag.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When a file cannot be read or written, or the target needs what is not there.
+
+    """
+    target = find_target(to)
+    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    figures = None if noise is None else files.read_noise(noise)
+    motion = None if bag is None else _motion(known, bag, table, topics)
+    found = export(known, target, noise=figures, rate=rate, motion=motion)
+    if output is not None:
+        files.write_whole(output, found.content)
+    return found
+
+
+def _motion(calibration, bag, table, topics) -> TrialMotion:
+    """Return the motion of a recording: as the table says it, else as its compensated readings say it."""
+    temperature = temperatures(bag, topics)
+    if table is None:
+        blocks = [block.imu for block in source_of(bag, topics, want_joints=False)() if block.imu is not None]
+        return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name_of(bag))
+    known = files.read_table(table)
+    truth = session_truth(source_of(bag, topics, known.joint_names)(), known)
+    ref = truth.reference
+    count = len(ref.time)
+    return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_at(calibration, temperature, np.asarray(truth.imu.stamp_ns)),
+                     f'{name_of(bag)}, moved as its table says ({count} samples)')
+
+
+def import_calibration(path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = '') -> Calibration:
+    """
+    Read the file of another program as a calibration.
+
+    Parameters
+    ----------
+    path : path-like
+    source : str
+        Name of the program, as in `export_calibration`.
+    output : path-like, optional
+        calibration.yaml to write; None: nothing is written.
+    frame_id : str
+        Frame of the Imu messages.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When it is no such file, or a file cannot be read or written.
+
+    """
+    target = find_reader(source)
+    found = import_file(target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id)
+    if output is not None:
+        files.write_text(output, calibration_to_text(found))
+    return found
