@@ -1,5 +1,6 @@
 """``imu_calibration export``: a calibration as estimators and autopilots want it."""
 
+from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.show import console
 from imu_calibration.errors import InputError
 from imu_calibration.exports.export import holds_in_words
@@ -19,12 +20,9 @@ def add_arguments(parser):
     parser.add_argument('--noise', metavar='FILE', help='noise.yaml of the verb noise')
     parser.add_argument('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
     parser.add_argument('--output', metavar='FILE', help='the file to write')
-    group = parser.add_argument_group('where the loss is measured', 'default: a standard motion')
-    group.add_argument('--bag', metavar='BAG', help='a recording')
-    group.add_argument('--table', metavar='TABLE', help='the table that says how the recording moved')
-    group.add_argument('--imu-topic', metavar='TOPIC', help='sensor_msgs/Imu, default /imu/data_raw')
-    group.add_argument('--joint-topic', metavar='TOPIC', help='sensor_msgs/JointState, default /joint_states')
-    group.add_argument('--temperature-topic', metavar='TOPIC', help='sensor_msgs/Temperature, default /imu/temperature')
+    parser.add_argument('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
+    add_stand_arguments(parser, 'what says how the recording moved; without it: its own readings')
+    add_topic_arguments(parser)
 
 
 def run(options):
@@ -35,11 +33,12 @@ def run(options):
     for name, given in (('CALIBRATION', options.document), ('--to NAME', options.to), ('--output FILE', options.output)):
         if not given:
             raise InputError(f'an export must have {name}, none came; give it, or see --list')
-    if options.table and not options.bag:
-        raise InputError('a table says how a recording moved and must come with --bag BAG, none came; give both')
+    stand = stand_of(options)
+    if stand is not None and not options.bag:
+        raise InputError('a table or arm says how a recording moved and must come with --bag BAG, none came; give both')
     topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic)
     found = export_calibration(options.document, options.to, output=options.output, noise=options.noise, rate=options.rate,
-                               bag=options.bag, table=options.table, topics=topics)
+                               bag=options.bag, stand=stand, topics=topics)
     for line in found.lines:
         print(line)
     print(f'written: {options.output}')

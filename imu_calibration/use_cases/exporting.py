@@ -14,11 +14,12 @@ from imu_calibration.exports.motion import TrialMotion, motion_of, recorded_moti
 from imu_calibration.exports.registry import find_reader, find_target
 from imu_calibration.samples import ImuSamples
 from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
+from imu_calibration.use_cases.stand import Stand, table_of
 
 
 def export_calibration(calibration: str | PathLike | Calibration, to: str, *, output: str | PathLike | None = None,
                        noise: str | PathLike | None = None, rate: float | None = None, bag: str | PathLike | None = None,
-                       table: str | PathLike | None = None, topics: Topics = Topics()) -> Export:
+                       stand: Stand | None = None, topics: Topics = Topics()) -> Export:
     """
     Write a calibration as another program wants it.
 
@@ -33,8 +34,10 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
         A noise document.
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
-    bag, table : path-like, optional
-        Recording on which the loss is measured, and the table that says its true motion; default `exports.motion.standard_motion`.
+    bag : path-like, optional
+        Recording on which the loss is measured; default `exports.motion.standard_motion`.
+    stand : path-like, Table or Arm, optional
+        What says how the recording truly moved; default its compensated readings.
     topics : Topics
         Of the bag.
 
@@ -47,21 +50,21 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     target = find_target(to)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     figures = None if noise is None else files.read_noise(noise)
-    motion = None if bag is None else _motion(known, bag, table, topics)
+    motion = None if bag is None else _motion(known, bag, stand, topics)
     found = export(known, target, noise=figures, rate=rate, motion=motion)
     if output is not None:
         files.write_whole(output, found.content)
     return found
 
 
-def _motion(calibration, bag, table, topics) -> TrialMotion:
+def _motion(calibration, bag, stand, topics) -> TrialMotion:
     """Return the motion of a recording: as the table says it, else as its compensated readings say it."""
     temperature = temperatures(bag, topics)
-    if table is None:
+    if stand is None:
         blocks = [block.imu for block in source_of(bag, topics, want_joints=False)() if block.imu is not None]
         return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name_of(bag))
-    known = files.read_table(table)
-    truth = session_truth(source_of(bag, topics, known.joint_names)(), known)
+    table = table_of(stand, [bag], topics)
+    truth = session_truth(source_of(bag, topics, table.joint_names)(), table)
     ref = truth.reference
     count = len(ref.time)
     return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_at(calibration, temperature, np.asarray(truth.imu.stamp_ns)),
