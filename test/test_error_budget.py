@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.collector import gather
+from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.error_budget import ReferenceErrors, _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.sensor_model import SensorModel
@@ -46,7 +46,7 @@ def result(recording):
 
 def moved(recording, result, false_table):
     """Return how the estimate moves when the reference is wrong, at the same weights."""
-    gathered = gather(iter([recording]), false_table, result.model)
+    gathered = GatherStep(false_table, result.model)((0, lambda: iter([recording])))
     return solve(gathered.accumulator, result.model, noise=result.solution.noise).values - result.solution.values
 
 

@@ -1,5 +1,6 @@
 """Pre-flight: each fault that a driver can make is named by one check, through a real bag; good recordings are left in peace."""
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from imu_calibration.preflight.axes import match_axes, signed_permutations
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
 from imu_calibration.samples import SampleBlock
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
@@ -43,9 +45,8 @@ def findings(samples, nominal=None, gravity=None, cut=None):
     blocks = [SampleBlock(imu, joints, temperature)]
     if cut is not None:
         blocks = [SampleBlock(imu.select(slice(a, a + cut))) for a in range(0, len(imu), cut)] + [SampleBlock(None, joints, temperature)]
-    preflight = Preflight(gravity, nominal)
-    for _ in preflight.watch(blocks, strict=False):
-        pass
+    preflight = Preflight(gravity, strict=False)
+    deque(BlockCleaner(nominal=nominal, watchers=[preflight]).all_of(blocks), maxlen=0)
     return preflight.findings
 
 
@@ -450,10 +451,9 @@ REAL = {
 @pytest.mark.real_data
 @pytest.mark.parametrize(('name', 'topic'), REAL, ids=lambda value: str(value))
 def test_real_recordings_get_what_is_true_of_them(recordings, name, topic):
-    preflight = Preflight()
+    preflight = Preflight(strict=False)
     with open_recording(recordings / name, imu_topic=topic, want_joints='optional') as recording:
-        for _ in preflight.watch(recording.blocks(), strict=False):
-            pass
+        deque(BlockCleaner(watchers=[preflight]).all_of(recording.blocks()), maxlen=0)
     assert trouble(preflight.findings) == REAL[name, topic]
     for finding in preflight.findings:
         if finding.check == 'clipping':

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from imu_calibration.calibration import collector as gathering
-from imu_calibration.calibration.collector import gather
+from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as least_squares
 from imu_calibration.estimation.solver import solve
@@ -48,7 +48,7 @@ def peak(imu, joints, repetitions):
     """Return (what was gathered, peak of allocated memory in bytes)."""
     tracemalloc.start()
     try:
-        gathered = gather(stream(imu, joints, repetitions), TABLE, MODEL)
+        gathered = GatherStep(TABLE, MODEL)((0, lambda: stream(imu, joints, repetitions)))
         return gathered, tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -56,7 +56,7 @@ def peak(imu, joints, repetitions):
 
 def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
     """Three times the length takes no more memory, once all that is kept on purpose is full; nothing of the data is lost by it."""
-    for module, name, value in ((gathering, 'KEPT_STATISTICS', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'CAPACITY', 64)):
+    for module, name, value in ((gathering, 'KEPT_POSES', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'CAPACITY', 64)):
         monkeypatch.setattr(module, name, value)
     imu, joints = piece
     short, short_peak = peak(imu, joints, 1)

@@ -470,6 +470,6 @@ def test_stream_statistics_are_at_hand():
     imu, joints = record(rest(10))
     gatherer = MotionGatherer(TABLE)
     gatherer.push(SampleBlock(imu, joints))
-    statistics = gatherer.streams()
+    statistics = gatherer.cleaner.statistics()
     assert statistics['imu'].rate == pytest.approx(200) and statistics['joints'].rate == pytest.approx(100)
     assert statistics['temperature'].count == 0

@@ -10,7 +10,7 @@ from imu_calibration.allan.sample_grid import SampleGrid, spread
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, TrendReference
 from imu_calibration.samples import NominalScaling, SampleBlock
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +80,9 @@ def read_curve(blocks: Iterable[SampleBlock], parts: list[list[StillPart]], peri
     """
     longest = max(round(part.seconds / period) for of_epoch in parts for part in of_epoch)
     reader = _PartReader(averaging_factors(longest), period, detrending)
-    check = StreamCheck()
-
-    def take(accepted):
-        for epoch, imu in accepted:
-            imu = imu if nominal is None else nominal.apply(imu)
+    for cleaned in BlockCleaner(nominal=nominal).all_of(blocks):
+        for epoch, imu in cleaned.imu:
             reader.push(epoch, imu, parts[epoch], time_of)
-    for block in blocks:
-        take(check.push(block.imu))
-    take(check.finish())
     return reader.curve()
 
 

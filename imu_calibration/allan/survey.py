@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.samples import NominalScaling, SampleBlock
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
 
 CHUNK_TIME = 0.25
 """s; also the distance at which temperatures are kept."""
@@ -45,28 +45,21 @@ def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None)
         When something makes the result wrong, such as other units.
 
     """
-    preflight, imu_check, warmth_check = Preflight(None, nominal), StreamCheck(), StreamCheck()
+    preflight = Preflight()
+    cleaner = BlockCleaner(nominal=nominal, watchers=[preflight])
     series: dict[int, ChunkSeries] = {}
-    dropped: Counter = Counter()
     temperature, frame_id = _Thinned(), ''
-    for block in preflight.watch(blocks):
-        dropped.update(block.dropped or {})
-        for epoch, imu in imu_check.push(block.imu):
+    for cleaned in cleaner.all_of(blocks):
+        for epoch, imu in cleaned.imu:
             frame_id = frame_id or imu.frame_id
-            _push(series, epoch, imu, nominal)
-        for _, warmth in warmth_check.push(block.temperature):
+            columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
+            series.setdefault(epoch, ChunkSeries(CHUNK_TIME, CAPACITY)).push(imu.stamp_ns, columns)
+        for _, warmth in cleaned.temperature:
             temperature.push(warmth)
-    for epoch, imu in imu_check.finish():
-        _push(series, epoch, imu, nominal)
-    dropped.update({reason: count for reason, count in imu_check.counts.items() if reason != 'clock reset'})
+    dropped = Counter(cleaner.lost)
+    dropped.update({reason: count for reason, count in preflight.streams['imu'].dropped.items() if reason != 'clock reset'})
     epochs = [item.chunks() for _, item in sorted(series.items())]
     return Survey(epochs, _period(epochs), temperature.result(), preflight.findings, dropped, frame_id)
-
-
-def _push(series, epoch, imu, nominal):
-    if len(imu):
-        imu = imu if nominal is None else nominal.apply(imu)
-        series.setdefault(epoch, ChunkSeries(CHUNK_TIME, CAPACITY)).push(imu.stamp_ns, np.concatenate([imu.force_s.T, imu.rate_s.T]))
 
 
 def _period(epochs):

@@ -18,8 +18,8 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_force
-from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.samples import ImuSamples, TemperatureSamples
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ class HandRecording:
                         temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
 
 
-def read_by_hand(blocks, nominal=None):
+def read_by_hand(blocks, nominal=None, watchers=()):
     """
-    Return the `HandRecording` of a whole stream of SampleBlock; `nominal` converts counts or volts.
+    Return the `HandRecording` of a whole stream of SampleBlock; `nominal` and `watchers` as for the `BlockCleaner`.
 
     Raises
     ------
@@ -52,29 +52,24 @@ def read_by_hand(blocks, nominal=None):
         When no usable sample is left.
 
     """
-    checks, parts, counts = {'imu': StreamCheck(), 'temperature': StreamCheck()}, {'imu': [], 'temperature': []}, {}
-    for block in blocks:
-        for reason, count in (block.dropped or {}).items():
-            counts[reason] = counts.get(reason, 0) + count
-        for name, check in checks.items():
-            parts[name] += check.push(getattr(block, name))
-    for name, check in checks.items():
-        parts[name] = [samples for _, samples in parts[name] + check.finish() if len(samples)]
-    if not parts['imu']:
+    cleaner, imus, temperatures = BlockCleaner(nominal=nominal, watchers=watchers), [], []
+    for cleaned in cleaner.all_of(blocks):
+        imus += [imu for _, imu in cleaned.imu]
+        temperatures += [temperature for _, temperature in cleaned.temperature]
+    if not imus:
         raise InputError('the recording must hold Imu messages that can be used, it holds none; check the topic')
-    for reason, count in checks['imu'].counts.items():
-        counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
-    imu, warm = type(parts['imu'][0]).concatenate(parts['imu']), None
-    if parts['temperature']:
-        known = type(parts['temperature'][0]).concatenate(parts['temperature'])
+    imu, warm = ImuSamples.concatenate(imus), None
+    if temperatures:
+        known = TemperatureSamples.concatenate(temperatures)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
         warm = np.interp((imu.stamp_ns - start).astype(float), (known.stamp_ns - start).astype(float), known.temperature_c)
-    return HandRecording(imu if nominal is None else nominal.apply(imu), warm, {reason: count for reason, count in counts.items() if count})
+    counts = cleaner.lost | {reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')}
+    return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count})
 
 
-def read_imu(blocks):
+def read_imu(blocks, watchers=()):
     """Return (ImuSamples, counts of what was dropped) of a whole recording, cleaned; raises as `read_by_hand`."""
-    recording = read_by_hand(blocks)
+    recording = read_by_hand(blocks, watchers=watchers)
     return recording.imu, recording.counts
 
 
@@ -98,8 +93,8 @@ def calibrate_without_table(sources, options=CalibrationOptions(), provenance=No
     """
     if len(sources) != 1:
         raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
-    preflight = Preflight(options.gravity, options.nominal)
-    recording = read_by_hand(preflight.watch(sources[0]()), options.nominal)
+    preflight = Preflight(options.gravity)
+    recording = read_by_hand(sources[0](), options.nominal, [preflight])
     return calibrate_samples_by_hand(recording, options, provenance, findings=preflight.findings)
 
 

@@ -1,35 +1,30 @@
 """From a stream of samples to a least-squares system: one recording at a time, to be merged."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.gathered import KEPT_SAMPLES, KEPT_STATISTICS, Gathered, naming
+from imu_calibration.calibration.gathered import KEPT_POSES, KEPT_SAMPLES, Gathered, naming
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling, SampleBlock
+from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class Collector:
     """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
 
-    def __init__(self, table, model: SensorModel, settings=WindowSettings(), nominal=None, session=0, keep=True):
-        from imu_calibration.segmentation.window_finder import MotionGatherer
-        self.table, self.model, self.nominal, self.session, self.keep = table, model, nominal, session, keep
-        self.gatherer = MotionGatherer(table, settings)
+    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=()):
+        self.table, self.model, self.session = table, model, session
+        self.gatherer = MotionGatherer(table, settings, nominal=nominal, watchers=watchers)
         self.gathered = Gathered()
-        self._adapter_drops = {}
 
     def push(self, block: SampleBlock):
         """Take a block and return the windows that it completed."""
-        for reason, count in (block.dropped or {}).items():
-            self._adapter_drops[reason] = self._adapter_drops.get(reason, 0) + count
         if block.imu is not None and len(block.imu):
-            if self.nominal is not None:
-                block = replace(block, imu=self.nominal.apply(block.imu))
             self._note_imu(block.imu)
         if block.temperature is not None and len(block.temperature):
             self._note_temperature(block.temperature.temperature_c)
@@ -44,7 +39,7 @@ class Collector:
     def update_counts(self):
         """Bring the counts up to date."""
         counts = dict(self.gatherer.counts)
-        for reason, count in self._adapter_drops.items():
+        for reason, count in self.gatherer.cleaner.lost.items():
             counts[reason] = counts.get(reason, 0) + count
         self.gathered.counts = counts
 
@@ -70,48 +65,16 @@ class Collector:
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
         if window.kind == 'static':
             found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
-            del found.poses[:-KEPT_STATISTICS]
+            del found.poses[:-KEPT_POSES]
         else:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
-        if self.keep:
-            self._store(window, reduced)
+        self._store(window, reduced)
         return reduced
 
     def _store(self, window, reduced: WindowStatistics):
-        found = self.gathered
-        if len(found.windows) < KEPT_STATISTICS:
-            found.windows.append(reduced)
-        if window.kind != 'static' and sum(len(w.time) for w in found.kept) + len(window.time) <= KEPT_SAMPLES:
-            found.kept.append(window)
-
-
-def gather(blocks, table, model, settings=WindowSettings(), nominal=None, session=0, keep=True, progress=None):
-    """
-    Reduce one recording to a `Gathered`: the map step of calibration.
-
-    Parameters
-    ----------
-    blocks : iterable of SampleBlock
-        The recording in file order.
-    progress : callable, optional
-        Called with the number of IMU samples read so far.
-
-    Raises
-    ------
-    InputError
-        At the end of the recording, when it cannot give a right result (`preflight`).
-
-    """
-    collector, count = Collector(table, model, settings, nominal, session, keep), 0
-    preflight = Preflight(table.gravity_value, nominal)
-    for block in preflight.watch(blocks):
-        collector.push(block)
-        count += 0 if block.imu is None else len(block.imu)
-        if progress is not None:
-            progress(count)
-    gathered = collector.finish()
-    gathered.findings = preflight.findings
-    return gathered
+        kept = self.gathered.kept
+        if window.kind != 'static' and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES:
+            kept.append(window)
 
 
 @dataclass(frozen=True)
@@ -134,5 +97,24 @@ class GatherStep:
     def __call__(self, numbered):
         """Return the Gathered of a recording, given (its number, callable that yields its blocks)."""
         session, source = numbered
-        with_name = naming(self.names, session)
-        return with_name(gather, source(), self.table, self.model, self.windows, self.nominal, session, progress=self.progress)
+        return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
+
+    def read(self, blocks, session, preflight):
+        """
+        Return the Gathered of a recording, which is read once, for its windows and for the checks.
+
+        Raises
+        ------
+        InputError
+            At the end of the recording, when it cannot give a right result (`preflight`).
+
+        """
+        collector, count = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,)), 0
+        for block in blocks:
+            collector.push(block)
+            count += 0 if block.imu is None else len(block.imu)
+            if self.progress is not None:
+                self.progress(count)
+        gathered = collector.finish()
+        gathered.findings = preflight.findings
+        return gathered

@@ -9,10 +9,8 @@ from imu_calibration.estimation.accumulator import Accumulator
 
 KEPT_SAMPLES = 200_000
 """Samples of moving windows kept for plots and for the autocorrelation of residuals."""
-
-
-KEPT_STATISTICS = 2000
-"""Windows whose full statistics are kept for residuals per window."""
+KEPT_POSES = 2000
+"""Static windows whose joint positions are kept."""
 
 
 @dataclass(eq=False)
@@ -21,8 +19,6 @@ class Gathered:
 
     accumulator: Accumulator = field(default_factory=Accumulator)
     """The least-squares system."""
-    windows: list = field(default_factory=list)
-    """Reduced windows with their centred rows, the first KEPT_STATISTICS of them."""
     kept: list = field(default_factory=list)
     """Windows with all samples, as far as KEPT_SAMPLES reaches."""
     poses: list = field(default_factory=list)
@@ -56,7 +52,6 @@ def merge(parts):
     total = parts[0]
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
-        total.windows = (total.windows + part.windows)[:KEPT_STATISTICS]
         total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)

@@ -252,7 +252,7 @@ class _LiveCollector(Collector):
     """A Collector that hands completed windows on and keeps a bounded number of them."""
 
     def __init__(self, table, model, options, session, store):
-        super().__init__(table, model, options.windows, options.nominal, session)
+        super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
         self.store, self._completed = store, []
 
     def _store(self, window, reduced):
@@ -280,4 +280,4 @@ class _LiveCollector(Collector):
 def _copied(gathered):
     """Return a copy that shares only what nobody changes in place."""
     accumulator = gathered.accumulator.copy()
-    return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), windows=[], kept=[], counts=dict(gathered.counts))
+    return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))

@@ -27,7 +27,7 @@ def run(options):
         open_bag(options.bag, topic, want_joints=False).close()
         blocks = source_of(options.bag, topic, want_joints=False)()
         preflight = Preflight()
-        imus.append(read_imu(preflight.watch(blocks))[0])
+        imus.append(read_imu(blocks, [preflight])[0])
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
     result = estimate_arm(*imus)
     out = console()

@@ -40,10 +40,7 @@ class ErrorFigures:
 
 def session_truth(blocks, table, settings=WindowSettings()):
     """Return the samples of a session with their reference, as far as joints and IMU are both there."""
-    gatherer, windows = MotionGatherer(table, settings, keep_unused=True), []
-    for block in blocks:
-        windows += gatherer.push(block)
-    windows += gatherer.finish()
+    windows = MotionGatherer(table, settings, keep_unused=True).all_of(blocks)
     references = [_reference(window, table) for window in windows]
     imu = ImuSamples(*(np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s')))
     names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')

@@ -104,8 +104,8 @@ def diagnose_without_table(source, options=CalibrationOptions(), provenance=None
 
     """
     options = replace(options, accelerometer_model=options.accelerometer_model or BARE, gyroscope_model=options.gyroscope_model or BARE)
-    preflight = Preflight(options.gravity, options.nominal)
-    recording = read_by_hand(preflight.watch(source()), options.nominal)
+    preflight = Preflight(options.gravity)
+    recording = read_by_hand(source(), options.nominal, [preflight])
     data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
     result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings)
@@ -114,12 +114,8 @@ def diagnose_without_table(source, options=CalibrationOptions(), provenance=None
 
 def collect_windows(blocks, table, options=CalibrationOptions()):
     """Return all windows of a recording with their samples, unused ones too."""
-    gatherer, windows = MotionGatherer(table, options.windows, keep_unused=True), []
-    for block in blocks:
-        if options.nominal is not None and block.imu is not None:
-            block = replace(block, imu=options.nominal.apply(block.imu))
-        windows += gatherer.push(block)
-    return windows + gatherer.finish()
+    gatherer = MotionGatherer(table, options.windows, keep_unused=True, nominal=options.nominal)
+    return gatherer.all_of(blocks)
 
 
 def _percent(advance):

@@ -20,37 +20,40 @@ CHECKS = (
 
 class Preflight:
     """
-    Looks at a recording while something else reads it.
+    Watches a recording while it is read (a `segmentation.block_cleaning.Watcher`).
 
     Parameters
     ----------
     gravity : float, optional
         Local gravity, m/s^2; default standard gravity.
-    nominal : NominalScaling of `gathering`, optional
-        For recordings in volts or counts.
+    strict : bool
+        Whether `finish` raises when a finding says that the result would be wrong.
 
     """
 
-    def __init__(self, gravity=None, nominal=None):
-        self._gatherer = EvidenceGatherer(STANDARD_GRAVITY if gravity is None else gravity, nominal)
-        self.findings = ()
+    def __init__(self, gravity=None, *, strict=True):
+        self._gatherer, self._strict = EvidenceGatherer(STANDARD_GRAVITY if gravity is None else gravity), strict
+        self.findings, self.streams, self.lost = (), None, {}
+        """What was found; name -> StreamStatistics; reason -> messages that could not be read: all of them after `finish`."""
 
-    def watch(self, blocks, strict=True):
+    def push(self, cleaned):
+        """Take a CleanedBlock."""
+        self._gatherer.push(cleaned)
+
+    def finish(self, cleaner):
         """
-        Yield the blocks; after the last one `findings` is complete.
+        Check what was seen of the streams that the BlockCleaner cleaned.
 
         Raises
         ------
         InputError
-            After the last block, when a finding says that the result would be wrong and `strict` is set.
+            When a finding says that the result would be wrong, unless `strict` is off.
 
         """
-        for block in blocks:
-            self._gatherer.push(block)
-            yield block
-        evidence = self._gatherer.evidence()
+        self.streams, self.lost = cleaner.statistics(), cleaner.lost
+        evidence = self._gatherer.evidence(self.streams)
         self.findings = tuple(finding for check in CHECKS for finding in check(evidence)) if 'imu' in evidence.streams else ()
-        if strict:
+        if self._strict:
             refuse(self.findings)
 
 

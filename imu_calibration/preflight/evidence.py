@@ -9,9 +9,9 @@ from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.preflight.extremes import Extremes
 from imu_calibration.preflight.rest import find_rest
 from imu_calibration.preflight.turning import relate_turns
-from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStatistics
+from imu_calibration.segmentation.block_cleaning import STREAMS
+from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
-STREAMS = ('imu', 'joints', 'temperature')
 IRREGULAR = 0.1
 """Steps farther than this share from the usual one count as irregular."""
 RESOLUTION_SAMPLES = 20_000
@@ -41,7 +41,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class RecordingEvidence:
-    """A recording as the checks see it; SI after the nominal scaling, when one was given."""
+    """A recording as the checks see it, cleaned and in SI."""
 
     streams: dict
     """'imu', 'joints', 'temperature' -> Stream; only those that came."""
@@ -88,41 +88,31 @@ class RecordingEvidence:
 
 
 class EvidenceGatherer:
-    """Takes blocks and gives the `RecordingEvidence`."""
+    """Takes cleaned blocks and gives the `RecordingEvidence`."""
 
-    def __init__(self, gravity, nominal=None):
-        self.gravity, self.nominal = gravity, nominal
-        self._checks = {name: StreamCheck() for name in STREAMS}
+    def __init__(self, gravity):
+        self.gravity = gravity
         self._steps = {name: _Steps() for name in STREAMS}
         self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
         self._resolution, self._temperature_c = np.full(6, np.inf), None
 
-    def push(self, block):
-        """Take a SampleBlock."""
+    def push(self, cleaned):
+        """Take a CleanedBlock."""
         for name in STREAMS:
-            samples = getattr(block, name)
-            if samples is not None and len(samples):
-                self._take(name, self._checks[name].push(samples))
+            for epoch, samples in getattr(cleaned, name):
+                self._steps[name].push(samples.stamp_ns, epoch)
+        for _, imu in cleaned.imu:
+            self._take_imu(imu)
+        for _, temperature in cleaned.temperature:
+            low, high = self._temperature_c or (np.inf, -np.inf)
+            self._temperature_c = (min(low, float(temperature.temperature_c.min())), max(high, float(temperature.temperature_c.max())))
 
-    def evidence(self):
-        """Close the streams and return the RecordingEvidence."""
-        for name in STREAMS:
-            self._take(name, self._checks[name].finish())
-        streams = {name: Stream(check.statistics(), *self._steps[name].summary()) for name, check in self._checks.items()
-                   if self._steps[name].first_ns is not None}
+    def evidence(self, statistics):
+        """Return the RecordingEvidence, with the StreamStatistics of each stream."""
+        streams = {name: Stream(statistics[name], *steps.summary()) for name, steps in self._steps.items() if steps.first_ns is not None}
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
         return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends, self._temperature_c, self.gravity)
-
-    def _take(self, name, pieces):
-        for epoch, samples in pieces:
-            if len(samples):
-                self._steps[name].push(samples.stamp_ns, epoch)
-                if name == 'imu':
-                    self._take_imu(samples if self.nominal is None else self.nominal.apply(samples))
-                elif name == 'temperature':
-                    low, high = self._temperature_c or (np.inf, -np.inf)
-                    self._temperature_c = (min(low, float(samples.temperature_c.min())), max(high, float(samples.temperature_c.max())))
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])

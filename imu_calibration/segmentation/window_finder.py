@@ -3,27 +3,24 @@
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.samples import JointSamples
+from imu_calibration.segmentation.block_cleaning import STREAMS, BlockCleaner
 from imu_calibration.segmentation.quiet_detector import QuietFloor
 from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT, MotionChunks
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_cutter import WindowCutter
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 __all__ = ['MotionGatherer', 'Window', 'find_still']
 
-_STREAMS = ('imu', 'joints', 'temperature')
-_BATCH = 200  # samples that are taken in together: cleaning has a fixed cost per call
-
 
 class MotionGatherer:
     """
     Turns streams into windows, in bounded memory; the outcome does not depend on how the streams are cut into blocks.
 
-    Cleaning is done by `stream_check.StreamCheck`, one per stream; `motion_chunks.MotionChunks` brings the joints to the
-    IMU's stamps; `window_cutting.WindowCutter` makes the windows. A clock that is set back starts again with the first two.
+    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` brings the joints to the IMU's stamps; `WindowCutter` makes the
+    windows. A clock that is set back starts again with the first two.
     Streams may be late against each other by a minute (temperature: five seconds); what comes later is not used.
 
     Parameters
@@ -33,17 +30,16 @@ class MotionGatherer:
     settings : WindowSettings
     keep_unused : bool
         Also return windows of kind 'unused', so that every accepted sample is in exactly one window, in order.
+    nominal, watchers
+        As for the `BlockCleaner`.
 
     """
 
-    def __init__(self, table, settings=WindowSettings(), keep_unused=False):
-        self._names = () if table is None else tuple(table.joint_names)
+    def __init__(self, table, settings=WindowSettings(), keep_unused=False, *, nominal=None, watchers=()):
+        self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)
         self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
-        self._checks = {name: StreamCheck() for name in _STREAMS}
-        self._raw = {name: [] for name in _STREAMS}
-        self._n_new = 0
-        self._queue = {name: [] for name in _STREAMS}
-        self._epoch_shift = dict.fromkeys(_STREAMS, 0)
+        self._queue = {name: [] for name in STREAMS}
+        self._epoch_shift = dict.fromkeys(STREAMS, 0)
         self._turns = _Unwrapper()
         self._floor = QuietFloor()
         self._lost_counts = {}
@@ -54,9 +50,8 @@ class MotionGatherer:
     @property
     def n_buffered(self):
         """Samples held at the moment; stays bounded however long the session."""
-        waiting = sum(len(part) for name in _STREAMS for _, part in self._queue[name])
-        raw = sum(len(part) for name in _STREAMS for part in self._raw[name])
-        return raw + waiting + self._chunks.n_buffered + self._cutter.n_waiting
+        waiting = sum(len(part) for name in STREAMS for _, part in self._queue[name])
+        return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
 
     @property
     def counts(self):
@@ -67,18 +62,10 @@ class MotionGatherer:
         'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
         'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What blocks report as dropped is not in here.
         """
-        self._take_in()
-        counts = {}
-        for name in _STREAMS:
-            _add_counts(counts, {f'{name} {reason}': number for reason, number in self._checks[name].counts.items()})
+        counts = self.cleaner.counts
         for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
             _add_counts(counts, source)
         return counts
-
-    def streams(self):
-        """Return stream name -> `StreamStatistics` ('imu', 'joints', 'temperature')."""
-        self._take_in()
-        return {name: check.statistics(self._settings.gap) for name, check in self._checks.items()}
 
     def push(self, block):
         """
@@ -90,24 +77,15 @@ class MotionGatherer:
             When the joints of the block are not those of the table.
 
         """
-        for name in _STREAMS:
-            samples = getattr(block, name)
-            if samples is not None and len(samples):
-                self._raw[name].append(self._with_table_joints(samples) if name == 'joints' else samples)
-                self._n_new += len(samples)
-        if self._n_new < _BATCH:
-            return []
-        self._n_new = 0
-        self._take_in()
-        return self._work()
+        cleaned = self.cleaner.push(block)
+        self._enqueue(cleaned)
+        return self._work() if cleaned else []
 
     def finish(self):
         """Return the remaining windows; after this nothing more may be pushed."""
-        self._take_in()
-        for name in _STREAMS:
-            self._enqueue(name, self._checks[name].finish())
+        self._enqueue(self.cleaner.finish())
         windows = self._work()
-        while any(epoch > self._epoch for name in _STREAMS for epoch, _ in self._queue[name]):
+        while any(epoch > self._epoch for name in STREAMS for epoch, _ in self._queue[name]):
             windows += self._next_epoch() + self._work()
         return windows + self._end_epoch() + self._cutter.push(None, final=True)
 
@@ -128,36 +106,21 @@ class MotionGatherer:
         self._chunks.change(settings)
         self._cutter.change(settings, self._chunks.short_rest)
 
-    def _with_table_joints(self, joints):
-        if not self._names or not joints.names or tuple(joints.names) == self._names:
-            return joints
-        missing = [name for name in self._names if name not in joints.names]
-        if missing:
-            raise InputError(f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
-                             'correct the names in the table or choose another joint topic')
-        order = [joints.names.index(name) for name in self._names]
-        return JointSamples(joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names)
+    def all_of(self, blocks):
+        """Return the windows of a whole recording."""
+        return [window for block in blocks for window in self.push(block)] + self.finish()
 
-    def _take_in(self):
-        """Clean what was pushed and queue it by epoch."""
-        kinds = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
-        for name in _STREAMS:
-            if self._raw[name]:
-                blocks, self._raw[name] = self._raw[name], []
-                self._enqueue(name, self._checks[name].push(blocks[0] if len(blocks) == 1 else kinds[name].concatenate(blocks)))
-
-    def _enqueue(self, name, accepted):
-        for epoch, samples in accepted:
-            if name == 'joints':
-                samples = self._turns.unwrap(samples)
-            if len(samples):
-                self._queue[name].append((epoch + self._epoch_shift[name], samples))
+    def _enqueue(self, cleaned):
+        """Queue samples by epoch."""
+        for name in STREAMS:
+            for epoch, samples in getattr(cleaned, name):
+                self._queue[name].append((epoch + self._epoch_shift[name], self._turns.unwrap(samples) if name == 'joints' else samples))
 
     def _work(self):
         """Hand on what belongs to this epoch; go to the next one when the streams have."""
         windows = []
         while True:
-            for name in _STREAMS:
+            for name in STREAMS:
                 for epoch, part in self._queue[name]:
                     if epoch == self._epoch:  # what is left of an earlier one came after its end: a temperature, too late
                         self._chunks.add(**{name: part})
@@ -187,9 +150,9 @@ class MotionGatherer:
         """Let streams whose clock was not set back go on in the new epoch: one clock moved, the others did not."""
         if not self._queue['joints']:
             self._chunks.add(joints=old.joints_left())
-        for name in _STREAMS:
+        for name in STREAMS:
             if not self._queue[name]:
-                self._epoch_shift[name] = self._epoch - self._checks[name].epoch
+                self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
 
     def _forget_temperature(self):
         """Bound the temperatures that wait for an epoch which the other streams do not begin."""

@@ -42,9 +42,10 @@ def open_bag(path: str | PathLike, topics: Topics, *, want_joints: bool | str = 
     return open_recording(existing(path), *topics, want_joints=want_joints, want_temperature=want_temperature)
 
 
-def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, want_joints: bool, quiet: bool) -> Iterator[SampleBlock]:
+def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, want_joints: bool | str, want_temperature: bool | str,
+                quiet: bool) -> Iterator[SampleBlock]:
     """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
-    recording = open_recording(path, *topics, want_joints=want_joints)
+    recording = open_recording(path, *topics, want_joints=want_joints, want_temperature=want_temperature)
     total = 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)
     with recording, progress_bar(Path(path).name, total) as advance:
         with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
@@ -57,11 +58,15 @@ def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, wa
 
 
 def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics(), joint_names: Iterable[str] | None = None, *,
-              want_joints: bool = True, quiet: bool = False) -> Source:
-    """Return a callable that yields the blocks of a recording, each time anew; samples in memory are a recording of one block."""
+              want_joints: bool | str = True, want_temperature: bool | str = True, quiet: bool = False) -> Source:
+    """
+    Return a callable that yields the blocks of a recording, each time anew; samples in memory are a recording of one block.
+
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`.
+    """
     if isinstance(recording, SampleBlock):
         return partial(iter, (recording if want_joints else SampleBlock(recording.imu, None, recording.temperature),))
-    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints, quiet)
+    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints, want_temperature, quiet)
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:

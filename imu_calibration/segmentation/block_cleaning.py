@@ -1,0 +1,147 @@
+"""Blocks of a recording or of live topics, cleaned once for everybody who looks at them: checks, windows, statistics of the streams."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStatistics
+
+STREAMS = ('imu', 'joints', 'temperature')
+BATCH = 200
+"""Samples that are cleaned together: cleaning has a fixed cost per call."""
+_KINDS = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedBlock:
+    """What is usable of one or several blocks: per stream (epoch of the clock, samples), ... in order."""
+
+    imu: Sequence[tuple[int, ImuSamples]] = ()
+    """SI."""
+    joints: Sequence[tuple[int, JointSamples]] = ()
+    """In the order of names that was asked for."""
+    temperature: Sequence[tuple[int, TemperatureSamples]] = ()
+    """Degrees Celsius."""
+
+    def __bool__(self) -> bool:
+        return bool(self.imu or self.joints or self.temperature)
+
+
+class Watcher(Protocol):
+    """Somebody who looks at a stream of cleaned blocks."""
+
+    def push(self, cleaned: CleanedBlock) -> object:
+        """Take what follows."""
+
+    def finish(self, cleaner: 'BlockCleaner') -> object:
+        """Take note that the streams are over; may raise when they cannot be used."""
+
+
+class BlockCleaner:
+    """
+    Brings the streams of a session to SI and one order of joints, and drops what cannot be used (see `StreamCheck`).
+
+    Parameters
+    ----------
+    joint_names : sequence of str
+        Order of the joints; without it they stay as they come.
+    nominal : NominalScaling, optional
+        For recordings in volts or counts.
+    watchers : sequence of Watcher
+        Who sees each cleaned block as well.
+
+    """
+
+    def __init__(self, joint_names: Sequence[str] = (), nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
+        self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
+        self._checks = {name: StreamCheck() for name in STREAMS}
+        self._raw, self._ready = ({name: [] for name in STREAMS} for _ in range(2))
+        self.lost: dict[str, int] = {}
+        """Messages that could not be turned into samples: reason -> count."""
+
+    @property
+    def n_buffered(self) -> int:
+        """Samples held at the moment."""
+        return sum(len(part) for parts in self._raw.values() for part in parts) + sum(len(part) for parts in self._ready.values() for _, part in parts)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return what was dropped of which stream: 'imu not finite', 'joints repeated stamp', ... -> number of samples."""
+        self._clean()
+        return {f'{name} {reason}': count for name, check in self._checks.items() for reason, count in check.counts.items()}
+
+    def epoch(self, stream: str) -> int:
+        """Return how often the clock of a stream was set anew."""
+        return self._checks[stream].epoch
+
+    def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
+        """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
+        self._clean()
+        return {name: check.statistics(gap) for name, check in self._checks.items()}
+
+    def push(self, block: SampleBlock) -> CleanedBlock:
+        """
+        Take a block and return what is usable by now; of small blocks nothing before `BATCH` samples came.
+
+        Raises
+        ------
+        InputError
+            When the joints of the block are not those that were asked for.
+
+        """
+        for reason, count in (block.dropped or {}).items():
+            self.lost[reason] = self.lost.get(reason, 0) + count
+        for name in STREAMS:
+            samples = getattr(block, name)
+            if samples is not None and len(samples):
+                self._raw[name].append(self._in_our_terms(name, samples))
+        if self.n_buffered < BATCH:
+            return CleanedBlock()
+        self._clean()
+        return self._hand_on()
+
+    def finish(self) -> CleanedBlock:
+        """Return what was held; after this nothing more may be pushed."""
+        self._clean()
+        for name, check in self._checks.items():
+            self._ready[name] += check.finish()
+        cleaned = self._hand_on()
+        for watcher in self._watchers:
+            watcher.finish(self)
+        return cleaned
+
+    def all_of(self, blocks: Iterable[SampleBlock]) -> Iterator[CleanedBlock]:
+        """Yield what is usable of a whole recording."""
+        for block in blocks:
+            yield self.push(block)
+        yield self.finish()
+
+    def _clean(self) -> None:
+        for name, parts in self._raw.items():
+            if parts:
+                self._ready[name] += self._checks[name].push(parts[0] if len(parts) == 1 else _KINDS[name].concatenate(parts))
+                self._raw[name] = []
+
+    def _hand_on(self):
+        cleaned = CleanedBlock(**{name: [(epoch, part) for epoch, part in parts if len(part)] for name, parts in self._ready.items()})
+        self._ready = {name: [] for name in STREAMS}
+        for watcher in self._watchers:
+            watcher.push(cleaned)
+        return cleaned
+
+    def _in_our_terms(self, name, samples):
+        if name == 'joints':
+            return self._in_order(samples)
+        return samples if name != 'imu' or self._nominal is None else self._nominal.apply(samples)
+
+    def _in_order(self, joints):
+        if not self._names or not joints.names or tuple(joints.names) == self._names:
+            return joints
+        missing = [name for name in self._names if name not in joints.names]
+        if missing:
+            raise InputError(f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
+                             'correct the names in the table or choose another joint topic')
+        order = [joints.names.index(name) for name in self._names]
+        return JointSamples(joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names)

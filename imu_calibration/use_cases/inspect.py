@@ -1,0 +1,83 @@
+"""Inspect: what the topics of a recording hold, what looks wrong with them, and what they can determine; each is read through once."""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from os import PathLike
+
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.preflight.checks import Preflight, unusable
+from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from imu_calibration.segmentation.stream_cleaning import StreamStatistics
+from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
+from msg_adapters.bag import Recording, imu_topics, list_topics
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one Imu topic of a recording is like, with the joints and temperatures that go with it."""
+
+    recording: Recording
+    """The recording, closed again."""
+    streams: dict[str, StreamStatistics]
+    """'imu', 'joints' or 'temperature' -> what its stamps are like."""
+    findings: tuple[CheckFinding, ...]
+    """What looks wrong."""
+    lost: dict[str, int]
+    """Reason -> messages that could not be read."""
+    calibrated: TableResult | ImuCalibrationError | None
+    """What the motions determine, or why nothing; None without a table."""
+
+    @property
+    def refused(self) -> bool:
+        """Whether a finding says that a calibration would be wrong."""
+        return any(finding.severity == REFUSE for finding in self.findings)
+
+    @property
+    def exit_code(self) -> int:
+        """0, or 3 where something is lost, unusable or refused."""
+        dropped = any(stream.dropped for stream in self.streams.values())
+        return 3 if self.refused or self.lost or dropped or unusable(self.findings) else 0
+
+
+def imu_topics_of(bag: PathLike, topics: Topics) -> list[Topics]:
+    """Return the topics with the Imu topic that was asked for, or with each one that the recording has."""
+    names = [topics.imu] if topics.imu is not None else imu_topics(list_topics(bag)) or [None]
+    return [topics._replace(imu=name) for name in names]
+
+
+def inspect(bag: PathLike, topics: Iterable[Topics], table: Table | None, options: CalibrationOptions) -> list[Look]:
+    """Look at each Imu topic of a recording, with the joints and temperatures that go with it."""
+    return [_look(bag, each, table, options) for each in topics]
+
+
+def _look(bag, topics, table, options):
+    recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
+    recording.close()
+    preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
+    if table is not None:
+        try:
+            calibrated = calibrate([source_of(bag, topics, table.joint_names)], table, options, mapper=_watched_by(preflight))
+        except ImuCalibrationError as error:
+            calibrated = error
+    if preflight.streams is None:   # not read to its end: nothing to calibrate from
+        preflight = Preflight(table and table.gravity_value, strict=False)
+        source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
+        deque(BlockCleaner(nominal=options.nominal, watchers=[preflight]).all_of(source()), maxlen=0)
+    return Look(recording, preflight.streams, preflight.findings, preflight.lost, calibrated)
+
+
+def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[Gathered]]:
+    """Return the map step of one recording that shows it to the checks, when it is read for the first time."""
+    def mapper(step, numbered):
+        if preflight.streams is not None:
+            return map(step, numbered)
+        return [step.read(source(), session, preflight) for session, source in numbered]
+    return mapper
