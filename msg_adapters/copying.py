@@ -1,6 +1,7 @@
 """A copy of a recording with a corrected Imu topic beside the others; everything else stays as it is, to the last bit."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -83,7 +84,7 @@ def _check(recording, corrected_topic):
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):
     """Write one stretch, every corrected message behind the measured one."""
     messages = [raw.packed.view(k) for k in range(len(raw.packed))]
-    done, corrected = patch(raw.packed.select(measured)) if len(measured) else (measured, [])
+    done, corrected = patch(raw.packed.select(measured), raw.received_ns[measured]) if len(measured) else (measured, [])
     measured = measured[done]
     order = np.argsort(np.concatenate([np.arange(len(messages)), measured]), kind='stable').tolist()
     topic_ids = np.concatenate([topic_ids, np.full(len(measured), corrected_id)])
@@ -100,8 +101,8 @@ class _Patch:
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
 
-    def __call__(self, packed):
-        """Return (index of the messages that could be corrected, their corrected messages)."""
+    def __call__(self, packed, received_ns):
+        """Return (index of the messages that could be corrected, their corrected messages); a zero stamp counts as the time of arrival."""
         groups, rest = group_by_layout(packed, find_imu_layout)
         for k in rest:
             try:
@@ -111,7 +112,8 @@ class _Patch:
         if not groups:
             return np.zeros(0, dtype=int), []
         done = np.sort(np.concatenate([index for _, index, _ in groups]))
-        corrected = self.correct(in_order([(index, decode_imu(layout, group)) for layout, index, group in groups]))
+        samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
+        corrected = self.correct(replace(samples, stamp_ns=np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)))
         messages = [None] * len(done)
         for layout, index, group in groups:
             place = np.searchsorted(done, index)

@@ -141,7 +141,7 @@ def test_a_stream_may_be_cut_anywhere_and_follows_the_truth():
     parts = [cut.correct(imu.select(slice(a, b))) for a, b in ((0, 1000), (1000, 1001), (1001, 4000))]
     np.testing.assert_allclose(np.concatenate([p.force for p in parts]), at_once.force, atol=1e-11)
     # The derivative is late by its delay: alpha changes by up to 5 rad/s^3 and the arms are 20 mm.
-    late = 5.0 * whole.derivative.delay * 0.05 + 1e-3
+    late = 5.0 * whole.slope.derivative.delay * 0.05 + 1e-3
     assert np.abs(at_once.force - force)[50:].max() < late
     np.testing.assert_allclose(at_once.rate, rate, atol=1e-11)
     assert whole.warnings() == []

@@ -74,6 +74,10 @@ EARLY, LATE = 0.5, 1.5
 """A step between these many periods is a regular one."""
 
 
+WHOLE, MANY = 0.25, 3.5
+"""A longer step is a hole where it is within this share of a whole number of periods, or longer than so many of them."""
+
+
 WARM_UP = 16
 """Steps from which the period is found."""
 
@@ -83,7 +87,7 @@ class StampedDerivative:
     Slope of a straight line through the last samples of a vector, updated one sample or one block at a time.
 
     The samples count as equally spaced, as those of a sensor with a clock of its own are, whatever the jitter of their stamps; the
-    stamps say where some are missing. A hole shorter than the window is bridged by a straight line; after a longer one, or when
+    stamps say where some are missing: where a step is about a whole number of periods, else a stamp was late. A hole shorter than the window is bridged by a straight line; after a longer one, or when
     the clock is set back by more than a second, the window starts anew. A sample that is doubled or came late does not enter the
     window and gets the derivative of the newest one. While the window is less than half full the derivative is zero.
 
@@ -115,9 +119,10 @@ class StampedDerivative:
         if self._newest is not None:
             step = (stamp_ns - self._newest) / self._period_ns
             if not EARLY < step <= LATE:
-                if step <= EARLY and stamp_ns - self._newest > -RESET_NS:
+                if step <= 0 and stamp_ns - self._newest > -RESET_NS:
                     return self.alpha
-                self._hole(step, x, y, z)
+                if step <= 0 or (step > LATE and abs(step - round(step)) <= WHOLE) or step > MANY:
+                    self._hole(step, x, y, z)
         self._newest = stamp_ns
         self._add(x, y, z)
         n = len(self._window)
@@ -158,6 +163,10 @@ class StampedDerivative:
         for k in range(1, missing + 1):
             part = k / (missing + 1)
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
+
+    def rebase(self, stamp_ns):
+        """Count the newest sample as taken at another time."""
+        self._newest = stamp_ns
 
     def seed(self, other):
         """Take over the past of another derivative of the same stream, as far as this window reaches."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.compensation.kernel import make_kernel
+from imu_calibration.compensation.rate_slope import SlopeError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import columns_at_point
 from imu_calibration.effects.forward_equations import coefficients_at_point
@@ -13,6 +14,11 @@ from imu_calibration.reference.reference_motion import Reference
 
 STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 """Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
+
+
+def is_known(covariance):
+    """Return whether a covariance from a message says something: finite, variances not negative, not all zero."""
+    return bool(np.all(np.isfinite(covariance)) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,20 +38,22 @@ class Sensitivity:
     """Weight of the newest reading in the derivative, 1/s."""
     earlier: float
     """Sum of the squared weights of the earlier readings, 1/s^2."""
+    slope_error: SlopeError
+    """How far the derivative is off at the present motion."""
 
     def covariances(self, force_cov, rate_cov, with_parameters=True):
         """
         Return the covariances of corrected (force, rate), each shape (3, 3).
 
-        ``A N_f A' + (B + w C) N_w (B + w C)' + v C N_w C'`` with A, B, C the gains by force, rate and derivative, w the newest
-        weight and v the earlier ones; plus the parameters' share.
+        ``A N_f A' + (B + w C) N_w (B + w C)' + v C N_w C' + C E C'`` with A, B, C the gains by force, rate and derivative, w the newest
+        weight, v the earlier ones, and E the covariance of the derivative's error (its delay); plus the parameters' share.
         """
-        results = []
+        results, error_cov = [], self.slope_error.covariance(rate_cov)
         for k in (0, 3):
             by_force, by_rate, by_derivative = (self.gain[k:k + 3, j:j + 3] for j in (0, 3, 6))
             now = by_rate + self.newest * by_derivative
             total = by_force @ force_cov @ by_force.T + now @ rate_cov @ now.T
-            total = total + self.earlier * (by_derivative @ rate_cov @ by_derivative.T)
+            total = total + by_derivative @ (self.earlier * rate_cov + error_cov) @ by_derivative.T
             results.append(total + self.parameters[k:k + 3, k:k + 3] if with_parameters else total)
         return tuple(results)
 
@@ -71,16 +79,20 @@ class Uncertainty:
         index = np.concatenate(index)
         self._covariance = calibration.covariance[np.ix_(index, index)]
         self._slopes = [self._coefficient_slopes(sensor) for sensor in SENSORS]
+        self.use(derivative)
+        self.noise = tuple(np.diag(calibration.noise(sensor)[0]**2) for sensor in SENSORS)
+
+    def use(self, derivative):
+        """Take the angular acceleration from another CausalDerivative, or from none."""
         weights = np.zeros(1) if derivative is None else derivative.weights
         self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
-        self.noise = tuple(np.diag(calibration.noise(sensor)[0]**2) for sensor in SENSORS)
 
     def _coefficient_slopes(self, sensor):
         """Return d(coefficients) / d(parameters), shape (n_params, n_columns, 3), by complex steps."""
         steps = 1e-30j * np.eye(len(self._values))
         return np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
 
-    def at(self, force=(0.0, 0.0, 9.8), rate=(0.0, 0.0, 0.0), derivative=(0.0, 0.0, 0.0), dt=0.0):
+    def at(self, force=(0.0, 0.0, 9.8), rate=(0.0, 0.0, 0.0), derivative=(0.0, 0.0, 0.0), dt=0.0, slope_error=None):
         """
         Return the Sensitivity at a measured sample.
 
@@ -90,6 +102,8 @@ class Uncertainty:
             Measured specific force, rate, and derivative of the rate.
         dt : float
             Temperature above the calibration's reference temperature, K.
+        slope_error : rate_slope.SlopeError, optional
+            How far the derivative is off; None: only by the noise.
 
         """
         sample = np.concatenate([force, rate, derivative])
@@ -97,7 +111,7 @@ class Uncertainty:
         true = self._inside(*sample.tolist(), dt)
         jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], dt)
         jacobian = gain[:, :6] @ jacobian
-        return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier)
+        return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier, slope_error or SlopeError())
 
     def _slope(self, sample, step, dt):
         above, below = self._kernel(*(sample + step).tolist(), dt), self._kernel(*(sample - step).tolist(), dt)

@@ -1,12 +1,16 @@
 """Compensation of a stream of blocks: the state that has to go from one block to the next, and what is noticed on the way."""
 
+from functools import partial
+
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import StampedDerivative, choose_derivative, typical_period
+from imu_calibration.compensation.angular_acceleration import choose_derivative, typical_period
 from imu_calibration.compensation.compensate import Transfer, arms_of, compensate, invertible, outside_conditions
-from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.compensation.covariance import Uncertainty, is_known
+from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
+from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic that ends like this is refused: nobody should correct twice."""
@@ -19,8 +23,6 @@ class CompensationStream:
     Parameters
     ----------
     calibration : Calibration
-    period : float, optional
-        Sampling period, s; default the median step of the first block.
     temperature : TemperatureSamples, optional
         For calibrations with thermal effects.
     transfer : Transfer, optional
@@ -28,12 +30,13 @@ class CompensationStream:
 
     """
 
-    def __init__(self, calibration, period=None, temperature=None, transfer=None):
+    def __init__(self, calibration, temperature=None, transfer=None):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
         if invertible(calibration.model).needs_temperature and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
-        self.period, self.derivative = period, None
         self.count, self.flagged, self.frame_id = 0, 0, ''
+        self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
+        self._uncertainty = Uncertainty(calibration, transfer)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
         self._fastest, self._temperatures, self._last = 0.0, [], ()
 
@@ -43,11 +46,13 @@ class CompensationStream:
 
         What is NaN, absent in the message or broken, stays NaN and leaves its neighbours and the other sensor alone.
         """
-        self._settle(imu)
+        if self.slope.line is None and len(imu):
+            first = imu.stamp_ns[:10_000]
+            self.slope.settle(describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
         temperature = self._temperature_at(imu.stamp_ns)
         finite = np.isfinite(imu.rate_s).all(axis=1)
         slope = np.zeros_like(imu.rate_s)
-        slope[finite] = self._tracker.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
+        slope[finite] = self.slope.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
         force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
                            for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
         corrected = compensate(self.calibration, force_s, rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
@@ -59,15 +64,6 @@ class CompensationStream:
             self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
         self._remember(imu, slope, temperature)
         return corrected
-
-    def _settle(self, imu):
-        if self.derivative is not None:
-            return
-        if self.period is None:
-            self.period = typical_period(imu.stamp_ns[:10_000]) or 0.01
-        self.derivative = derivative_for(self.calibration, self.period, self.transfer)
-        self._tracker = StampedDerivative(self.derivative)
-        self._uncertainty = Uncertainty(self.calibration, self.transfer, self.derivative)
 
     def _remember(self, imu, slope, temperature):
         usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
@@ -93,12 +89,12 @@ class CompensationStream:
         Parameters
         ----------
         force_cov, rate_cov : ndarray or None
-            Those of the measured ones, shape (3, 3); None: unknown, the calibration's noise is taken.
+            Those of the measured ones, shape (3, 3); zero, no covariances at all or None: the calibration's noise is taken.
 
         """
-        noise = self._uncertainty.noise
-        known = [n if c is None else c for c, n in zip((force_cov, rate_cov), noise)]
-        return self._uncertainty.at(*self._last).covariances(*known)
+        known = [c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
+        self._uncertainty.use(self.slope.derivative)
+        return self._uncertainty.at(*self._last, slope_error=self.slope.error()).covariances(*known)
 
     def warnings(self):
         """Return lines about what was outside the calibration's conditions or could not be corrected."""
@@ -107,6 +103,8 @@ class CompensationStream:
         if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
             lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
                          'make sure that it is the same sensor')
+        if self.slope.n_without and uses_slope(self.calibration, self.transfer):
+            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples follow no clock{WITHOUT}')
         if self.flagged:
             lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
         return lines
@@ -119,6 +117,11 @@ def derivative_for(calibration, period, transfer=None):
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
     (force_sd, _), (rate_sd, _) = (calibration.noise(sensor) for sensor in ('accelerometer', 'gyroscope'))
     return choose_derivative(period, float(rate_sd.max()), arm, float(force_sd.min()))
+
+
+def uses_slope(calibration, transfer=None):
+    """Return whether the angular acceleration enters what is corrected: there is a lever arm."""
+    return bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
 
 
 def refuse_corrected(topic):

@@ -9,17 +9,21 @@ from imu_calibration.calibration import trust
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.segmentation.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
 """Beginnings of the reasons for which a stream as a whole cannot be corrected."""
 QUIET = 2.0
 """Seconds without a message after which diagnostics say so."""
+ANOTHER_RATE = 0.1
+"""Relative change of the period from which the stamps are worth another line."""
 COLD = 10.0
 """Seconds without a temperature after which diagnostics say so; drivers send one per second."""
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
-         'covariance not finite': "covariances are not finite: the calibration's noise takes their place",
+         'covariance not finite': "covariances that came are none (not finite, or a variance below zero): the calibration's noise takes their place",
+         'zero stamp': 'the driver sets no stamps, they are zero: the time of arrival stands for them where the angular acceleration is formed',
          'beyond what can be undone': 'readings are too large for the non-linear effects to be undone: these messages are not published'}
 
 
@@ -28,7 +32,7 @@ class CompensatorDiagnostics:
 
     def __init__(self, node):
         self._node, self._counts = node, {}
-        self._received, self._last_change, self._told_source = 0, monotonic(), ''
+        self._received, self._last_change, self._told_source, self._told_stamps = 0, monotonic(), '', None
         self._temperature, self._temperature_at, self._nan_temperatures = None, monotonic(), 0
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
@@ -66,7 +70,16 @@ class CompensatorDiagnostics:
             if source != self._told_source and node.imu.publishers:
                 self._told_source = source
                 node.get_logger().info(f'Imu messages come on {source}')
+        self._tell_stamps(compensation)
         return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
+
+    def _tell_stamps(self, compensation):
+        """Say once how stamps are that are not simply regular; a rate that changes is another line."""
+        line = None if compensation is None else compensation.slope.line
+        if line is not None and (told := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
+            if line.word == COUNTED or self._told_stamps is not None:
+                self._node.get_logger().info(str(line))
+            self._told_stamps = told
 
     def _lines(self, compensation):
         """Return (what prevents correction, what should be known), one line each."""
@@ -81,7 +94,7 @@ class CompensatorDiagnostics:
         notes = []
         for reason, count in self._new_counts(compensation).items():
             (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, compensation))
-        return serious, notes + self._outside(compensation) + self._warmth(compensation)
+        return serious, notes + [compensation.slope.doubt] * bool(compensation.slope.doubt) + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
         """Return the reasons of which there is more than at any call before: a calibration that is about to take over has counted nothing."""
@@ -126,9 +139,9 @@ class CompensatorDiagnostics:
         values |= {'verdict': calibration.verdict or 'none', 'standing': trust.standing(calibration), 'date': calibration.conditions.get('date', ''),
                    'parameters': len(calibration.status), 'not determined': sum(status != DETERMINED for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}
-        if compensation.period is not None:
-            values['period [s]'] = f'{compensation.period:.6g}'
-        derivative = compensation.derivative
+        line, derivative = compensation.slope.line, compensation.slope.derivative
+        if line is not None:
+            values |= {'stamps': str(line), 'period [s]': f'{1e-9 * line.period_ns:.6g}'}
         if derivative is not None:
             noise = derivative.noise_sd(float(calibration.noise('gyroscope')[0].max()))
             values |= {'derivative window [samples]': derivative.taps, 'derivative delay [s]': f'{derivative.delay:.4g}',

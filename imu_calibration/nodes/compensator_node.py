@@ -24,7 +24,7 @@ from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
+from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
@@ -94,7 +94,7 @@ class CompensatorNode(Node):
             self.uncorrected += 1
             return data if self.settings.passthrough and current is None and not self.corrected_already else None
         try:
-            return current(data)
+            return current(data, sent_ns(information))
         except Exception as error:   # a message that nobody foresaw must not end the stream
             current.counts[shortened(f'failed with {type(error).__name__}: {error}', 100)] += 1
             return None

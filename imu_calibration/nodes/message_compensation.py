@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_calibration.compensation.covariance import is_known
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import late_ns
 from msg_adapters.imu_stream import ImuStream
@@ -36,7 +37,7 @@ class LiveCompensation(SampleCompensation):
         self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
         self._message = ImuStream(transfer and transfer.frame_id, late_ns(calibration, correct_stamps))
         self._taken, self._rate_cov, self._force_cov = -1, b'', b''
-        self._no_rate = self._no_force = self._absent = False
+        self._no_rate = self._no_force = self._absent = self._odd = False
         self._orientation_in, self._orientation_out, self._no_orientation = None, b'', False
         self._can_saturate = any(np.isfinite(self.levels))
 
@@ -45,8 +46,17 @@ class LiveCompensation(SampleCompensation):
         super().follow(before)
         self.received = before.received
 
-    def __call__(self, data):
-        """Return the corrected message as bytes, or None when there is nothing to publish; `counts` says why."""
+    def __call__(self, data, sent_ns=0):
+        """
+        Return the corrected message as bytes, or None when there is nothing to publish; `counts` says why.
+
+        Parameters
+        ----------
+        data : bytes
+        sent_ns : int
+            When it was sent or received, which stands for the stamp where a driver sets none.
+
+        """
         self.received += 1
         message = self._message
         taken = message.take(data) if self._taken == self.revision else None
@@ -58,9 +68,13 @@ class LiveCompensation(SampleCompensation):
         stamp_ns, readings = taken
         if self._absent:
             readings = self._mixed(self.at_zero['gyroscope'] + self.at_zero['accelerometer'], readings)   # does not disturb the other sensor
-        corrected = self.correct(stamp_ns, *readings)
+        if not stamp_ns:
+            self.counts['zero stamp'] += 1
+        corrected = self.correct(stamp_ns or sent_ns, *readings)
         if corrected is None:
             return None
+        if self._odd:
+            self.counts['covariance not finite'] += 1
         covariances = self._rate_cov, self._force_cov
         if self._can_saturate:
             covariances = self._marked(readings)
@@ -89,6 +103,7 @@ class LiveCompensation(SampleCompensation):
         given = self._message.covariances(data)
         self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT) for cov in given]
         self._absent = any(absent)
+        self._odd = any(np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent))
         found = self.covariances(*(None if missing else cov for cov, missing in zip(given, absent)))
         self._force_cov, self._rate_cov = (self._message.packed(cov if missing else new) for cov, new, missing in zip(given, found, absent))
 

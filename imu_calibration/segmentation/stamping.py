@@ -101,7 +101,9 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     apart = (stamp_ns[LAG:] - stamp_ns[:-LAG]).astype(float)
     apart = apart[np.abs(apart - LAG * period) <= PAUSE_NS]
     if period > 0 and len(apart) and apart.var() <= DRIFTING * step.var():
-        return _line(stamp_ns, step, apart / LAG, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
+        line = _line(stamp_ns, step, apart / LAG, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
+        if line.period_ns >= 1.0:
+            return line
     # Where more than half of the samples are lost the usual step is two periods.
     return _regular(in_order, float(np.quantile(in_order, 0.1))) or StampLine(IRREGULAR, max(period, 1.0))
 
@@ -109,7 +111,10 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
 def _regular(step: np.ndarray, usual: float) -> StampLine | None:
     if usual <= 0 or regular_share(step, usual) < 1 - IRREGULAR_SHARE:
         return None
-    return StampLine(REGULAR, float(step[(step > EARLY * usual) & (step <= LATE * usual)].mean()))
+    number = np.rint(step / usual)
+    number[(step <= LATE * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE))] = 1.0   # late, and the next is the earlier
+    used = (step > 0) & (number <= MOST_LOST)
+    return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
 
 
 def regular_share(step: np.ndarray, period: float) -> float:

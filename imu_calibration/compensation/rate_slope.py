@@ -1,0 +1,246 @@
+"""The derivative of the measured rate, whatever the stamps are: by the stamps, by counting, or not at all; and how far it may be off."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.compensation.angular_acceleration import EARLY, LATE, CausalDerivative, StampedDerivative
+from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
+
+BLOCK = LAG
+"""The stamps are looked at again after so many samples."""
+HISTORY = 4 * LAG + 1
+"""Stamps from which counted and irregular ones are told apart."""
+CHANGED = {REGULAR: 0.02, COUNTED: 0.05}
+"""A period that differs by more than this share is another one; counting tells it less well."""
+RECENT = 1.0, 64, 2048
+"""Seconds, least and most samples from whose motion the error of the derivative is taken."""
+ROUGH = 0.02
+"""Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
+NO_SLOPE = (0.0, 0.0, 0.0)
+WITHOUT = ': the angular acceleration cannot be told, the effect of the lever arm stays uncorrected and the covariance has its size'
+"""Behind how the stamps are, where nothing can be made of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeError:
+    """How far the derivative in use is off the true one at the present motion, beside the noise that it passes on."""
+
+    moment: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Mean of error times error, noise of the rate included, (rad/s^2)^2, shape (3, 3)."""
+    noise_gain: float = 0.0
+    """That noise is this times the covariance of the rate, 1/s^2."""
+
+    def covariance(self, rate_cov: np.ndarray) -> np.ndarray:
+        """Return the covariance of the error without the noise, not negative in any direction, shape (3, 3)."""
+        sizes, directions = np.linalg.eigh(self.moment - self.noise_gain * rate_cov)
+        return (directions * np.maximum(sizes, 0.0)) @ directions.T
+
+
+class RateSlope:
+    """
+    Derivative of the rate of a stream, one sample or one block at a time; the outcome does not depend on how the stream is cut.
+
+    Regular stamps say where samples are missing. Where they follow a clock only loosely (packets, times of arrival, whole milliseconds) the
+    samples are counted, and a pause longer than their scatter starts the window anew. Where they follow none there is no derivative: it is
+    zero and `error` has the size of what is left out. The stamps are looked at again every `BLOCK` samples.
+
+    Parameters
+    ----------
+    choose : callable
+        Returns the CausalDerivative for a period in s.
+    changed : callable
+        Called when another derivative is in use, or none.
+
+    """
+
+    def __init__(self, choose: Callable[[float], CausalDerivative], changed: Callable[[], None] = lambda: None):
+        self._choose, self._changed = choose, changed
+        self.line: StampLine | None = None
+        """How the stamps are; None while they are too few to tell."""
+        self.derivative: CausalDerivative | None = None
+        """What is in use; None: nothing."""
+        self._tracker: StampedDerivative | None = None
+        self._stamps: deque[int] = deque(maxlen=HISTORY)
+        self._due = LEAST + 1
+        self._newest, self._reading, self._slope = None, NO_SLOPE, NO_SLOPE
+        self._count, self._longest_ns, self._young = 0, 0.0, True
+        self._recent: deque[tuple] = deque(maxlen=RECENT[1])
+        self._all_of_it: SlopeError | None = None
+        self.n_without = 0
+        """Samples without a derivative because their stamps follow no clock."""
+
+    @property
+    def doubt(self) -> str:
+        """Why there is no derivative; '' when there is one, or that is not known yet."""
+        return f'{self.line}{WITHOUT}' if self.line is not None and self.line.word == IRREGULAR else ''
+
+    def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
+        """Return the derivative (x, y, z) after one more sample, per second."""
+        if stamp_ns == self._newest and (x, y, z) == self._reading:   # the same message again
+            return self._slope
+        step_ns = 0 if self._newest is None else stamp_ns - self._newest
+        self._newest, self._reading = stamp_ns, (x, y, z)
+        self._stamps.append(stamp_ns)
+        self._due -= 1
+        if not self._due:
+            self._review()
+        if self._tracker is None:
+            self.n_without += self.line is not None
+            self._recent.append((x, y, z))
+            return NO_SLOPE
+        if self._longest_ns:
+            stamp_ns = self._counted(step_ns)
+        self._slope = slope = self._tracker.push(stamp_ns, x, y, z)
+        self._recent.append(slope)
+        return slope
+
+    def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
+        out, start = np.empty(values.shape), 0
+        while start < len(values):
+            stop = self._usual_until(stamp_ns, values, start)
+            if stop > start:
+                out[start:stop] = self._tracker.push_block(stamp_ns[start:stop], values[start:stop])
+                self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop])
+            if stop < len(values):
+                out[stop] = self.push(int(stamp_ns[stop]), *values[stop].tolist())
+            start = stop + 1
+        return out
+
+    def settle(self, line: StampLine) -> None:
+        """Use from now on what suits stamps of that kind; while the period stays, so does what the window holds."""
+        self.line = line
+        self._longest_ns = line.high_ns - line.low_ns + LATE * line.period_ns if line.word == COUNTED else 0.0
+        if self._tracker is not None and self._suits(line):
+            self._tracker.rebase(round(self._count * 1e9 * self._tracker.period) if self._longest_ns else self._stamps[-2])
+            return
+        self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
+        self.derivative = self._tracker = None
+        if line.word != IRREGULAR:
+            self.derivative = self._choose(line.period_ns * 1e-9)
+            self._tracker = StampedDerivative(self.derivative)
+        seconds, least, most = RECENT
+        self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
+        self._slope, self._young = NO_SLOPE, True
+        self._changed()
+
+    def _suits(self, line: StampLine) -> bool:
+        """Return whether what is in use suits stamps of that kind."""
+        if self._tracker is None or line.word == IRREGULAR:
+            return self._tracker is None and line.word == IRREGULAR
+        return abs(1e-9 * line.period_ns / self._tracker.period - 1) <= CHANGED[line.word]
+
+    def prepare(self, before: 'RateSlope') -> None:
+        """Settle for the stamps of another one, with the motion that it has seen."""
+        if before.line is not None:
+            self.settle(before.line)
+            self._recent.extend(list(before._recent))
+
+    def follow(self, before: 'RateSlope') -> None:
+        """Go on where another one stops, after `prepare`."""
+        self._stamps, self._due, self._newest, self._reading, self._count = before._stamps, before._due, before._newest, before._reading, before._count
+        if self._tracker is not None and before._tracker is not None:
+            self._tracker.seed(before._tracker)
+
+    def error(self) -> SlopeError:
+        """
+        Return how far the derivative has lately been off.
+
+        A derivative that is `delay` late is off by what the true one changed in that time, which the estimates tell a delay later:
+        ``alpha(t + delay) - alpha(t)``. Without one it is off by all of it: the rate over `ROUGH` seconds tells how much. Behind a change
+        of the stamps, until there is new motion, it counts as off by all of it too.
+        """
+        recent = np.array(list(self._recent)).reshape(-1, 3)
+        if len(recent) < LEAST and self._all_of_it is not None:
+            return self._all_of_it
+        if self.derivative is None:
+            return self._size_of_all(recent)
+        late = (self.derivative.taps - 1) / 2
+        lag = max(round(late + 0.01), 1)
+        if len(recent) <= lag + 1:
+            return SlopeError()
+        share, weights = (late / lag)**2, self.derivative.weights
+        apart = np.convolve(weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
+        return SlopeError(share * _moment(recent[lag:] - recent[:-lag]), share * float(apart @ apart))
+
+    def _size_of_all(self, rates: np.ndarray) -> SlopeError:
+        """Return how large the derivative is, from rates, or from what a derivative in use has given."""
+        if self.derivative is not None and len(rates):
+            return SlopeError(_moment(rates), float(self.derivative.weights @ self.derivative.weights))
+        period = _mean_step(list(self._stamps)[-len(rates):])
+        if len(rates) < 3 or not period:
+            return SlopeError()
+        lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
+        return SlopeError(_moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period)**2)
+
+    def _counted(self, step_ns: int) -> int:
+        """Return the time of the newest sample by counting; behind a pause that hides how many were lost the window starts anew."""
+        self._count += 1 if 0 <= step_ns <= self._longest_ns else self.derivative.taps + 1
+        return round(self._count * 1e9 * self._tracker.period)
+
+    def _review(self) -> None:
+        """Look at the latest stamps again; after the first motion by new ones, say how far the derivative is off."""
+        if self.line is not None and self._young:
+            self._young = False
+            self._changed()
+        stamps = np.array(self._stamps, np.int64)
+        if self.line is None:
+            self._due = LEAST
+            line = describe_stamps(stamps)
+        else:
+            self._due = BLOCK
+            if self.line.word == REGULAR and _usual(stamps[-BLOCK - 1:], self.line.period_ns):
+                return
+            # Counted stamps may look regular for a while; regular ones are seen at once.
+            line = None if self.line.word == COUNTED else describe_stamps(stamps[-BLOCK - 1:])
+            line = line or (describe_stamps(stamps) if len(stamps) == HISTORY else None)
+        if line is None:
+            if self.line is None:
+                self._changed()   # so that what is left out meanwhile is known
+            return
+        if self.line is None or line.word != self.line.word or not self._suits(line):
+            self.settle(line)
+        self._due = BLOCK
+
+    def _usual_until(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
+        """Return up to which sample of a block nothing but the window has to move: no message came twice, the stamps are as they were."""
+        if self.line is None or self.line.word != REGULAR:
+            return start
+        before = np.array(self._stamps, np.int64)[-BLOCK:]
+        stamps = np.concatenate([before, stamp_ns[start:]])
+        step = np.diff(stamps)
+        again = np.flatnonzero(step[max(len(before) - 1, 0):] == 0)   # who counts them looks at their readings
+        stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
+        due = np.arange(self._due - 1, stop, BLOCK)
+        first = due + len(before) - BLOCK
+        unusual = first < 0
+        unusual[~unusual] = ~_usual(stamps[first[~unusual, None] + np.arange(BLOCK + 1)], self.line.period_ns)
+        return start + (int(due[unusual][0]) if unusual.any() else stop)
+
+    def _note(self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray) -> None:
+        """Remember what a block leaves behind that was worked off as a whole."""
+        self._stamps.extend(stamp_ns[-HISTORY:].tolist())
+        self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
+        self._due = (self._due - len(stamp_ns) - 1) % BLOCK + 1
+        self._recent.extend(map(tuple, slopes[-self._recent.maxlen:].tolist()))
+
+
+def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
+    """Return whether stamps, shape (..., n), are those of a clock of that period, none missing."""
+    step = np.diff(stamps, axis=-1)
+    within = np.all((step > EARLY * period_ns) & (step <= LATE * period_ns), axis=-1)
+    return within & (np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1) <= CHANGED[REGULAR])
+
+
+def _mean_step(stamps: list[int]) -> float:
+    """Return the mean step between stamps without pauses, s; 0.0 where there is none."""
+    step = np.diff(np.array(stamps, np.int64))
+    step = step[np.abs(step) <= PAUSE_NS]
+    return max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
+
+
+def _moment(rows: np.ndarray) -> np.ndarray:
+    return rows.T @ rows / len(rows)
