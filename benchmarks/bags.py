@@ -29,9 +29,9 @@ def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
     One session of `PIECE_MINUTES` is simulated; it is repeated with pauses, or cut, to the length.
     """
     table = bench_table()
-    profile = make_profile('calibration', 0, table, 60.0 * PIECE_MINUTES)
+    profile = make_profile('calibration', 0, table, duration=60.0 * PIECE_MINUTES)
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=table.joint_names)
-    imu, joints, _ = simulate(model, random_values(model), table, profile, SimulationOptions(imu_rate, joint_rate), 0)
+    imu, joints, _ = simulate(model, random_values(model), table, profile=profile, options=SimulationOptions(imu_rate, joint_rate), seed=0)
     span = int(imu.stamp_ns[-1] - imu.stamp_ns[0]) + PAUSE_NS
     repeats = range(ceil(60e9 * minutes / span))
     end = imu.stamp_ns[0] + int(60e9 * minutes)

@@ -24,7 +24,7 @@ PRINTED = {
 
 
 def readings(order='ZYX', axis='z', angles=ANGLES):
-    return avrutov.gravity_readings(avrutov.turn(order, angles, angles, angles), axis)
+    return avrutov.gravity_readings(avrutov.turn(order, [angles] * 3), axis)
 
 
 def samples():
@@ -100,10 +100,10 @@ def print_gyro_series():
 
 def print_budget():
     heading('Error budget of sample 1 (section V): 0.1 mV, level 2 arcmin, encoder 1.5 arcsec; worst sensor, mV and mV/g')
-    truth, mat_bn = avrutov.nominal_accelerometers('linear'), avrutov.turn('ZYX', ANGLES, ANGLES, ANGLES)
+    truth, mat_bn = avrutov.nominal_accelerometers('linear'), avrutov.turn('ZYX', [ANGLES] * 3)
     budget = avrutov_budget.error_budget(
-        readings(), truth, 'linear', 1e-4, {'levelling': avrutov_budget.tilt_changes(mat_bn, 'z', TILT)},
-        {'encoder': avrutov_budget.encoder_changes('ZYX', np.tile(ANGLES, (3, 1)), 'z', ENCODER)})
+        readings(), truth, 'linear', noise_sd=1e-4, common={'levelling': avrutov_budget.tilt_changes(mat_bn, 'z', TILT)},
+        scattered={'encoder': avrutov_budget.encoder_changes('ZYX', np.tile(ANGLES, (3, 1)), 'z', encoder_sd_rad=ENCODER)})
     for cause, sd in budget.items():
         print(f'{cause:14s}' + ''.join(f'   {name} {1e3 * np.max(row):.4f}' for name, row in zip(avrutov.COLUMNS['linear'], sd)))
     tilted = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))) @ truth
@@ -150,7 +150,7 @@ def findings():
     sensed = avrutov.add_earth_rate(avrutov.series_3(), EARTH_RATE)
     ignored = avrutov_budget.reference_error(avrutov.series_3(), sensed - avrutov.series_3(), linear)
     yield f'Earth rate is not in the model: in Kyiv it puts {np.max(np.abs(ignored[1:])):.2e} V/(deg/s) into sample 3.'
-    mat_bn = avrutov.turn('ZYX', ANGLES, ANGLES, ANGLES)
+    mat_bn = avrutov.turn('ZYX', [ANGLES] * 3)
     nominal = avrutov.nominal_accelerometers()
     tilted = avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))
     solution = avrutov.calibrate(readings(), avrutov.design_matrix(tilted, 'products') @ nominal, 'products')

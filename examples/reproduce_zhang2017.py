@@ -61,7 +61,7 @@ def print_tables_2_and_4(rng):
     for title, printed, rate in (('Table 2, at rest', zhang.TABLE_2_G, 0.0), ('Table 4, spinning at 100 deg/s', zhang.TABLE_4_G, 100.0)):
         heading(f'{title}: printed, before -> after (error ratio) | ours, simulated from Tables 1 and 3')
         before, after, reference = simulated_readings(rng, rate)
-        for line in zhang.axis_readings(before, after, reference, np.deg2rad([rate, rate]), G):
+        for line in zhang.axis_readings(before, after, reference, rate=np.deg2rad([rate, rate]), gravity=G):
             sensor, column = 'xyz'.index(line.sensor), 0 if line.position == '+x' else 2
             shown = printed[sensor, column:column + 2]
             ratio = abs(shown[0] - line.theoretical_g) / abs(shown[1] - line.theoretical_g)
@@ -79,12 +79,13 @@ def print_table_3(rng):
     heading('Table 3, lever arms in mm (reference point to sensor; printed with the opposite sign)')
     rate, rows = np.deg2rad(200), {}
     rows['printed, sign turned'] = ARMS
-    rows['eq. 24, no noise'] = zhang.closed_form(*closed_form_means(rng, rate, 0.0), rate, SENSOR.cosines)
-    rows['eq. 24 as printed'] = zhang.closed_form(*closed_form_means(rng, rate, 0.0), rate, SENSOR.cosines, as_printed=True)
-    rows['eq. 24, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG), rate, SENSOR.cosines)
+    rows['eq. 24, no noise'] = zhang.closed_form(*closed_form_means(rng, rate, 0.0), rate, directions=SENSOR.cosines)
+    rows['eq. 24 as printed'] = zhang.closed_form(*closed_form_means(rng, rate, 0.0), rate, directions=SENSOR.cosines, as_printed=True)
+    rows['eq. 24, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG), rate, directions=SENSOR.cosines)
     rows['   its sd'] = zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines)
     axes = skewed_axes(60)
-    rows['eq. 24, skew 60, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG, axes), rate, SENSOR.cosines, axes)
+    rows['eq. 24, skew 60, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG, axes), rate, directions=SENSOR.cosines,
+                                                         spin_axes=axes)
     for design in ('Z0', 'M'):
         runs = design_runs(design)
         noise = stack_runs(runs)[2]
@@ -104,7 +105,7 @@ def print_designs():
         weak = weak_arms(judged)
         print(f'{design:4s}{NAMES[design]:32s} sd on axis {np.diag(sd).max():.4f}, off axis {sd[OFF_AXIS].max():8.4f}; '
               f'cond in tolerances {max(one.cond for one in judged):6.1f}; not determined: {", ".join(weak) or "none"}')
-    runs = design_runs('Z0')[:6] + [oscillation((1, 1, 1), 10, 1.0, MG)]
+    runs = design_runs('Z0')[:6] + [oscillation((1, 1, 1), 10, 1.0, noise_sd=MG)]
     try:
         fit_joint(runs, predict(runs, TRUTH[0]))
         raise SystemExit('the single oscillation axis should have been refused')
@@ -132,7 +133,7 @@ def print_spins():
 def print_tumbling(rng):
     heading('Figures 9 and 10, 60 s of three-axis sinusoids: peak errors and median improvement over 300 estimates of the arms')
     motions = (((60, 45, 30), (0.7, 0.9, 1.1)), ((30,) * 3, (1.0,) * 3), ((90,) * 3, (0.5,) * 3), ((10,) * 3, (3.0,) * 3))
-    errors = {design: np.stack([arm_errors(design_runs(design), *pair, rng, 300) for pair in zip(SENSOR.cosines, ARMS)], axis=1)
+    errors = {design: np.stack([arm_errors(design_runs(design), *pair, rng=rng, n_draws=300) for pair in zip(SENSOR.cosines, ARMS)], axis=1)
               for design in DESIGNS}
     for amplitude, frequency in motions:
         responses = zhang_claims.arm_responses(zhang_claims.tumble(amplitude, frequency, sample_rate=100.0), SENSOR.cosines)
@@ -174,14 +175,14 @@ def findings():
            f'{-1e3 * ARMS[1, 1]:.2f} and {-1e3 * ARMS[2, 2]:.2f} are printed.')
     rate = np.deg2rad(200)
     static, spinning = closed_form_means(np.random.default_rng(0), rate, 0.0)
-    wrong = zhang.closed_form(static, spinning, rate, SENSOR.cosines, as_printed=True)
+    wrong = zhang.closed_form(static, spinning, rate, directions=SENSOR.cosines, as_printed=True)
     yield (f'The fourth term of r_jx in eq. 24 lacks a 0: as printed r_jx comes out as {row(wrong[:, 0], " .3f")} m instead of '
            f'{row(ARMS[:, 0], " .4f")}.')
     sd = 1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines)
     yield (f'Only r_xx, r_yy, r_zz can be seen: at 200 deg/s and the sensor\'s 0.75 mg the off-axis arms have sd '
            f'{sd[OFF_AXIS].min():.0f} to {sd[OFF_AXIS].max():.0f} mm, the printed values are {1e3 * np.abs(ARMS[OFF_AXIS]).min():.2f} to '
            f'{1e3 * np.abs(ARMS[OFF_AXIS]).max():.2f} mm. Averaging over rates does not create what is missing; a skewed fixture '
-           f'({1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines, skewed_axes(60)).max():.1f} mm) or oscillations do.')
+           f'({1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines, spin_axes=skewed_axes(60)).max():.1f} mm) or oscillations do.')
     equilibrated = np.linalg.cond(jacobian(design_runs('Z0'), TRUTH[0]) / np.linalg.norm(jacobian(design_runs('Z0'), TRUTH[0]), axis=0))
     yield f'An equilibrated condition number does not see this ({equilibrated:.1f} for Zhang\'s design); tolerances do.'
     acceleration = np.deg2rad(100) ** 2 * 0.01

@@ -60,7 +60,7 @@ def read_mapping(path, what, checked=dict):
     try:
         return checked(documents.from_text(read_text(path, what), what))
     except InputError as error:
-        raise error.named(path) from error
+        raise error.named(str(path)) from error
 
 
 def read_table(path):
@@ -97,7 +97,7 @@ def read_noise(path: str | os.PathLike) -> NoiseFigures:
     try:
         return noise_from_text(read_text(path, 'noise document'))
     except InputError as error:
-        raise error.named(path) from error
+        raise error.named(str(path)) from error
 
 
 def make_folder(path):

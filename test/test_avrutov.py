@@ -23,7 +23,7 @@ EARTH_RATE_VERTICAL = 15.041 / 3600 * np.sin(np.deg2rad(50.45))
 
 
 def readings(order, axis, angles=ANGLES):
-    return avrutov.gravity_readings(avrutov.turn(order, angles, angles, angles), axis)
+    return avrutov.gravity_readings(avrutov.turn(order, [angles] * 3), axis)
 
 
 def recover_all_cases(model, truth):
@@ -48,14 +48,14 @@ def test_turn_matrices_are_rotations_that_compose_in_the_stated_order():
     rng = np.random.default_rng(1)
     angles = rng.uniform(-3, 3, (3, 20))
     for order in avrutov.GIMBAL_ORDERS:
-        mat_bn = avrutov.turn(order, *angles)
+        mat_bn = avrutov.turn(order, angles)
         np.testing.assert_allclose(mat_bn @ np.swapaxes(mat_bn, 1, 2), np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-15)
         first_axis = np.eye(3)['XYZ'.index(order[0])]
-        np.testing.assert_allclose(avrutov.turn(order, angles[0], 0 * angles[0], 0 * angles[0]) @ first_axis,
+        np.testing.assert_allclose(avrutov.turn(order, [angles[0], 0 * angles[0], 0 * angles[0]]) @ first_axis,
                                    np.broadcast_to(first_axis, (20, 3)), atol=1e-15)
-    quarter = avrutov.turn('ZYX', *np.array([[np.pi / 2], [0], [0]]))[0]
+    quarter = avrutov.turn('ZYX', np.array([[np.pi / 2], [0], [0]]))[0]
     np.testing.assert_allclose(quarter @ [1, 0, 0], [0, -1, 0], atol=1e-15)
-    about_z = avrutov.turn('ZYX', angles[0], 0 * angles[0], 0 * angles[0])
+    about_z = avrutov.turn('ZYX', [angles[0], 0 * angles[0], 0 * angles[0]])
     np.testing.assert_allclose(avrutov.simultaneous_turn(angles[0], (0, 0, 1)), about_z, atol=1e-15)
     assert len(avrutov.GIMBAL_ORDERS) == 12
 
@@ -218,7 +218,7 @@ def test_a9_earth_rate_on_sample_3():
 
 @pytest.mark.parametrize('order, expected', [('ZYX', 0.588), ('XYZ', 1.143)])
 def test_a10_table_tilt(order, expected):
-    mat_bn = avrutov.turn(order, ANGLES, ANGLES, ANGLES)
+    mat_bn = avrutov.turn(order, [ANGLES] * 3)
     truth = avrutov.nominal_accelerometers('linear')
     level = avrutov.gravity_readings(mat_bn, 'z')
     ignored, estimated = [], []
@@ -238,7 +238,7 @@ def test_a10_table_tilt(order, expected):
 
 def test_tilt_can_hide_in_matrix_and_products():
     """Gravity along the first axis, n x 7: 2 arcmin leave less than 0.2 uV of residual and 0.5 mV/g of error."""
-    mat_bn = avrutov.turn('ZYX', ANGLES, ANGLES, ANGLES)
+    mat_bn = avrutov.turn('ZYX', [ANGLES] * 3)
     truth = avrutov.nominal_accelerometers()
     outputs = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0)), 'products') @ truth
     solution = avrutov.calibrate(avrutov.gravity_readings(mat_bn, 'z'), outputs, 'products')
@@ -250,10 +250,10 @@ def test_error_budget_is_the_scatter_of_simulated_causes():
     """One cause at a time, 3000 draws, sd ratio within 7 % (5 sd)."""
     rng = np.random.default_rng(10)
     order, axis, truth = 'ZYX', 'z', avrutov.nominal_accelerometers('linear')
-    mat_bn, level = avrutov.turn(order, ANGLES, ANGLES, ANGLES), readings(order, axis)
+    mat_bn, level = avrutov.turn(order, [ANGLES] * 3), readings(order, axis)
     common = {'tilt': avrutov_budget.tilt_changes(mat_bn, axis, TILT), 'gravity': 3e-5 * level}
-    scattered = {'encoder': avrutov_budget.encoder_changes(order, np.tile(ANGLES, (3, 1)), axis, 1e-4)}
-    budget = avrutov_budget.error_budget(level, truth, 'linear', 1e-4, common, scattered)
+    scattered = {'encoder': avrutov_budget.encoder_changes(order, np.tile(ANGLES, (3, 1)), axis, encoder_sd_rad=1e-4)}
+    budget = avrutov_budget.error_budget(level, truth, 'linear', noise_sd=1e-4, common=common, scattered=scattered)
 
     def scatter(make_outputs):
         outputs = np.concatenate([make_outputs() for _ in range(3000)], axis=1)
@@ -265,7 +265,7 @@ def test_error_budget_is_the_scatter_of_simulated_causes():
 
     def with_encoder():
         angles = ANGLES + rng.normal(scale=1e-4, size=(3, len(ANGLES)))
-        return avrutov.design_matrix(avrutov.gravity_readings(avrutov.turn(order, *angles), axis)) @ truth
+        return avrutov.design_matrix(avrutov.gravity_readings(avrutov.turn(order, angles), axis)) @ truth
 
     np.testing.assert_allclose(scatter(with_tilt), budget['tilt'], rtol=0.07)
     np.testing.assert_allclose(scatter(with_encoder), budget['encoder'], rtol=0.07)
@@ -277,7 +277,8 @@ def test_separate_sets_take_means_of_positions_and_runs():
     force, rates = readings('XYX', 'x'), avrutov.factorial_rates()
     forces, gyros = avrutov.nominal_accelerometers(), avrutov.nominal_gyroscopes('linear')
     accelerometers, gyroscopes = avrutov.calibrate_separate_sets(
-        (force, avrutov.design_matrix(force, 'products') @ forces), (rates, avrutov.design_matrix(rates) @ gyros), 'products', 'linear')
+        (force, avrutov.design_matrix(force, 'products') @ forces), (rates, avrutov.design_matrix(rates) @ gyros), 'products',
+        gyroscope_model='linear')
     np.testing.assert_allclose(accelerometers.values, forces, atol=1e-12)
     np.testing.assert_allclose(gyroscopes.values, gyros, atol=1e-13)
 

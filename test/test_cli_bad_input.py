@@ -26,7 +26,8 @@ def session():
     """A short session: (ImuSamples, JointSamples)."""
     model = SensorModel()
     options = SimulationOptions(noise=GRADES['industrial'].noise)
-    return simulate(model, random_values(model, 'industrial', 2), TABLE, make_profile('quick', 2, TABLE), options, 2)[:2]
+    return simulate(model, random_values(model, 'industrial', 2), TABLE, profile=make_profile('quick', 2, TABLE), options=options,
+                    seed=2)[:2]
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +36,8 @@ def home(tmp_path_factory, session):
     folder = tmp_path_factory.mktemp('bad_input')
     write_session(str(folder / 'bag'), *session)
     (folder / 'table.yaml').write_text(yaml.safe_dump(DESCRIPTION))
-    assert main(['calibrate', str(folder / 'bag'), '--table', str(folder / 'table.yaml'), '--output', str(folder / 'good'), '--no-report']) == 0
+    assert main(['calibrate', str(folder / 'bag'), '--table', str(folder / 'table.yaml'), '--output', str(folder / 'good'),
+                 '--no-report']) == 0
     return folder
 
 
@@ -196,7 +198,8 @@ def test_an_output_bag_that_exists(capsys, home):
 
 
 @pytest.mark.parametrize('more', (('--setting', 'settling=soon'), ('--setting', 'colour=1'), ('--setting', 'settling=-1'),
-                                  ('--accelerometer-model', 'bias+magic'), ('--gyroscope-model', 'bias'), ('--reference-model', 'table_tlit')))
+                                  ('--accelerometer-model', 'bias+magic'), ('--gyroscope-model', 'bias'),
+                                  ('--reference-model', 'table_tlit')))
 def test_options_that_do_not_fit(capsys, tmp_path, home, more):
     calibrate_refused(capsys, tmp_path, home / 'bag', home / 'table.yaml', *more)
 
@@ -214,7 +217,8 @@ def test_a_truncated_bag_gives_what_came_before_the_damage(capsys, tmp_path, hom
     file = next((tmp_path / 'whole').glob('*.mcap'))
     content = file.read_bytes()
     file.write_bytes(content[:int(0.93 * len(content))])
-    code = main(['calibrate', str(tmp_path / 'whole'), '--table', str(home / 'table.yaml'), '--output', str(tmp_path / 'out'), '--no-report'])
+    code = main(['calibrate', str(tmp_path / 'whole'), '--table', str(home / 'table.yaml'), '--output', str(tmp_path / 'out'),
+                 '--no-report'])
     printed = capsys.readouterr()
     assert code == 3
     document = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())

@@ -23,7 +23,8 @@ STORAGES = ('sqlite3', 'mcap')
 def bags(tmp_path_factory):
     """The same session as a bag of each kind."""
     folder = tmp_path_factory.mktemp('bags')
-    imu, joints, _ = simulate(MODEL, VALUES, TABLE, make_profile('quick', 6, TABLE), SimulationOptions(200.0, 100.0), 6)
+    imu, joints, _ = simulate(MODEL, VALUES, TABLE, profile=make_profile('quick', 6, TABLE), options=SimulationOptions(200.0, 100.0),
+                              seed=6)
     for storage in STORAGES:
         write_session(folder / storage, imu, joints, storage=storage)
     return folder, len(imu)
@@ -43,7 +44,8 @@ def calibrate(bag, output):
 def used(document):
     """Return how many samples came through."""
     return sum(document['statistics']['samples_used'].values()) + sum(
-        count for reason, count in document['statistics']['stream'].items() if reason in ('settling', 'not quiet', 'too short', 'edge of joints'))
+        count for reason,
+        count in document['statistics']['stream'].items() if reason in ('settling', 'not quiet', 'too short', 'edge of joints'))
 
 
 def errors(document):

@@ -18,7 +18,8 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
+                                       {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'gravity': 9.81, 'latitude': 48.8, 'azimuth_deg': 0.0})
 NO_TILT = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect', reference_model='none')
 SIZES = np.array([1e-3] * 3 + [1e-4] * 9 + [1e-4] * 9)
@@ -29,7 +30,8 @@ def recording():
     """A short session of an IMU with a size effect."""
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
     values = random_values(model, 'industrial', 4)
-    imu, joints, _ = simulate(model, values, TABLE, make_profile('quick', 4, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), 4)
+    imu, joints, _ = simulate(model, values, TABLE, profile=make_profile('quick', 4, TABLE),
+                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=4)
     return SampleBlock(imu, joints)
 
 

@@ -20,7 +20,8 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
+                                       {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
 INDUSTRIAL = GRADES['industrial'].noise
 WHITE = (INDUSTRIAL.accel_density * 10.0, INDUSTRIAL.gyro_density * 10.0)
@@ -33,7 +34,7 @@ def session():
     """Windows of a short full session, without noise; their outputs are replaced by each test."""
     profile = make_profile('quick', 0, TABLE)
     quiet = SimulatedNoise(accel_density=1e-5, gyro_density=1e-6)
-    imu, joints, _ = simulate(SensorModel(), SensorModel().start(), TABLE, profile, SimulationOptions(noise=quiet), 0)
+    imu, joints, _ = simulate(SensorModel(), SensorModel().start(), TABLE, profile=profile, options=SimulationOptions(noise=quiet), seed=0)
     gatherer = MotionGatherer(TABLE)
     return gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
 
@@ -73,10 +74,12 @@ class SameMotion:
     def outputs(self, session, values, rng):
         """Return the session's windows with outputs of FULL, white noise, and biases that wander."""
         found, times = [], np.arange(0.0, session[-1].time[-1] + 1.0, 0.5)
-        wander = [gauss_markov(sd, 100.0, 0.5, (len(times), 3), rng) for sd in (INDUSTRIAL.accel_instability, INDUSTRIAL.gyro_instability)]
+        wander = [gauss_markov(sd, 100.0, 0.5, shape=(len(times), 3), rng=rng) for sd in (INDUSTRIAL.accel_instability,
+                                                                                          INDUSTRIAL.gyro_instability)]
         for window in session:
             n, near = len(window.time), np.rint(window.time / 0.5).astype(int)
-            force, rate = (self(FULL, sensor, TABLE, window.motion) @ coefficients(FULL, sensor, values) + rng.normal(0, sd, (n, 3)) + bias[near]
+            force, rate = (self(FULL, sensor, TABLE, window.motion) @ coefficients(FULL, sensor, values) + rng.normal(0, sd,
+                                                                                                                      (n, 3)) + bias[near]
                            for sensor, sd, bias in zip(('accelerometer', 'gyroscope'), WHITE, wander))
             found.append(Window(**{**vars(window), 'force_s': force, 'rate_s': rate}))
         return found
@@ -131,7 +134,8 @@ def test_reported_standard_deviations_match_the_scatter(session):
 
 def cramer_rao(system, model):
     """Return the variances that an estimator reaches which knows the noise exactly."""
-    known = {sensor: noise_model.NoiseModel(np.full(3, sd**2), np.ones(3), bias_processes=(noise_model.BiasProcess(wander, 100.0),)) for sensor, sd, wander in zip(
+    known = {sensor: noise_model.NoiseModel(np.full(3, sd**2), np.ones(3),
+                                            bias_processes=(noise_model.BiasProcess(wander, 100.0),)) for sensor, sd, wander in zip(
         ('accelerometer', 'gyroscope'), WHITE, (INDUSTRIAL.accel_instability, INDUSTRIAL.gyro_instability))}
     return np.diag(solve(system, model, noise=known).covariance)
 
@@ -176,8 +180,10 @@ def test_fewer_columns_are_the_same_as_a_smaller_model(session):
     assert np.max(np.abs(direct.values - cut.values) / direct.sd) < 1e-6
 
 
-@pytest.mark.parametrize('name', ['accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product', 'gyro_quadratic', 'gyro_g_sensitivity',
-                                  'gyro_rate_product', 'gyro_scale_asymmetry', 'accel_bandwidth', 'gyro_bandwidth', 'time_offset', 'table_tilt',
+@pytest.mark.parametrize('name', ['accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product', 'gyro_quadratic',
+                                  'gyro_g_sensitivity',
+                                  'gyro_rate_product', 'gyro_scale_asymmetry', 'accel_bandwidth', 'gyro_bandwidth', 'time_offset',
+                                  'table_tilt',
                                   'axis_non_orthogonality', 'encoder_zero', 'encoder_harmonic', 'earth_rate'])
 def test_columns_are_the_derivative_of_the_prediction(session, name):
     """Columns times the derivative of the coefficients equal finite differences of the forward equations."""
@@ -212,4 +218,5 @@ def test_a_warp_of_one_sensor_leaves_the_other_sensors_motion_alone(session):
     model, window = model.at(values), next(w for w in session if w.kind == 'dynamic')
     together = References(model, TABLE, window.motion)
     for sensor in ('accelerometer', 'gyroscope'):
-        np.testing.assert_array_equal(columns(model, sensor, TABLE, window.motion, references=together), columns(model, sensor, TABLE, window.motion))
+        np.testing.assert_array_equal(columns(model, sensor, TABLE, window.motion, references=together),
+                                      columns(model, sensor, TABLE, window.motion))

@@ -25,7 +25,8 @@ MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint
 
 def session(seed, values):
     """Return (imu, joints) of a short session."""
-    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile('quick', seed, TABLE), SimulationOptions(100.0, 100.0), seed)
+    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile('quick', seed, TABLE), options=SimulationOptions(100.0, 100.0),
+                              seed=seed)
     return imu, joints
 
 
@@ -138,8 +139,10 @@ def test_several_recordings_that_do_not_belong_together_are_refused(recordings, 
     imu, joints = session(3, truth['unit_a'])
     write_session(tmp_path / 'other_frame', replace(imu, frame_id='second_imu'), joints, storage='mcap')
     write_session(tmp_path / 'other_table', imu, replace(joints, names=('a', 'b', 'c')), storage='mcap')
-    for bad, expected in ((tmp_path / 'other_frame', "'second_imu'"), (tmp_path / 'other_table', 'a, b, c'), (folder / 'unit_c.mcap', 'readable bag')):
-        code = main(['calibrate', str(folder / 'unit_a'), str(bad), '--table', str(TABLE_FILE), '--output', str(tmp_path / 'out'), '--no-report', '--jobs', '1'])
+    for bad, expected in ((tmp_path / 'other_frame', "'second_imu'"), (tmp_path / 'other_table', 'a, b, c'),
+                          (folder / 'unit_c.mcap', 'readable bag')):
+        code = main(['calibrate', str(folder / 'unit_a'), str(bad), '--table', str(TABLE_FILE), '--output', str(tmp_path / 'out'),
+                     '--no-report', '--jobs', '1'])
         error = capsys.readouterr().err
         assert code == 1 and bad.name in error and expected in error and error.count('\n') == 1
     assert not (tmp_path / 'out' / 'calibration.yaml').exists()

@@ -48,7 +48,7 @@ def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
 def test_covariance_equals_the_inverse_normal_matrix_and_the_weights_enter():
     rng = np.random.default_rng(2)
     design, weights = vandermonde(rng), rng.uniform(0.5, 4, 12)
-    solution = solve_linear(design, rng.normal(size=12), NAMES, weights)
+    solution = solve_linear(design, rng.normal(size=12), NAMES, weights=weights)
     np.testing.assert_allclose(solution.unit_covariance, np.linalg.inv(design.T @ (weights[:, None] * design)), rtol=1e-11)
     np.testing.assert_allclose(design.T @ (weights * solution.residuals), 0, atol=1e-12)
     np.testing.assert_allclose(predicted_sd(design, weights), solution.unit_sd, rtol=1e-12)
@@ -107,7 +107,7 @@ def test_too_few_rows_and_an_empty_design_are_refused():
 ])
 def test_wrong_input_is_refused(design, outputs, weights):
     with pytest.raises(InputError):
-        solve_linear(design, outputs, NAMES, weights)
+        solve_linear(design, outputs, NAMES, weights=weights)
 
 
 def test_tolerance_scaling_finds_the_weak_parameter_that_eqcond_misses():
@@ -125,5 +125,6 @@ def test_tolerance_scaling_of_design_and_covariance_agree():
     design, tolerances = vandermonde(rng), np.array([0.1, 2.0, 0.5])
     covariance = 0.3**2 * solve_linear(design, np.ones(12), NAMES).unit_covariance
     by_design = tolerance_scaled(design, tolerances, 0.3)
-    np.testing.assert_allclose(tolerance_scaled_singular_values(np.linalg.inv(covariance), tolerances), by_design.singular_values, rtol=1e-9)
+    np.testing.assert_allclose(tolerance_scaled_singular_values(np.linalg.inv(covariance), tolerances), by_design.singular_values,
+                               rtol=1e-9)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)) / tolerances, by_design.sd_over_tolerance, rtol=1e-10)

@@ -30,7 +30,8 @@ def session(tilt=(0.0, 0.0), seed=1):
     model = SensorModel(('bias', 'matrix', 'accel_size_effect'), ('bias', 'matrix'), ('table_tilt',), TABLE.joint_names)
     values = random_values(model, 'industrial', seed)
     values[model.slices['reference', 'table_tilt']] = tilt
-    imu, joints, _ = simulate(model.at(values), values, TABLE, make_profile('quick', seed, TABLE), SimulationOptions(50.0, 50.0), seed)
+    imu, joints, _ = simulate(model.at(values), values, TABLE, profile=make_profile('quick', seed, TABLE),
+                              options=SimulationOptions(50.0, 50.0), seed=seed)
     return imu, joints
 
 

@@ -17,7 +17,8 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
+                                       {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
 MODEL = SensorModel()
 SENSORS = ('accelerometer', 'gyroscope')
@@ -30,7 +31,7 @@ def motion():
     """Windows of a short session and their columns; each trial puts outputs on them."""
     profile = make_profile('quick', 0, TABLE)
     options = SimulationOptions(noise=SimulatedNoise(accel_density=1e-5, gyro_density=1e-6))
-    imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile, options, 0)
+    imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0)
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
     return [(window, {s: columns(MODEL, s, TABLE, window.motion) for s in SENSORS}) for window in windows]
@@ -42,7 +43,8 @@ def recordings(motion, values, steps, rng):
     for session, step in enumerate(steps):
         part = Accumulator()
         for window, designs in motion:
-            outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s], (len(window.time), 3)) for s in SENSORS]
+            outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s],
+                                                                                          (len(window.time), 3)) for s in SENSORS]
             part.add(reduce_window(Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]}), MODEL, TABLE, session=session,
                                    column_function=lambda model, sensor, *rest, known=designs, **shared: known[sensor]))
         total.merge(part)
@@ -72,7 +74,8 @@ def test_biases_that_agree_stay_one(motion):
     """Without steps, eight pairs of recordings are taken as one, and the bias is known better than from one alone."""
     sds = bias_sds(motion)
     for seed in range(8):
-        system = recordings(motion, random_values(MODEL, 'industrial', seed), [{s: np.zeros(3) for s in SENSORS}] * 2, np.random.default_rng([seed, 1]))
+        system = recordings(motion, random_values(MODEL, 'industrial', seed), [{s: np.zeros(3) for s in SENSORS}] * 2,
+                            np.random.default_rng([seed, 1]))
         solution = solve(system, MODEL)
         for sensor in SENSORS:
             assert solution.noise[sensor].session_sd == 0.0

@@ -155,7 +155,7 @@ def test_n3_tumbling_with_estimated_arms(design, wanted):
     rng = np.random.default_rng(13)
     runs = zhang_designs.design_runs(design)
     responses = zhang_claims.arm_responses(zhang_claims.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
-    wrong = np.stack([zhang_joint.arm_errors(runs, COSINES[i], ARMS[i], rng, 300) for i in range(3)], axis=1)
+    wrong = np.stack([zhang_joint.arm_errors(runs, COSINES[i], ARMS[i], rng=rng, n_draws=300) for i in range(3)], axis=1)
     gains = zhang_claims.peaks(responses, ARMS)[:, :1] / zhang_claims.peaks(responses, wrong)
     velocity, position = np.median(gains, axis=1)
     show('N3', f'{design}: median improvement, velocity, position', [velocity, position], wanted)

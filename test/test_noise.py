@@ -17,7 +17,7 @@ from imu_calibration.simulation.sensor_noise import (
 
 def test_white_noise_integrates_to_a_random_walk_of_its_density():
     model = SimulatedNoise(accel_density=2e-3, gyro_density=1e-4)
-    force, rate = add_imu_noise(np.zeros((40000, 3)), np.zeros((40000, 3)), model, 200.0, np.random.default_rng(1))
+    force, rate = add_imu_noise(np.zeros((40000, 3)), np.zeros((40000, 3)), model, sample_rate=200.0, rng=np.random.default_rng(1))
     for noise, density in ((force, 2e-3), (rate, 1e-4)):
         # 1200 integrals over 0.5 s: 2 % sampling error of their sd.
         walk = noise.reshape(-1, 100, 3).sum(axis=1) / 200.0
@@ -25,7 +25,7 @@ def test_white_noise_integrates_to_a_random_walk_of_its_density():
 
 
 def test_bias_wander_is_stationary_with_its_correlation_time():
-    wander = gauss_markov(3.0, 5.0, 0.1, (2000, 400), np.random.default_rng(2))
+    wander = gauss_markov(3.0, 5.0, 0.1, shape=(2000, 400), rng=np.random.default_rng(2))
     for row in (0, 500, 1999):
         # 400 independent paths: 3.5 % sampling error.
         assert np.std(wander[row]) == pytest.approx(3.0, rel=0.12)
@@ -36,7 +36,7 @@ def test_bias_wander_is_stationary_with_its_correlation_time():
 
 def test_no_noise_changes_nothing():
     force = np.random.default_rng(3).normal(size=(10, 3))
-    for got in add_imu_noise(force, force, SimulatedNoise(), 100.0, np.random.default_rng(4)):
+    for got in add_imu_noise(force, force, SimulatedNoise(), sample_rate=100.0, rng=np.random.default_rng(4)):
         np.testing.assert_array_equal(got, force)
     np.testing.assert_array_equal(read_encoders(force, SimulatedNoise(), np.random.default_rng(4)), force)
 

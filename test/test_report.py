@@ -27,7 +27,8 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.units import with_sd
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
+                                       {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}
@@ -38,7 +39,8 @@ VOID = {'meta', 'link', 'br', 'img', 'hr', 'input'}
 def session(profile, seed=6):
     """Simulate one recording."""
     values = random_values(MODEL, 'industrial', seed)
-    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile(profile, seed, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), seed)
+    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile(profile, seed, TABLE),
+                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=seed)
     return SampleBlock(imu, joints)
 
 
@@ -63,7 +65,8 @@ def by_hand(quick):
 @pytest.fixture(scope='module')
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
-    return calibrate([lambda: iter([quick])], TABLE, CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}), PROVENANCE)
+    return calibrate([lambda: iter([quick])], TABLE, CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
+                     PROVENANCE)
 
 
 @pytest.fixture(scope='module')
@@ -105,7 +108,8 @@ def test_the_page_is_whole_and_needs_nothing_else(pages, name):
     assert not re.search(r'<script|@import|url\((?!#)', page)
     assert [s for s in SECTIONS if f'<section id="{s}">' not in page] == []
     assert 'session &lt;1&gt;' in page and 'session <1>' not in page
-    assert not re.search(r'\bnan\b|\binf\b|None|Undefined', re.sub(r'<svg.*?</svg>|<style>.*?</style>', '', page, flags=re.S).replace('None: in every', ''))
+    assert not re.search(r'\bnan\b|\binf\b|None|Undefined',
+                         re.sub(r'<svg.*?</svg>|<style>.*?</style>', '', page, flags=re.S).replace('None: in every', ''))
 
 
 def test_the_same_calibration_gives_the_same_bytes(on_table, pages):
@@ -128,7 +132,8 @@ def test_every_parameter_is_there_with_the_digits_that_it_deserves(on_table, pag
 
 
 @pytest.mark.parametrize(('name', 'word', 'next_step'), (
-    ('on_table', 'Good', 'compensate'), ('by_hand', 'Weak', 'give the local gravity'), ('demanding', 'Weak', 'accelerometer.accel_size_effect')))
+    ('on_table', 'Good', 'compensate'), ('by_hand', 'Weak', 'give the local gravity'),
+    ('demanding', 'Weak', 'accelerometer.accel_size_effect')))
 def test_the_verdict_comes_first_with_its_next_step(pages, name, word, next_step):
     head = pages[name][:pages[name].index('<nav>')]
     assert f'<p class="word">{word}</p>' in head
@@ -243,7 +248,8 @@ def opened(page, width, tmp_path):
     file = tmp_path / 'report.html'
     file.write_text(page.replace('</body>', WATCH))
     flags = ['--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--disable-background-networking',
-             '--disable-component-update', '--disable-sync', '--disable-dev-shm-usage', '--enable-logging=stderr', f'--user-data-dir={tmp_path / "profile"}',
+             '--disable-component-update', '--disable-sync', '--disable-dev-shm-usage', '--enable-logging=stderr',
+             f'--user-data-dir={tmp_path / "profile"}',
              f'--window-size={width},1000', '--virtual-time-budget=3000', '--dump-dom']
     done = subprocess.run([chromium(), *flags, file.as_uri()], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -16,7 +16,8 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
+TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
+                                       {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'azimuth_deg': 0.0})
 MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
 
@@ -26,7 +27,8 @@ def result():
     """The diagnosis of a short session."""
     values = random_values(MODEL, 'industrial', 9)
     values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array([1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1])
-    imu, joints, _ = simulate(MODEL, values, TABLE, make_profile('quick', 9, TABLE), SimulationOptions(noise=GRADES['industrial'].noise), 9)
+    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile('quick', 9, TABLE),
+                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=9)
     block = SampleBlock(imu, joints)
     return diagnose_recording(lambda: iter([block]), TABLE, CalibrationOptions(), {'bags': [{'name': 'session', 'sha256': '0'}]})
 

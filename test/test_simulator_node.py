@@ -33,7 +33,7 @@ def at_rest(position=(0.0, 0.0, 0.0), time=0.0):
 
 def test_a_trajectory_meets_its_points_and_is_smooth():
     position, rate = np.array([[0.5, -0.2, 0.1], [1.0, 0.3, -0.4]]), np.array([[0.2, 0.1, 0.0], [0.0, 0.0, 0.0]])
-    trajectory = trajectory_from(at_rest((0.1, 0.0, 0.0), 3.0), [1.0, 2.5], position, rate)
+    trajectory = trajectory_from(at_rest((0.1, 0.0, 0.0), 3.0), [1.0, 2.5], position, rate=rate)
     motion = trajectory.at([3.0, 4.0, 5.5, 9.0])
     np.testing.assert_allclose(motion.position, [[0.1, 0.0, 0.0], *position, position[-1]], atol=1e-12)
     np.testing.assert_allclose(motion.rate, [[0, 0, 0], *rate, [0, 0, 0]], atol=1e-12)
@@ -60,7 +60,7 @@ def test_a_profile_that_repeats_and_a_trajectory_that_takes_over_leave_no_jump()
     around = profile.duration + np.linspace(-1e-4, 1e-4, 11)
     assert np.max(np.abs(np.diff(motion.at(around).position, axis=0))) < 1e-6
     before = motion.at(np.array([40.0]))
-    motion.follow(40.0, [2.0], np.zeros((1, 3)))
+    motion.follow(40.0, time=[2.0], position=np.zeros((1, 3)))
     after = motion.at(np.array([40.0]))
     for name in ('position', 'rate', 'acceleration'):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-12)
@@ -71,8 +71,8 @@ def test_blocks_without_noise_are_the_offline_simulation():
     _, _, values, model = make_session(2, 100.0, seconds=1.0)
     options = SimulationOptions(100.0, 50.0, SimulatedNoise(), temperature_start_c=20.0)
     profile = make_profile('quick', 1, TABLE)
-    expected = simulate(model, values, TABLE, profile, options)
-    live = LiveSimulation(model, values, TABLE, TableMotion(profile, 3), options, start_ns=int(expected[0].stamp_ns[0]))
+    expected = simulate(model, values, TABLE, profile=profile, options=options)
+    live = LiveSimulation(model, values, TABLE, motion=TableMotion(profile, 3), options=options, start_ns=int(expected[0].stamp_ns[0]))
     edges = np.sort(np.random.default_rng(0).uniform(0.0, 60.0, 40))
     blocks = [live.take(until) for until in [*edges, 60.0]]
     for name, whole in zip(('imu', 'joints', 'temperature'), expected):
@@ -87,7 +87,7 @@ def test_blocks_without_noise_are_the_offline_simulation():
 def test_the_wander_goes_on_from_block_to_block():
     _, _, values, model = make_session(2, 100.0, seconds=1.0)
     options = SimulationOptions(50.0, 1.0, SimulatedNoise(gyro_instability=1e-3, correlation_time=5.0))
-    live = LiveSimulation(model, values, TABLE, TableMotion(None, 3), options, seed=4)
+    live = LiveSimulation(model, values, TABLE, motion=TableMotion(None, 3), options=options, seed=4)
     rate = np.concatenate([live.take(until).imu.rate_s for until in np.arange(5.0, 601.0, 5.0)])
     drift = rate - rate.mean(axis=0)
     lag = int(5.0 * 50)

@@ -30,7 +30,8 @@ ALLOWED_GROWTH = 1 << 20
 def piece():
     """Return the IMU and the joints of a short session at 100 Hz."""
     profile = make_profile('quick', 4, TABLE)
-    return simulate(MODEL, random_values(MODEL, 'industrial', 4), TABLE, profile, SimulationOptions(100.0, 50.0), 4)[:2]
+    return simulate(MODEL, random_values(MODEL, 'industrial', 4), TABLE, profile=profile, options=SimulationOptions(100.0, 50.0),
+                    seed=4)[:2]
 
 
 def stream(imu, joints, repetitions):

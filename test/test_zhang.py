@@ -92,8 +92,8 @@ def test_z2_six_position_noise():
 def test_z3_closed_form_without_noise(rate_deg_s):
     rate = np.deg2rad(rate_deg_s)
     static, spinning = spin_means(rate, np.eye(3))
-    error = np.max(np.abs(zhang.closed_form(static, spinning, rate, COSINES) - ARMS))
-    printed = zhang.closed_form(static, spinning, rate, COSINES, as_printed=True)
+    error = np.max(np.abs(zhang.closed_form(static, spinning, rate, directions=COSINES) - ARMS))
+    printed = zhang.closed_form(static, spinning, rate, directions=COSINES, as_printed=True)
     show('Z3', f'closed form at {rate_deg_s} deg/s, m', error, '< 1e-12')
     show('Z3', 'r_jx with the printed fourth term, m', printed[:, 0], 'wrong by decimetres')
     assert error < 1e-12
@@ -105,10 +105,10 @@ def test_z3_closed_form_without_noise(rate_deg_s):
 def test_z3_closed_form_with_a_skewed_fixture():
     rate, axes = np.deg2rad(200), skewed_axes(60)
     change = np.array([[m @ _centripetal(n, rate) @ r for m, r in zip(COSINES, ARMS)] for n in axes])
-    error = np.max(np.abs(zhang.closed_form(np.zeros((3, 3)), change, rate, COSINES, axes) - ARMS))
+    error = np.max(np.abs(zhang.closed_form(np.zeros((3, 3)), change, rate, directions=COSINES, spin_axes=axes) - ARMS))
     show('Z3', 'closed form, fixture skewed by 60 deg, m', error, '< 1e-15')
     assert error < 1e-15
-    with_gravity = zhang.closed_form(*spin_means(rate, axes), rate, COSINES, axes)
+    with_gravity = zhang.closed_form(*spin_means(rate, axes), rate, directions=COSINES, spin_axes=axes)
     np.testing.assert_allclose(with_gravity, ARMS, atol=1e-14)
 
 
@@ -121,7 +121,7 @@ def test_z4_closed_form_noise():
     rng, rate, axes = np.random.default_rng(4), np.deg2rad(200), np.eye(3)
     static, spinning = spin_means(rate, axes)
     still, turning = 0.75 * MG * rng.normal(size=(2, 20000, 3, 3))
-    draws = zhang.closed_form(static + still, spinning + turning, rate, COSINES)
+    draws = zhang.closed_form(static + still, spinning + turning, rate, directions=COSINES)
     measured, predicted = 1e3 * np.std(draws, axis=0), 1e3 * zhang.closed_form_sd(0.75 * MG, rate, COSINES)
     show('Z4', 'sd mm, row x', measured[0], '0.74 59 163')
     show('Z4', 'sd mm, row y', measured[1], '57 0.74 75')
@@ -136,7 +136,7 @@ def test_averaging_rates_by_their_information_beats_the_plain_mean():
     """Zhang's nine spins share three static means; plain mean 1.42 / 312 mm, weighted 0.82 / 179 mm, joint fit 0.63 / 139 mm."""
     rng, rates = np.random.default_rng(5), np.deg2rad([100.0, 150.0, 200.0])
     still, turning = 0.75 * MG * rng.normal(size=(8000, 3, 3)), 0.75 * MG * rng.normal(size=(3, 8000, 3, 3))
-    arms = np.array([zhang.closed_form(still, part, rate, COSINES) for part, rate in zip(turning, rates)])
+    arms = np.array([zhang.closed_form(still, part, rate, directions=COSINES) for part, rate in zip(turning, rates)])
     plain, weighted = (1e3 * np.std(zhang.average_rates(arms, rates, flag), axis=0) for flag in (False, True))
     show('', 'plain mean over rates, sd mm, on and off axis', [plain[0, 0], plain.max()], '1.42 312')
     show('', 'weighted by rate^4', [weighted[0, 0], weighted.max()], '0.82 179')
@@ -148,9 +148,9 @@ def test_averaging_rates_by_their_information_beats_the_plain_mean():
 def test_closed_form_refuses_axes_it_cannot_use():
     ideal = np.eye(3)
     with pytest.raises(NotObservableError, match='square to spin axis'):
-        zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, ideal)
+        zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, directions=ideal)
     with pytest.raises(InputError, match='orthonormal'):
-        zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, COSINES, np.ones((3, 3)))
+        zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, directions=COSINES, spin_axes=np.ones((3, 3)))
 
 
 # --- joint fit ------------------------------------------------------------------------------------------------------------------------
@@ -166,11 +166,11 @@ def test_jacobian_of_the_joint_model(design):
 
 def test_two_axis_motion_is_consistent_kinematics():
     """Gravity in the body obeys d(up)/dt = -rate x up, and alpha is the derivative of the rate."""
-    run = two_axis((0, 1, 0), 200, 150, 1.0, n_samples=4000)
+    run = two_axis((0, 1, 0), 200, 150, noise_sd=1.0, n_samples=4000)
     step = 360 / 200 / 4000
     np.testing.assert_allclose(np.gradient(run.force, step, axis=0)[1:-1], -np.cross(run.rate, run.force)[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.gradient(run.rate, step, axis=0)[1:-1], run.alpha[1:-1], atol=1e-4)
-    swing = oscillation((0, 0, 1), 10, 1.0, 1.0, n_samples=4000)
+    swing = oscillation((0, 0, 1), 10, 1.0, noise_sd=1.0, n_samples=4000)
     np.testing.assert_allclose(np.gradient(swing.rate, 1 / 4000, axis=0)[1:-1], swing.alpha[1:-1], atol=1e-4)
 
 
@@ -262,7 +262,7 @@ def test_z7_weak_directions_carry_parameter_names():
 
 
 def test_z7_a_single_oscillation_axis_is_refused():
-    runs = [face(sign * axis, 0.1 * MG) for sign in (1, -1) for axis in np.eye(3)] + [oscillation((1, 1, 1), 10, 1.0, MG)]
+    runs = [face(sign * axis, 0.1 * MG) for sign in (1, -1) for axis in np.eye(3)] + [oscillation((1, 1, 1), 10, 1.0, noise_sd=MG)]
     with pytest.raises(NotObservableError, match='rank 6') as caught:
         fit_joint(runs, predict(runs, TRUTH[0]))
     assert 'r_x' in str(caught.value) and 'bias' not in str(caught.value)
@@ -274,7 +274,7 @@ def test_z8_tilted_table_and_averaged_headings():
     dynamic, level = design_runs('Z0')[6:], design_runs('Z0')[:6]
     tilted_spins = [replace(run, force=np.cos(TILT) * run.force) for run in dynamic]  # whole turns leave the part along the axis
     ups = [run.force[0] for run in level]
-    errors = [arm_error(level + dynamic, [face(up, 0.1 * MG, TILT, azimuth) for up in ups] + tilted_spins)
+    errors = [arm_error(level + dynamic, [face(up, 0.1 * MG, TILT, azimuth=azimuth) for up in ups] + tilted_spins)
               for azimuth in np.linspace(0, 2 * np.pi, 24, endpoint=False)]
     on_axis, off_axis = (np.max(np.abs(np.array(errors)[:, part])) for part in (~OFF_DIAGONAL, OFF_DIAGONAL))
     averaged = np.max(np.abs(np.diag(arm_error(level + dynamic, [average_headings(TILT, up, 0.1 * MG) for up in ups] + tilted_spins))))
@@ -300,7 +300,7 @@ def test_z8_late_accelerometer_in_two_axis_turns():
     level = design_runs('Z0')[:6]
 
     def turns(pairs, delay):
-        return level + [two_axis(axis, inner, outer, MG, delay=delay) for axis in np.eye(3) for inner, outer in pairs]
+        return level + [two_axis(axis, inner, outer, noise_sd=MG, delay=delay) for axis in np.eye(3) for inner, outer in pairs]
 
     single, paired = ((100, 100), (150, 150), (200, 100)), ((200, 200), (-200, 200))
     unmodelled = np.max(np.abs(arm_error(turns(single, 0), turns(single, -1e-3))))
@@ -312,7 +312,7 @@ def test_z8_late_accelerometer_in_two_axis_turns():
 
 
 @pytest.mark.parametrize('runs_of', [
-    lambda delay: [oscillation(axis, 10, 1.0, MG, delay=delay) for axis in np.eye(3)],
+    lambda delay: [oscillation(axis, 10, 1.0, noise_sd=MG, delay=delay) for axis in np.eye(3)],
     lambda delay: [spin(axis, rate, 0.1 * MG) for axis in skewed_axes(60) for rate in (100, 200)],
 ])
 def test_z8_delay_does_not_move_spins_and_oscillations(runs_of):
@@ -345,7 +345,7 @@ def test_axis_readings_reproduce_the_layout_of_tables_2_and_4():
     reference = np.vstack([force, spinning, oblique])
     rate = np.concatenate([np.zeros(6), np.deg2rad([99.9, 100.1]), [0.0]])
     bias = MG * np.array([1.0, -2.0, 3.0])
-    lines = zhang.axis_readings(reference + bias, reference + 0.1 * bias, reference, rate, G)
+    lines = zhang.axis_readings(reference + bias, reference + 0.1 * bias, reference, rate=rate, gravity=G)
     assert [line.position for line in lines[::3]] == ['+x', '+y', '+z', '-x', '-y', '-z', '+x']
     assert [line.rate_deg_s for line in lines[::3]] == [0] * 6 + [100] and lines[-1].n_windows == 2
     for line in lines:
@@ -357,6 +357,6 @@ def test_axis_readings_reproduce_the_layout_of_tables_2_and_4():
 
 def test_axis_readings_of_a_recording_without_such_positions_are_empty():
     oblique = G * np.array([[0.7, 0.7, 0.14]])
-    assert zhang.axis_readings(oblique, oblique, oblique, [0.0], G) == []
+    assert zhang.axis_readings(oblique, oblique, oblique, rate=[0.0], gravity=G) == []
     nothing = np.zeros((0, 3))
-    assert zhang.axis_readings(nothing, nothing, nothing, np.zeros(0), G) == []
+    assert zhang.axis_readings(nothing, nothing, nothing, rate=np.zeros(0), gravity=G) == []

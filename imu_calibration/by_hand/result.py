@@ -11,7 +11,7 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import Role
-from imu_calibration.segmentation.window import WindowKind
+from imu_calibration.segmentation.window import Window, WindowKind
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,6 +60,10 @@ class HandResult(CalibrationResult):
                             {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
                             {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
                             {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
+
+    def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
+        """None: by hand no windows are kept."""
+        return {}
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
         """Return noise and gravity: there is no other reference. The gravity of a default value is in the sd already."""

@@ -14,6 +14,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import Verdict, judge
 from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.segmentation.window import Window
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,6 +67,10 @@ class CalibrationResult(ABC):
     @abstractmethod
     def window_errors(self) -> WindowErrors:
         """Return the errors of window means before and after."""
+
+    @abstractmethod
+    def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
+        """Return sensor -> measured minus predicted of a window that was kept, shape (n, 3)."""
 
     @abstractmethod
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:

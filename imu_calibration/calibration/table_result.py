@@ -9,11 +9,13 @@ from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceError
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors, window_residuals
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,6 +73,12 @@ class TableResult(CalibrationResult):
             parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
             parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
         return WindowErrors(found['time'], kind, **parts)
+
+    def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
+        """Return measured minus what the motion of the table predicts."""
+        predicted = predict(self.solution.model, self.solution.values, self.table, window.motion, window.temperature_c)
+        return {sensor: measured - model for sensor, measured,
+                model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
         """Return noise beside what the table contributes."""

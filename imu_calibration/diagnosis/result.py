@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.selection.gain import Gain
+
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -23,7 +25,7 @@ class Finding:
     """Gain of log likelihood on held-out windows, nats."""
     share: float
     """Share of what was unexplained that it removes from held-out windows."""
-    gain: object
+    gain: Gain
     """`gain.Gain` on windows that took no part in choosing, of this finding on top of those before it."""
     indistinguishable_from: tuple
     """Effects that this recording cannot tell apart from it, at most two."""
@@ -69,7 +71,7 @@ class Diagnosis:
     """Solution of the model that was diagnosed."""
     solution: object
     """Solution of the extended model on all windows; the baseline's when nothing was found."""
-    gain: object
+    gain: Gain
     """`gain.Gain` of all findings together on windows that took no part in choosing."""
     traces: object
     """`gain.Traces`: residuals before and after, for plots."""

@@ -83,7 +83,8 @@ class SimulatorNode(Node):
         self._table, self._motion = self._make_table()
         model, values = self._true_imu()
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
-        self._simulation = LiveSimulation(model, values, self._table, self._motion, self._options(), settings.seed, start_ns)
+        self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,
+                                          start_ns=start_ns)
         self._trajectories = queue.Queue()
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
@@ -176,7 +177,7 @@ class SimulatorNode(Node):
         positions = column('positions')
         try:
             positions = np.zeros((0, 0)) if positions is None else positions
-            self._motion.follow(now, times, positions, column('velocities'), column('accelerations'))
+            self._motion.follow(now, time=times, position=positions, rate=column('velocities'), acceleration=column('accelerations'))
         except ImuCalibrationError as error:
             self.get_logger().warning(f'{error}; the trajectory is not followed')
 

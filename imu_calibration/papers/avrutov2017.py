@@ -7,11 +7,12 @@ The methods also run on means over windows of a real recording; then inputs are 
 """
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.papers.linear_least_squares import solve_linear
+from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 from imu_calibration.reference.reference_motion import skew
 
 COLUMNS = {
@@ -25,13 +26,13 @@ GIMBAL_ORDERS = tuple(''.join(order) for order in itertools.product('XYZ', repea
 """All 12 Euler and Tait-Bryan orders, the first rotation first."""
 
 
-def nominal_accelerometers(model='products'):
+def nominal_accelerometers(model: str = 'products') -> np.ndarray:
     """Return the coefficients of samples 1 ('linear', V and V/g) and 2 ('products', also V/g^2), shape (n_params, 3)."""
     matrix = np.array([[1.0, 0.01, -0.01], [-0.01, 1.0, 0.01], [0.01, -0.01, 1.0]])
     return _stacked(2.5, matrix, model)
 
 
-def nominal_gyroscopes(model='products', n11=0.1):
+def nominal_gyroscopes(model: str = 'products', n11: float = 0.1) -> np.ndarray:
     """Return the coefficients of samples 3 and 4, V, V/(deg/s), V/(deg/s)^2; the paper prints 0.01 for n11 and means 0.1, it seems."""
     matrix = np.array([[n11, 0.01, -0.02], [-0.01, 0.1, 0.01], [0.03, -0.01, 0.1]])
     return _stacked(2.0, matrix, model)
@@ -42,23 +43,23 @@ def _stacked(bias, matrix, model):
     return np.vstack([np.full(3, bias), matrix.T, products.T])[:len(COLUMNS[model])]
 
 
-def turn(order, alpha, beta, gamma):
+def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
     """
     Return body-from-base matrices of three gimbal turns, shape (n, 3, 3).
 
     Parameters
     ----------
     order : str
-        One of `GIMBAL_ORDERS`; the first letter is the axis of `alpha`, next to the base.
-    alpha, beta, gamma : array, shape (n,)
+        One of `GIMBAL_ORDERS`; the first letter is the axis of the first turn, next to the base.
+    angles : three arrays, shape (n,)
         Turns in rad, right-handed, each about the axis as the previous turns left it.
 
     """
-    first, second, third = (_axis_turn('XYZ'.index(letter), angle) for letter, angle in zip(order, (alpha, beta, gamma)))
+    first, second, third = (_axis_turn('XYZ'.index(letter), angle) for letter, angle in zip(order, angles, strict=True))
     return third @ second @ first
 
 
-def simultaneous_turn(angle, axis=(1.0, 1.0, 1.0)):
+def simultaneous_turn(angle: np.ndarray, axis: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
     """Return body-from-base matrices of one turn by `angle` (rad, shape (n,)) about `axis`: "three axes simultaneously", literally."""
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     cross = skew(axis)
@@ -66,12 +67,12 @@ def simultaneous_turn(angle, axis=(1.0, 1.0, 1.0)):
     return np.eye(3) - np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
-def equal_angles(step_deg=10.0, stop_deg=400.0):
+def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
     """Return the paper's turn angles in rad: 0 to `stop_deg` with the end, 41 positions (the paper says 40)."""
     return np.deg2rad(np.arange(0.0, stop_deg + step_deg / 2, step_deg))
 
 
-def gravity_readings(mat_bn, gravity_axis, tilt_rad=(0.0, 0.0)):
+def gravity_readings(mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
     """
     Return the specific force in g in the body frame, shape (n, 3), for gravity along one axis of the table's base.
 
@@ -88,32 +89,33 @@ def gravity_readings(mat_bn, gravity_axis, tilt_rad=(0.0, 0.0)):
     return mat_bn @ tilted_gravity(gravity_axis, tilt_rad)
 
 
-def series_3(rate_deg_s=None):
+def series_3(rate_deg_s: float | None = None) -> np.ndarray:
     """Return the rates of sample 3, deg/s, shape (n, 3): w, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, the paper says 10)."""
     rate = np.arange(0.0, 101.0, 10.0) if rate_deg_s is None else np.asarray(rate_deg_s, float)
     return np.column_stack([rate, np.sqrt(rate), np.cbrt(rate)])
 
 
-def series_4(rate_deg_s=None):
+def series_4(rate_deg_s: float | None = None) -> np.ndarray:
     """Return the rates of sample 4, deg/s, shape (n, 3): w, exp(-w), w^2 for w = 0, 1 ... 10."""
     rate = np.arange(0.0, 11.0) if rate_deg_s is None else np.asarray(rate_deg_s, float)
     return np.column_stack([rate, np.exp(-rate), rate**2])
 
 
-def factorial_rates(rate_deg_s=10.0, n_static=3):
+def factorial_rates(rate_deg_s: float = 10.0, n_static: int = 3) -> np.ndarray:
     """Return all eight sign combinations of one rate on each axis and `n_static` runs at rest, deg/s: the orthogonal design."""
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     return np.vstack([rate_deg_s * corners, np.zeros((n_static, 3))])
 
 
-def add_earth_rate(rate_deg_s, along_spin_axis_deg_s, axis_at_rest=(1.0, 0.0, 0.0)):
+def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float,
+                   axis_at_rest: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> np.ndarray:
     """Return body rates that include Earth rate's component along the spin axis; the rest averages out over full turns."""
     size = np.linalg.norm(rate_deg_s, axis=1, keepdims=True)
     axis = np.where(size > 0, rate_deg_s / np.where(size > 0, size, 1.0), axis_at_rest)
     return rate_deg_s + along_spin_axis_deg_s * axis
 
 
-def design_matrix(inputs, model='linear'):
+def design_matrix(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
     """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `COLUMNS`."""
     if model not in COLUMNS:
         raise InputError(f"model must be one of {', '.join(COLUMNS)}, got '{model}'; choose one of them")
@@ -122,7 +124,7 @@ def design_matrix(inputs, model='linear'):
     return np.column_stack([known[name] for name in COLUMNS[model]])
 
 
-def calibrate(inputs, outputs, model='linear', weights=None):
+def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *, weights: np.ndarray | None = None) -> LinearSolution:
     """
     Estimate bias, matrix and products of three sensors (eq. 3, 6, 9, 12), by orthogonal factors instead of normal equations.
 
@@ -146,16 +148,18 @@ def calibrate(inputs, outputs, model='linear', weights=None):
         When the turns do not determine every column.
 
     """
-    return solve_linear(design_matrix(inputs, model), outputs, COLUMNS[model], weights)
+    return solve_linear(design_matrix(inputs, model), outputs, COLUMNS[model], weights=weights)
 
 
-def calibrate_as_printed(inputs, outputs, model='linear'):
+def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear') -> np.ndarray:
     """Return X by the printed normal equations ``inv(G'G) G'U``, to show what they lose."""
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
 
 
-def calibrate_separate_sets(static, spinning, accelerometer_model='linear', gyroscope_model='linear'):
+def calibrate_separate_sets(static: tuple[np.ndarray, np.ndarray], spinning: tuple[np.ndarray, np.ndarray],
+                            accelerometer_model: str = 'linear', *,
+                            gyroscope_model: str = 'linear') -> tuple[LinearSolution, LinearSolution]:
     """
     Calibrate the two sets apart, as the paper does: accelerometers from positions at rest, gyroscopes from constant-rate runs.
 
@@ -190,7 +194,7 @@ def _base_axes(gravity_axis):
     return np.roll(np.eye(3), -index, axis=0)
 
 
-def tilted_gravity(gravity_axis, tilt_rad):
+def tilted_gravity(gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the unit gravity reaction in the base frame, shape (3,); `tilt_rad` are its components along the next two axes."""
     up, first, second = _base_axes(gravity_axis)
     return np.sqrt(1 - np.dot(tilt_rad, tilt_rad)) * up + tilt_rad[0] * first + tilt_rad[1] * second

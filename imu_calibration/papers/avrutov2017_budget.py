@@ -25,7 +25,7 @@ class TiltedSolution:
     """Last linear step; its `unit_covariance` holds for the names in `linear.param_names`."""
 
 
-def calibrate_with_tilt(mat_bn, outputs, gravity_axis, iterations=8):
+def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str, *, iterations: int = 8) -> TiltedSolution:
     """
     Estimate bias, matrix (n x 4 model) and two tilt parameters from all three accelerometers jointly, by Gauss-Newton steps.
 
@@ -51,7 +51,7 @@ def calibrate_with_tilt(mat_bn, outputs, gravity_axis, iterations=8):
     return TiltedSolution(coefficients, tilt, step)
 
 
-def reference_error(inputs, input_changes, coefficients, model='linear'):
+def reference_error(inputs: np.ndarray, input_changes: np.ndarray, coefficients: np.ndarray, *, model: str = 'linear') -> np.ndarray:
     """
     Return what wrong reference inputs do to the coefficients: ``G^+ dG X``, shape (n_params, 3).
 
@@ -63,7 +63,8 @@ def reference_error(inputs, input_changes, coefficients, model='linear'):
     return calibrate(inputs, true_outputs, model).values - coefficients
 
 
-def error_budget(inputs, coefficients, model='linear', noise_sd=0.0, common=None, scattered=None):
+def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'linear', *, noise_sd: float = 0.0,
+                 common: dict[str, np.ndarray] | None = None, scattered: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """
     Split the sd of every coefficient into its causes, which is what section V of the paper is after.
 
@@ -101,17 +102,17 @@ def error_budget(inputs, coefficients, model='linear', noise_sd=0.0, common=None
     return budget
 
 
-def tilt_changes(mat_bn, gravity_axis, tilt_sd_rad):
+def tilt_changes(mat_bn: np.ndarray, gravity_axis: str, tilt_sd_rad: float) -> np.ndarray:
     """Return the change of the readings by one sd of each tilt component, g, shape (2, n, 3), for `error_budget`."""
     return tilt_sd_rad * np.moveaxis(mat_bn @ _tilt_derivative(gravity_axis, np.zeros(2)), 2, 0)
 
 
-def encoder_changes(order, angles, gravity_axis, encoder_sd_rad):
+def encoder_changes(order: str, angles: np.ndarray, gravity_axis: str, *, encoder_sd_rad: float) -> np.ndarray:
     """Return the change of the readings by one sd of each gimbal angle, g, shape (3, n, 3), for `error_budget`."""
     changes = []
     for gimbal in range(3):
         shift = np.pi / 2 * np.eye(3)[gimbal][:, None]
-        later, earlier = (gravity_readings(turn(order, *(np.asarray(angles) + sign * shift)), gravity_axis) for sign in (1, -1))
+        later, earlier = (gravity_readings(turn(order, np.asarray(angles) + sign * shift), gravity_axis) for sign in (1, -1))
         changes.append(encoder_sd_rad * (later - earlier) / 2)  # exact: every element is affine in the sine and cosine of one angle
     return np.array(changes)
 

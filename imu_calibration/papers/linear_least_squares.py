@@ -39,31 +39,32 @@ class LinearSolution:
     """Singular values of the unit-column design, descending, shape (n_params,)."""
 
     @property
-    def unit_sd(self):
+    def unit_sd(self) -> np.ndarray:
         """Sd of each parameter for output noise of sd 1, shape (n_params,)."""
         return np.sqrt(np.diag(self.unit_covariance))
 
     @property
-    def sd(self):
+    def sd(self) -> np.ndarray:
         """Sd of each parameter with the estimated sigma, shape of `values`."""
         return np.multiply.outer(self.unit_sd, self.sigma)
 
     @property
-    def covariance(self):
+    def covariance(self) -> np.ndarray:
         """Covariance with the estimated sigma, shape (n_params, n_params) or (n_outputs, n_params, n_params)."""
         return np.multiply.outer(self.sigma**2, self.unit_covariance)
 
     @property
-    def chi2_per_dof(self):
+    def chi2_per_dof(self) -> np.ndarray:
         """Weighted residual sum of squares per degree of freedom, shape of `sigma`."""
         return self.sigma**2
 
-    def value(self, name):
+    def value(self, name: str) -> float:
         """Return the parameter called `name`."""
         return self.values[self.param_names.index(name)]
 
 
-def solve_linear(design, outputs, param_names, weights=None, rank_tolerance=RANK_TOLERANCE):
+def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str, ...], *, weights: np.ndarray | None = None,
+                 rank_tolerance: float = RANK_TOLERANCE) -> LinearSolution:
     """
     Solve ``outputs = design @ values`` by least squares through the SVD of the unit-column design.
 
@@ -112,19 +113,19 @@ def solve_linear(design, outputs, param_names, weights=None, rank_tolerance=RANK
                           _ratio(raw), _ratio(singular), singular)
 
 
-def numerical_rank(design, rank_tolerance=RANK_TOLERANCE):
+def numerical_rank(design: np.ndarray, rank_tolerance: float = RANK_TOLERANCE) -> int:
     """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
     singular = _scaled_svd(np.asarray(design, float))[2]
     return int(np.sum(singular > rank_tolerance * max(singular[0], np.finfo(float).tiny)))
 
 
-def condition_numbers(design):
+def condition_numbers(design: np.ndarray) -> tuple[float, float]:
     """Return (condition number as it is, condition number with unit-norm columns); infinite when a column is zero."""
     design = np.asarray(design, float)
     return _ratio(np.linalg.svd(design, compute_uv=False)), _ratio(_scaled_svd(design)[2])
 
 
-def null_directions(design, param_names, rank_tolerance=RANK_TOLERANCE):
+def null_directions(design: np.ndarray, param_names: tuple[str, ...], rank_tolerance: float = RANK_TOLERANCE) -> list[dict[str, float]]:
     """
     Return the combinations of parameters that leave every output unchanged, as a list of {name: weight}.
 
@@ -137,7 +138,7 @@ def null_directions(design, param_names, rank_tolerance=RANK_TOLERANCE):
     return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
-def predicted_sd(design, weights=None, sigma=1.0):
+def predicted_sd(design: np.ndarray, weights: np.ndarray | None = None, sigma: float = 1.0) -> np.ndarray:
     """
     Return the sd that each parameter will have, before any data exist; infinite where the design does not reach it.
 
@@ -172,17 +173,17 @@ class ToleranceScaled:
     """Predicted sd over tolerance of each parameter, shape (n_params,); infinite when not reached."""
 
     @property
-    def cond(self):
+    def cond(self) -> float:
         """Largest over smallest singular value."""
         return _ratio(self.singular_values)
 
-    def weak_directions(self, param_names, threshold=1.0, share=0.1):
+    def weak_directions(self, param_names: tuple[str, ...], threshold: float = 1.0, share: float = 0.1) -> list[dict[str, float]]:
         """Return [{name: weight}] for directions whose sd exceeds tolerance/threshold, the weakest first."""
         rows = self.directions[self.singular_values < threshold][::-1]
         return [{name: float(w) for name, w in zip(param_names, row) if abs(w) >= share * np.max(np.abs(row))} for row in rows]
 
 
-def tolerance_scaled(design, tolerances, sigma=1.0):
+def tolerance_scaled(design: np.ndarray, tolerances: np.ndarray, sigma: float = 1.0) -> ToleranceScaled:
     """
     Scale a design to parameters in units of their tolerances and outputs in units of their noise.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.papers.linear_least_squares import solve_linear
+from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
 """m/s^2, the g of the paper's units."""
 TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])
@@ -41,50 +41,50 @@ class StaticModel:
     """Outputs at zero force, shape (3,)."""
 
     @property
-    def matrix(self):
+    def matrix(self) -> np.ndarray:
         """K C' (eq. 7), shape (3, 3)."""
         return self.scale[:, None] * self.cosines
 
     @property
-    def angles_deg(self):
+    def angles_deg(self) -> np.ndarray:
         """Installation angles in degrees, shape (3, 3)."""
         return np.rad2deg(np.arccos(np.clip(self.cosines, -1, 1)))
 
     @property
-    def bias_force(self):
+    def bias_force(self) -> np.ndarray:
         """Equivalent zero bias in the body frame (eq. 8), force units, shape (3,)."""
         return np.linalg.solve(self.matrix, self.bias)
 
-    def predict(self, force_b):
+    def predict(self, force_b: np.ndarray) -> np.ndarray:
         """Return the outputs for specific forces in the body frame, shape (n, 3)."""
         return np.asarray(force_b) @ self.matrix.T + self.bias
 
-    def invert(self, outputs):
+    def invert(self, outputs: np.ndarray) -> np.ndarray:
         """Return specific forces in the body frame (eq. 6) by the true inverse, shape (n, 3)."""
         return np.linalg.solve(self.matrix, (np.asarray(outputs) - self.bias).T).T
 
-    def invert_as_printed(self, outputs):
+    def invert_as_printed(self, outputs: np.ndarray) -> np.ndarray:
         """Return specific forces with the transpose taken for the inverse of the cosines, as eq. 3 and 4 claim."""
         return (np.asarray(outputs) - self.bias) / self.scale @ self.cosines
 
 
-def printed_static_model():
+def printed_static_model() -> StaticModel:
     """Return Table 1 as it stands; its second row is no unit vector."""
     return StaticModel(TABLE_1_SCALE, np.cos(np.deg2rad(TABLE_1_ANGLES_DEG)), TABLE_1_BIAS)
 
 
-def static_model_from_matrix(matrix, bias):
+def static_model_from_matrix(matrix: np.ndarray, bias: np.ndarray) -> StaticModel:
     """Split a sensor matrix into scale factors and unit rows of direction cosines."""
     scale = np.linalg.norm(matrix, axis=1)
     return StaticModel(scale, matrix / scale[:, None], np.asarray(bias, float))
 
 
-def six_positions(force=1.0):
+def six_positions(force: float = 1.0) -> np.ndarray:
     """Return the specific forces of the six faces, shape (6, 3): x, y, z up, then x, y, z down."""
     return force * np.vstack([np.eye(3), -np.eye(3)])
 
 
-def fit_static(force_b, outputs, weights=None):
+def fit_static(force_b: np.ndarray, outputs: np.ndarray, weights: np.ndarray | None = None) -> tuple[StaticModel, LinearSolution]:
     """
     Estimate scale factors, nine installation angles and zero biases from means at rest (section 3.1, step 4).
 
@@ -104,11 +104,12 @@ def fit_static(force_b, outputs, weights=None):
 
     """
     design = np.column_stack([np.ones(len(force_b)), force_b])
-    solution = solve_linear(design, outputs, ('bias', 'x', 'y', 'z'), weights)
+    solution = solve_linear(design, outputs, ('bias', 'x', 'y', 'z'), weights=weights)
     return static_model_from_matrix(solution.values[1:].T, solution.values[0]), solution
 
 
-def closed_form(means_static, means_spin, rate, directions, spin_axes=None, as_printed=False):
+def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *, directions: np.ndarray,
+                spin_axes: np.ndarray | None = None, as_printed: bool = False) -> np.ndarray | None:
     """
     Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (..., 3, 3), one sensor per row.
 
@@ -150,13 +151,13 @@ def closed_form(means_static, means_spin, rate, directions, spin_axes=None, as_p
     return numerator / (2 * rate**2 * cosines) @ axes
 
 
-def closed_form_sd(noise_sd, rate, directions, spin_axes=None):
+def closed_form_sd(noise_sd: float, rate: float, directions: np.ndarray, *, spin_axes: np.ndarray | None = None) -> np.ndarray:
     """Return the sd of each arm along the spin axes, ``sqrt(6) noise_sd / (2 rate^2 |cos|)``, shape (3, 3), one sensor per row."""
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     return np.sqrt(6) * noise_sd / (2 * rate**2 * np.abs(np.asarray(directions, float) @ axes.T))
 
 
-def average_rates(arms, rates, weighted=True):
+def average_rates(arms: np.ndarray, rates: np.ndarray, weighted: bool = True) -> np.ndarray:
     """Average closed-form arms of several spin rates, shape (n_rates, 3, 3), with weights rate^4 (their inverse variances) or plainly."""
     rates = np.asarray(rates, float)
     return np.average(arms, axis=0, weights=rates**4 if weighted else None)
@@ -182,13 +183,14 @@ class AxisReading:
     """Reading after compensation, g."""
 
     @property
-    def improvement(self):
+    def improvement(self) -> float:
         """Return the error before over the error after, in sizes."""
         after = abs(self.after_g - self.theoretical_g)
         return abs(self.before_g - self.theoretical_g) / after if after > 0 else np.inf
 
 
-def axis_readings(measured, compensated, reference, rate, gravity, within_deg=5.0, still_deg_s=0.2):
+def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.ndarray, *, rate: np.ndarray,
+                  gravity: float, within_deg: float = 5.0, still_deg_s: float = 0.2) -> list[AxisReading]:
     """
     Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
 

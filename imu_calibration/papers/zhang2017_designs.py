@@ -1,5 +1,6 @@
 """Runs of a turntable that carries a tri-axis accelerometer, and the designs made of them that are compared for Zhang's lever arms."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ class Run:
     """Sd of one row, m/s^2."""
 
 
-def face(up, noise_sd, tilt=0.0, azimuth=0.0):
+def face(up: np.ndarray, noise_sd: float, tilt: float = 0.0, *, azimuth: float = 0.0) -> Run:
     """Return one position at rest; the table is off level by `tilt` (rad) towards `azimuth` about the body's up axis."""
     up = _unit(up)
     level = _square_to(up)
@@ -37,13 +38,14 @@ def face(up, noise_sd, tilt=0.0, azimuth=0.0):
     return Run('face', STANDARD_GRAVITY * force[None], np.zeros((1, 3)), np.zeros((1, 3)), noise_sd)
 
 
-def spin(axis, rate_deg_s, noise_sd):
+def spin(axis: np.ndarray, rate_deg_s: float, noise_sd: float) -> Run:
     """Return a spin at constant rate about a vertical axis; gravity and arms give constant readings."""
     axis = _unit(axis)[None]
     return Run('spin', STANDARD_GRAVITY * axis, np.deg2rad(rate_deg_s) * axis, np.zeros((1, 3)), noise_sd)
 
 
-def oscillation(axis, amplitude_deg, frequency_hz, noise_sd, n_samples=100, delay=0.0):
+def oscillation(axis: np.ndarray, amplitude_deg: float, frequency_hz: float, *, noise_sd: float,
+                n_samples: int = 100, delay: float = 0.0) -> Run:
     """Return one period of ``amplitude sin(2 pi f t)`` about a vertical axis; `delay` (s) is how late the samples are stamped."""
     axis, angular = _unit(axis), 2 * np.pi * frequency_hz
     phase = angular * (np.arange(n_samples) / n_samples / frequency_hz - delay)
@@ -52,7 +54,8 @@ def oscillation(axis, amplitude_deg, frequency_hz, noise_sd, n_samples=100, dela
                np.outer(-amplitude * angular**2 * np.sin(phase), axis), noise_sd)
 
 
-def two_axis(inner, inner_deg_s, outer_deg_s, noise_sd, n_samples=100, delay=0.0):
+def two_axis(inner: np.ndarray, inner_deg_s: float, outer_deg_s: float, *, noise_sd: float, n_samples: int = 100,
+             delay: float = 0.0) -> Run:
     """Return one turn of a horizontal body axis `inner` at constant rate while the vertical outer axis turns as well."""
     inner, (inner_rate, outer_rate) = _unit(inner), np.deg2rad([inner_deg_s, outer_deg_s])
     turned = inner_rate * (np.arange(n_samples) / n_samples * 2 * np.pi / abs(inner_rate) - delay)
@@ -62,7 +65,7 @@ def two_axis(inner, inner_deg_s, outer_deg_s, noise_sd, n_samples=100, delay=0.0
     return Run('two-axis', STANDARD_GRAVITY * up, rate, alpha, noise_sd)
 
 
-def design_runs(name, sample_sd=1e-3 * STANDARD_GRAVITY, n_samples=100):
+def design_runs(name: str, sample_sd: float = 1e-3 * STANDARD_GRAVITY, n_samples: int = 100) -> list[Run]:
     """
     Return the runs of a named design: six faces and nine dynamic runs of `n_samples` samples each.
 
@@ -83,23 +86,24 @@ def design_runs(name, sample_sd=1e-3 * STANDARD_GRAVITY, n_samples=100):
         return runs + [spin(axis, rate, mean_sd) for axis in skewed_axes(skew_deg) for rate in (100, 150, 200)]
     if name == 'O':
         kinds = ((10, 1.0), (5, 2.0), (90, 0.5))
-        return runs + [oscillation(axis, *kind, sample_sd, n_samples) for axis in axes for kind in kinds]
-    return (runs + [spin(axis, 200, mean_sd) for axis in axes] + [oscillation(axis, 10, 1.0, sample_sd, n_samples) for axis in axes]
-            + [two_axis(axis, 200, 200, sample_sd, n_samples) for axis in axes])
+        return runs + [oscillation(axis, *kind, noise_sd=sample_sd, n_samples=n_samples) for axis in axes for kind in kinds]
+    return (runs + [spin(axis, 200, mean_sd) for axis in axes]
+            + [oscillation(axis, 10, 1.0, noise_sd=sample_sd, n_samples=n_samples) for axis in axes]
+            + [two_axis(axis, 200, 200, noise_sd=sample_sd, n_samples=n_samples) for axis in axes])
 
 
-def skewed_axes(skew_deg):
+def skewed_axes(skew_deg: float) -> np.ndarray:
     """Return three orthonormal spin axes, one per row, for a fixture turned by `skew_deg` about the body diagonal (1, 1, 1)."""
     return rotation_from_vector(np.deg2rad(skew_deg) * np.ones(3) / np.sqrt(3)).T
 
 
-def average_headings(tilt, up, noise_sd, n_headings=4):
+def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings: int = 4) -> Run:
     """Return the mean of a tilted position over equally spaced headings: what takes levelling out of the static reference."""
-    parts = [face(up, noise_sd, tilt, 2 * np.pi * k / n_headings) for k in range(n_headings)]
+    parts = [face(up, noise_sd, tilt, azimuth=2 * np.pi * k / n_headings) for k in range(n_headings)]
     return replace(parts[0], force=np.mean([part.force for part in parts], axis=0))
 
 
-def stack_runs(runs):
+def stack_runs(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return forces (n, 3), lever-arm matrices (n, 3, 3) and noise sd (n,) of all rows of the runs in order."""
     noise = np.concatenate([np.full(len(run.force), run.noise_sd) for run in runs])
     arm_matrix = np.concatenate([lever_matrix(run.rate, run.alpha) for run in runs])

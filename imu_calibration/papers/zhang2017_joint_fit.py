@@ -6,14 +6,15 @@ Static and dynamic runs in one least-squares system: bias, matrix row and lever 
 the nonlinear fit runs on it, for many draws of noise at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import NotObservableError
-from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, solve_linear, tolerance_scaled
-from imu_calibration.papers.zhang2017_designs import stack_runs
+from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, ToleranceScaled, solve_linear, tolerance_scaled
+from imu_calibration.papers.zhang2017_designs import Run, stack_runs
 
 PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
 """Parameters of one accelerometer: m/s^2, 1, m."""
@@ -21,20 +22,21 @@ TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e
 """0.1 mg, 0.1 mg/g, 0.1 mm."""
 
 
-def predict(runs, values):
+def predict(runs: Sequence[Run], values: np.ndarray) -> np.ndarray:
     """Return the readings of one accelerometer, shape (n_rows,), for parameters in `PARAM_NAMES` order."""
     force, arm_matrix, _ = stack_runs(runs)
     return values[0] + (force + arm_matrix @ values[4:]) @ values[1:4]
 
 
-def jacobian(runs, values):
+def jacobian(runs: Sequence[Run], values: np.ndarray) -> np.ndarray:
     """Return the derivative of the readings by `PARAM_NAMES`, each row over its noise sd, shape (n_rows, 7)."""
     force, arm_matrix, noise = stack_runs(runs)
     columns = [np.ones(len(force)), force + arm_matrix @ values[4:], np.einsum('j,njk->nk', values[1:4], arm_matrix)]
     return np.column_stack(columns) / noise[:, None]
 
 
-def judge_design(runs, matrix, arms, tolerances=TOLERANCES):
+def judge_design(runs: Sequence[Run], matrix: np.ndarray, arms: np.ndarray, *,
+                 tolerances: np.ndarray = TOLERANCES) -> list[ToleranceScaled]:
     """
     Predict what a design can determine, one `ToleranceScaled` per accelerometer: sd over tolerance and weak directions.
 
@@ -44,12 +46,12 @@ def judge_design(runs, matrix, arms, tolerances=TOLERANCES):
     return [tolerance_scaled(jacobian(runs, np.concatenate([[0.0], m, r])), tolerances) for m, r in zip(matrix, arms)]
 
 
-def weak_arms(judged):
+def weak_arms(judged: Sequence[ToleranceScaled]) -> list[str]:
     """Return names such as 'r_xy' (sensor x, component y) of arms whose predicted sd exceeds the tolerance."""
     return [f'r_{sensor}{PARAM_NAMES[k][-1]}' for sensor, one in zip('xyz', judged) for k in (4, 5, 6) if one.sd_over_tolerance[k] > 1]
 
 
-def arm_errors(runs, matrix_row, arm, rng, n_draws):
+def arm_errors(runs: Sequence[Run], matrix_row: np.ndarray, arm: np.ndarray, *, rng: np.random.Generator, n_draws: int) -> np.ndarray:
     """Draw errors of one estimated arm from the covariance that the runs predict, m, shape (n_draws, 3)."""
     factor = np.linalg.qr(jacobian(runs, np.concatenate([[0.0], matrix_row, arm])), mode='r')
     return np.linalg.solve(factor, rng.normal(size=(len(PARAM_NAMES), n_draws))).T[:, 4:]
@@ -71,12 +73,12 @@ class JointFit:
     """Gauss-Newton steps taken."""
 
     @property
-    def sd(self):
+    def sd(self) -> np.ndarray:
         """Sd of the parameters, shape (n_draws, 7)."""
         return np.sqrt(np.einsum('nii->ni', self.covariance))
 
 
-def fit_joint(runs, readings, start=None, max_iterations=30):
+def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | None = None, *, max_iterations: int = 30) -> JointFit:
     """
     Fit bias, matrix row and arm of one accelerometer to static and dynamic runs jointly.
 
@@ -117,7 +119,7 @@ def fit_joint(runs, readings, start=None, max_iterations=30):
     return JointFit(values, covariance, outside + np.sum(rest**2, axis=1), len(readings) - len(PARAM_NAMES), iteration)
 
 
-def fit_triad(runs, readings):
+def fit_triad(runs: Sequence[Run], readings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[JointFit]]:
     """Fit the three accelerometers of a recording, readings of shape (n_rows, 3); return matrix (3, 3), arms (3, 3), bias (3,), fits."""
     fits = [fit_joint(runs, column) for column in np.asarray(readings, float).T]
     values = np.array([fit.values[0] for fit in fits])
@@ -166,5 +168,5 @@ def _static_start(runs, readings):
     force, _, noise = stack_runs(runs)
     still = np.concatenate([np.full(len(run.force), not (np.any(run.rate) or np.any(run.alpha))) for run in runs])
     design = np.column_stack([np.ones(np.sum(still)), force[still]])
-    static = solve_linear(design, readings[still], PARAM_NAMES[:4], 1 / noise[still] ** 2).values
+    static = solve_linear(design, readings[still], PARAM_NAMES[:4], weights=1 / noise[still] ** 2).values
     return np.concatenate([static.T, np.zeros((readings.shape[1], 3))], axis=1)

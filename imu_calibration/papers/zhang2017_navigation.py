@@ -1,12 +1,13 @@
 """Zhang's navigation claims as simulations: at rest with drift between runs, in constant spins, and while tumbling."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from imu_calibration import navigation
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.papers.zhang2017 import fit_static, six_positions, static_model_from_matrix
+from imu_calibration.papers.zhang2017 import StaticModel, fit_static, six_positions, static_model_from_matrix
 from imu_calibration.reference.reference_motion import lever_matrix
 
 
@@ -23,13 +24,14 @@ class StaticNavigation:
     position_after: np.ndarray
     """m, shape (n_draws,)."""
 
-    def medians(self):
+    def medians(self) -> tuple[float, ...]:
         """Return medians: velocity before, position before, velocity after, position after."""
         return tuple(float(np.median(values)) for values in
                      (self.velocity_before, self.position_before, self.velocity_after, self.position_after))
 
 
-def static_navigation(model, drift_sd_g, rng, n_draws=400, seconds=50.0, noise_sd_g=1e-3, sample_rate=100.0, calibration_seconds=60.0):
+def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Generator, *, n_draws: int = 400, seconds: float = 50.0,
+                      noise_sd_g: float = 1e-3, sample_rate: float = 100.0, calibration_seconds: float = 60.0) -> StaticNavigation:
     """
     Calibrate in six positions, then navigate at rest with x up, attitude known.
 
@@ -73,13 +75,14 @@ def _noise_at_end(rng, noise_sd, seconds, sample_rate):
     return velocity[-1], position[-1]
 
 
-def size_effect_error(cosines, arms, rate, alpha):
+def size_effect_error(cosines: np.ndarray, arms: np.ndarray, rate: np.ndarray, *, alpha: np.ndarray) -> np.ndarray:
     """Return the error in the body frame, m/s^2, shape (n, 3), of accelerometers that are taken to sit in one point (eq. 17)."""
     along_axes = np.einsum('ij,njk,ik->ni', cosines, lever_matrix(rate, alpha), arms)
     return np.linalg.solve(cosines, along_axes.T).T
 
 
-def spin_growth(cosines, arms, axis, rate_deg_s=100.0, seconds=100.0, sample_rate=100.0):
+def spin_growth(cosines: np.ndarray, arms: np.ndarray, axis: tuple[float, float, float], *, rate_deg_s: float = 100.0,
+                seconds: float = 100.0, sample_rate: float = 100.0) -> dict[str, Any]:
     """
     Return errors of an uncompensated size effect in a constant spin: (velocity, position) in n, the same summed in the body frame.
 
@@ -89,7 +92,7 @@ def spin_growth(cosines, arms, axis, rate_deg_s=100.0, seconds=100.0, sample_rat
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
     rate = np.tile(np.deg2rad(rate_deg_s) * axis, (len(time), 1))
-    error = size_effect_error(cosines, arms, rate, np.zeros_like(rate))
+    error = size_effect_error(cosines, arms, rate, alpha=np.zeros_like(rate))
     mat_ns = navigation.rotation_from_vector(rate * time[:, None])
     return {'time': time, 'level': navigation.error_growth(time, error, mat_ns), 'body': navigation.error_growth(time, error),
             'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY}
@@ -109,7 +112,8 @@ class Tumbling:
     """rad/s^2, shape (n, 3)."""
 
 
-def tumble(amplitude_deg, frequency_hz, phase=(0.3, 1.1, 2.0), seconds=60.0, sample_rate=200.0):
+def tumble(amplitude_deg: tuple[float, float, float], frequency_hz: tuple[float, float, float],
+           phase: tuple[float, float, float] = (0.3, 1.1, 2.0), *, seconds: float = 60.0, sample_rate: float = 200.0) -> Tumbling:
     """Return a `Tumbling` motion; each argument has one value per body axis, or one for all."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
     angular = 2 * np.pi * np.asarray(frequency_hz, float)
@@ -119,14 +123,14 @@ def tumble(amplitude_deg, frequency_hz, phase=(0.3, 1.1, 2.0), seconds=60.0, sam
     return Tumbling(time, navigation.integrate_attitude(time, rate), rate, alpha)
 
 
-def arm_responses(motion, cosines):
+def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return velocity and position histories per metre of each arm component (sensor, component), shape (9, n, 3) each."""
     unit_arms = np.eye(9).reshape(9, 3, 3)
-    errors = np.array([size_effect_error(cosines, arms, motion.rate, motion.alpha) for arms in unit_arms])
+    errors = np.array([size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms])
     return navigation.error_growth(motion.time, errors, motion.mat_ns)
 
 
-def peaks(responses, arms, every=5):
+def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int = 5) -> np.ndarray:
     """Return the largest velocity and position error for arm errors of shape (n_draws, 3, 3), shape (2, n_draws)."""
     flat = np.asarray(arms, float).reshape(-1, 9)
     out = []

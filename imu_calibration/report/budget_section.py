@@ -1,7 +1,10 @@
 """The error budget, drawn and in numbers: noise beside what the reference contributes."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.report.figures import INK, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.report.observability_section import short_name
@@ -12,11 +15,11 @@ LOWEST = 1e-5
 """Shares of the tolerance below this are drawn at the edge."""
 
 
-def budget_section(result):
+def budget_section(result: CalibrationResult) -> dict[str, Any]:
     """Return the figure, the rows (largest component of each effect) and what was assumed."""
     budget = result.error_budget()
     return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget),
-                           'Error budget of each effect by cause, in tolerances'),
+                           label='Error budget of each effect by cause, in tolerances'),
             'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],
             'rows': _rows(result, budget)}
 

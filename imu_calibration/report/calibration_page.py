@@ -1,6 +1,10 @@
 """The report of a calibration: the verdict first, then everything that supports it."""
 
+from typing import Any
+
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -14,7 +18,7 @@ from imu_calibration.report.residuals import UNIT, residual_section
 from imu_calibration.report.worked_sample import worked_sample
 
 
-def calibration_report(result):
+def calibration_report(result: CalibrationResult) -> str:
     """
     Return the report of a calibration, on a table or by hand, as one HTML page that needs nothing else.
 
@@ -35,7 +39,7 @@ def calibration_report(result):
                   moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
 
 
-def tiles(result, errors, navigation):
+def tiles(result: CalibrationResult, errors: WindowErrors, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
     """Return the figures that matter most: what was determined, and the errors before and after."""
     asked = list(result.calibration.requested.values())
     found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]

@@ -1,8 +1,12 @@
 """The report of a diagnosis: the finding as a sentence, the plot that convinces, and the evidence on everything that was asked."""
 
+
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.diagnosis.result import Diagnosis, Finding
+from imu_calibration.diagnosis.traces import Traces
+from imu_calibration.diagnosis.workflow import DiagnosisResult
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
@@ -20,7 +24,7 @@ CLEAR = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
 
-def diagnosis_report(result):
+def diagnosis_report(result: DiagnosisResult) -> str:
     """
     Return the report of a diagnosis as one HTML page that needs nothing else; the same input gives the same bytes.
 
@@ -100,19 +104,19 @@ def _finding(diagnosis, finding, number):
             'motion': finding.separating_motion, 'figure': draw_finding(diagnosis, finding, number)}
 
 
-def draw_finding(diagnosis, finding, number):
+def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> str:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), label)
+    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), label=label)
 
 
-def draw_over_time(result):
+def draw_over_time(result: DiagnosisResult) -> str:
     """Return the size of the residuals over time, before and after the extension, as SVG."""
     return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, SPAN[result.observations]),
-                'Residuals over time before and after the extension')
+                label='Residuals over time before and after the extension')
 
 
-def variables(traces):
+def variables(traces: Traces) -> dict[str, tuple[str, np.ndarray]]:
     """Return {label: (kind, values)} of everything that a residual may be drawn against, in people's units."""
     found = {'time, s': ('time', traces.time)}
     if traces.temperature_c is not None:
@@ -125,7 +129,7 @@ def variables(traces):
     return found
 
 
-def explained_share(values, signal):
+def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
     """Return the share of the variance of `signal` that its means over bins of `values` carry."""
     edges = np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1])
     index = np.searchsorted(edges, values)
@@ -135,7 +139,7 @@ def explained_share(values, signal):
     return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
 
 
-def cause_of(traces, finding):
+def cause_of(traces: Traces, finding: Finding) -> tuple[str, int, str, np.ndarray | None]:
     """Return (sensor, axis, label, values): what the residual of a finding is drawn against, and for which component."""
     sensor = finding.gain.sensor
     signal = traces.before[sensor] - traces.after[sensor]
@@ -218,12 +222,12 @@ def _candidate(row):
             'mark': row.verdict == 'found'}
 
 
-def chance(probability):
+def chance(probability: float) -> str:
     """Return a probability as text; what underflows is not nothing."""
     return text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
 
 
-def in_type(sentence):
+def in_type(sentence: str) -> str:
     """Return a sentence with printed signs."""
     return sentence.replace(' +- ', ' ± ').replace(' -', ' −').replace('^2', '²').replace('^3', '³')
 

@@ -3,6 +3,8 @@
 import io
 import math
 import re
+from collections.abc import Callable
+from typing import Any
 
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
 BEFORE, AFTER = '#c0561b', '#1f66a8'
@@ -10,7 +12,7 @@ AXIS = {'x': '#c44e1d', 'y': '#2b8a57', 'z': '#2566b0'}
 """Colours of the three axes, everywhere the same."""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'static': 'o', 'spin': 's', 'dynamic': '^', 'turn': 's'}
-STYLE = {
+STYLE: Any = {
     'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold',
     'axes.titlelocation': 'left', 'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8,
     'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID,
@@ -23,7 +25,7 @@ STYLE = {
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
-def draw(name, size, paint, label):
+def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, label: str) -> str:
     """
     Return a figure as SVG for the page.
 
@@ -72,7 +74,7 @@ def _inside(svg, label):
     return re.sub(r"font: ([0-9.]+)px[^;\"]*", r'font-size: \1px', svg)
 
 
-def log_axis(axis):
+def log_axis(axis: Any) -> None:
     """Make an axis logarithmic with decades only, written as plain text (mathtext takes most of the time of a page)."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
     axis.axes.set(**{f'{axis.axis_name}scale': 'log'})
@@ -81,7 +83,7 @@ def log_axis(axis):
     axis.set_major_formatter(FuncFormatter(lambda value, _: decade(value)))
 
 
-def decade(value):
+def decade(value: float) -> str:
     """Return a power of ten as text: plain from 0.001 to 1000, with a raised exponent beyond."""
     exponent = round(math.log10(value))
     if -3 <= exponent <= 3:
@@ -89,7 +91,7 @@ def decade(value):
     return '10' + str(exponent).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 
-def axis_legend(axes, where='upper right', **more):
+def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     """Draw the legend of the three sensor axes."""
     from matplotlib.lines import Line2D
     axes.legend(handles=[Line2D([], [], color=colour, marker='o', markersize=4, lw=0, label=name) for name, colour in AXIS.items()],

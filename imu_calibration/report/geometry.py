@@ -1,8 +1,11 @@
 """The scale factors, installation angles and lever arms that follow from the parameters, in numbers and drawn."""
 
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
 from imu_calibration.constants import DEG
 from imu_calibration.effects.base import SENSORS, Role
@@ -13,7 +16,7 @@ from imu_calibration.units import decimals
 PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-def derived_section(result):
+def derived_section(result: CalibrationResult) -> list[dict[str, Any]]:
     """Return scale factors, angles and biases of both sensors, as rows of text."""
     return [_derived(derive(result.calibration, sensor), result.options.nominal) for sensor in SENSORS]
 
@@ -28,14 +31,14 @@ def _derived(found, nominal):
     return {'sensor': found.sensor, 'lines': lines, 'ppm': ppm, 'angles': angles, 'between': between}
 
 
-def lever_section(result):
+def lever_section(result: CalibrationResult) -> dict[str, Any] | None:
     """Return the drawing of the lever arms, or None when the model has none."""
     if result.calibration.of('accelerometer', Role.ARMS) is None:
         return None
     gauge = result.calibration.gauge.get('origin')
     origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
     return {'figure': draw('lever-arms', (8.6, 3.15), _Arms(result.calibration),
-                           'Sensitive points of the three accelerometers in three views'), 'origin': origin}
+                           label='Sensitive points of the three accelerometers in three views'), 'origin': origin}
 
 
 class _Arms:

@@ -1,9 +1,12 @@
 """What the errors become in navigation: dead reckoning from the windows of this recording, before and after calibration."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
@@ -33,12 +36,12 @@ class Growth:
     position: np.ndarray
     """Size of the position error, m, shape (n_runs, n)."""
 
-    def last(self):
+    def last(self) -> tuple[float, float]:
         """Return the medians at the end: velocity (m/s), position (m)."""
         return float(np.median(self.velocity[:, -1])), float(np.median(self.position[:, -1]))
 
 
-def navigation_section(result, errors):
+def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
     """Return figures and end values of dead reckoning at rest and in motion."""
     before, moving = rest_growth(errors), motion_growth(result)
     found = {'rest': None, 'moving': None}
@@ -54,12 +57,12 @@ def navigation_section(result, errors):
 def _shown(name, before, after, parts=None):
     (velocity_before, position_before), (velocity_after, position_after) = before.last(), after.last()
     return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after, parts or {}),
-                           'Growth of velocity and position errors, before and after calibration'),
+                           label='Growth of velocity and position errors, before and after calibration'),
             'seconds': text(before.time[-1]), 'runs': len(before.velocity), 'velocity': (text(velocity_before), text(velocity_after)),
             'position': (text(position_before), text(position_after))}
 
 
-def rest_growth(errors):
+def rest_growth(errors: WindowErrors) -> Growth | None:
     """
     Return the Growth of uncalibrated runs of 50 s at rest, one per pose of the recording; None without poses.
 
@@ -81,7 +84,7 @@ def _rest_run(time, force, force_error, rate_error):
     return strapdown(time, np.tile(force + force_error, (count, 1)), np.tile(rate_error, (count, 1)), gravity, attitude)
 
 
-def expected_growth(result, errors):
+def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Growth, dict[str, Growth]]:
     """
     Return the expected Growth (rms) at rest after calibration, and its parts: parameters, instability, noise.
 
@@ -117,7 +120,7 @@ def _constant_growth(time, variances, gravity):
     return Growth(time, np.hypot(force * time, gravity * rate * time**2 / 2), np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6))
 
 
-def noise_densities(result):
+def noise_densities(result: CalibrationResult) -> list[float]:
     """Return the densities of accelerometer and gyroscope noise at low frequency, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
     found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
     return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * result.period))
@@ -129,7 +132,7 @@ def _growth(time, runs):
                   np.array([np.linalg.norm(run.position_n, axis=1) for run in runs]))
 
 
-def motion_growth(result):
+def motion_growth(result: CalibrationResult) -> tuple[Growth, ...] | None:
     """
     Return (before, after) Growth over the moving stretches of the recording, each from rest at the true attitude, or None.
 

@@ -14,7 +14,7 @@ from imu_calibration.units import SHOWN_OF_NOISE
 
 def draw_curve(result: NoiseIdentification, sensor: str) -> str:
     """Return the Allan deviations of the axes of one sensor as SVG."""
-    return draw(f'allan-{sensor}', (8.6, 5.0), _Curves(result, sensor), f'Allan deviation of the {sensor} against averaging time')
+    return draw(f'allan-{sensor}', (8.6, 5.0), _Curves(result, sensor), label=f'Allan deviation of the {sensor} against averaging time')
 
 
 class _Curves:

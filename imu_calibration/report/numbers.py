@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.units import for_people, significant, with_sd
 
 
-def text(value, digits=3):
+def text(value: float | None, digits: int = 3) -> str:
     """Return a number with `digits` significant digits and a real minus sign; an en dash for what is not a number."""
     if value is None or not np.isfinite(value):
         return '–'
@@ -20,25 +20,25 @@ def _raised(power):
     return str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 
-def fixed(value, places):
+def fixed(value: float, places: int) -> str:
     """Return a number with so many decimals and a real minus sign."""
     if value is None or not np.isfinite(value):
         return '–'
     return f'{round(value, places) + 0.0:.{places}f}'.replace('-', '−')
 
 
-def pair(value, sd):
+def pair(value: float, sd: float) -> tuple[str, str]:
     """Return (value, sd) as text with the digits that the sd supports."""
     return tuple(part.replace('-', '−') for part in with_sd(value, sd))
 
 
-def people(value, sd, unit):
+def people(value: float, sd: float, unit: str) -> tuple[str, str, str]:
     """Return (value, sd, unit) as text in people's units; dimensionless stays plain."""
     factor, shown = for_people(unit)
     return (*pair(value * factor, sd * factor), '' if shown == '1' else shown)
 
 
-def in_unit(value, unit, digits=3):
+def in_unit(value: float, unit: str, digits: int = 3) -> str:
     """Return a value in people's units with its unit."""
     factor, shown = for_people(unit)
     return text(value * factor, digits) + ('' if shown == '1' else f' {shown}')

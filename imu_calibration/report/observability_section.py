@@ -1,7 +1,11 @@
 """What the recording determines: standard deviations against tolerances, singular values, weak directions, correlations."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.effects.base import SHORT
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text
@@ -10,26 +14,26 @@ ROW = 0.155
 """Height of one bar, inches."""
 
 
-def observability_section(result):
+def observability_section(result: CalibrationResult) -> dict[str, Any]:
     """Return figures and weak directions."""
     calibration = result.calibration
     live = calibration.sd > 0
     figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live),
-                            'Standard deviation over tolerance of every parameter'),
-               'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), 'Correlation between the parameters')}
+                            label='Standard deviation over tolerance of every parameter'),
+               'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), label='Correlation between the parameters')}
     if len(result.singular_values):
         figures['singular'] = draw('singular', (8.6, 2.5), _Singular(result.singular_values),
-                                   'Singular values of the design in units of the tolerances')
+                                   label='Singular values of the design in units of the tolerances')
     return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
 
 
-def directions(calibration):
+def directions(calibration: Calibration) -> list[dict[str, Any]]:
     """Return the weak directions as rows: members with weights, and the motion that is needed."""
     return [{'members': [(name, text(weight, 2)) for name, weight in d['parameters'].items()], 'needs': d['needs']}
             for d in calibration.undetermined]
 
 
-def strongest(calibration, live, count=5):
+def strongest(calibration: Calibration, live: np.ndarray, count: int = 5) -> list[tuple[str, str, str]]:
     """Return the strongest correlations as (name, name, value)."""
     correlation, names = _correlation(calibration, live)
     rows, columns = np.triu_indices(len(names), 1)
@@ -43,7 +47,7 @@ def _correlation(calibration, live):
     return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), names
 
 
-def short_name(name):
+def short_name(name: str) -> str:
     """Return a parameter or effect name that fits a figure."""
     sensor, _, rest = name.partition('.')
     rest = rest.removeprefix(SHORT.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')

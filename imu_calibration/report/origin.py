@@ -1,14 +1,16 @@
 """Where the calibration comes from: recording, table, settings, what was used and what was dropped."""
 
 from functools import singledispatch
+from typing import Any
 
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.report.numbers import fixed, in_unit, text
 from imu_calibration.settings import describe
 
 
-def recording_facts(result):
+def recording_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return (what, value) of the recording, for the head of the page."""
     calibration, conditions = result.calibration, result.calibration.conditions
     bags = calibration.provenance.get('bags') or []
@@ -30,7 +32,7 @@ def _duration(seconds):
     return f'{minutes} min {rest} s' if minutes else f'{rest} s'
 
 
-def origin_section(result):
+def origin_section(result: CalibrationResult) -> dict[str, Any]:
     """Return the tables of windows, drops, settings, table description and provenance."""
     calibration, statistics = result.calibration, result.calibration.statistics
     used = [(kind, count, (statistics.get('samples_used') or {}).get(kind, ''))
@@ -64,7 +66,7 @@ def _joint(joint):
 
 
 @singledispatch
-def table_rows(_result):
+def table_rows(_result: CalibrationResult) -> list[tuple[str, ...]]:
     """Return (what, value) of the table; nothing for a calibration without one."""
     return []
 

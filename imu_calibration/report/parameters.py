@@ -1,8 +1,12 @@
 """The parameter table: every value with its standard deviation, tolerance, status and the reason for it."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED, HELD
+from imu_calibration.diagnosis.workflow import DiagnosisResult
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
@@ -10,7 +14,7 @@ USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, sample
        'none': 'belongs to the table or the session, not removed'}
 
 
-def parameter_groups(result):
+def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[str, Any]]:
     """Return the table: groups with title, explanation and rows."""
     calibration, needs = result.calibration, motions_needed(result)
     groups = []
@@ -32,7 +36,7 @@ def _row(result, index, unit, component, needs):
             'share': text(share, 2), 'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
 
 
-def printed(unit):
+def printed(unit: str) -> str:
     """Return an SI unit with raised powers."""
     return unit.replace('^-1', '⁻¹').replace('^-2', '⁻²').replace('^2', '²')
 
@@ -55,7 +59,7 @@ def _why(calibration, index, share, needs):
     return f'estimated, but its sd is {text(share, 2)} times the tolerance' + wanted
 
 
-def motions_needed(result):
+def motions_needed(result: CalibrationResult | DiagnosisResult) -> dict[str, str]:
     """Return parameter name -> the motion that would serve it best, for all that are not determined."""
     return {name: motion if not np.isfinite(sd)
             else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'

@@ -1,7 +1,11 @@
 """Zhang's Tables 2 and 4 for this recording: readings at +-1 g, at rest and in rotation, before and after compensation."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.report.numbers import fixed, text
 
@@ -9,13 +13,13 @@ LEVEL = 0.02
 """Windows whose mean specific force differs from 1 g by more than this share turn through the vertical and have no reading at 1 g."""
 
 
-def reading_tables(result, errors):
+def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[dict[str, Any]]]:
     """Return two lists of lines: at rest (Table 2) and in rotation (Table 4)."""
     gravity = result.gravity
     true = errors.true['accelerometer']
     chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL) & (errors.kind != 'dynamic')
     lines = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],
-                          np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity)
+                          rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity=gravity)
     return [_lines([line for line in lines if (line.rate_deg_s == 0) == at_rest]) for at_rest in (True, False)]
 
 

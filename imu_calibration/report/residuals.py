@@ -1,9 +1,13 @@
 """Residuals: windows before and after calibration beside the noise floor, their autocorrelation, chi-square, noise and wander."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import predict
 from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
 from imu_calibration.report.numbers import in_unit, text
 from imu_calibration.units import for_people
@@ -15,19 +19,20 @@ MOST_WINDOWS = 60
 KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins', 'dynamic': 'within dynamic stretches'}
 
 
-def residual_section(result, errors):
+def residual_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
     """Return figures and tables of the residuals."""
     figures = {sensor: draw_windows(errors, sensor) for sensor in SENSORS}
     traces = autocorrelation(result)
-    lags = draw('autocorrelation', (8.6, 2.7), _Lags(traces), 'Autocorrelation of the residuals within moving windows') if traces else None
+    lags = draw('autocorrelation', (8.6, 2.7), _Lags(traces),
+                label='Autocorrelation of the residuals within moving windows') if traces else None
     return {'windows': figures, 'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration),
             'errors': error_rows(errors)}
 
 
-def draw_windows(errors, sensor):
+def draw_windows(errors: WindowErrors, sensor: str) -> str:
     """Return the errors of one sensor in every window, before and after, as SVG."""
     label = f'Errors of the {sensor} in every window, before and after calibration'
-    return draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor), label)
+    return draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor), label=label)
 
 
 class _Windows:
@@ -61,7 +66,7 @@ class _Windows:
                           mfc='none' if hollow else colour, mew=0.8, alpha=0.9, ls='none')
 
 
-def autocorrelation(result):
+def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
     """
     Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise), from the kept moving windows.
 
@@ -70,16 +75,13 @@ def autocorrelation(result):
     windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:
         return {}
-    model, values, table = result.solution.model, result.solution.values, result.table
     typical = np.median([len(w) for w in windows])
     windows = [w for w in windows if len(w) >= typical][:MOST_WINDOWS]
     period = float(np.median([w.period for w in windows]))
     n_lags = max(2, min(int(LAG_SECONDS / period), int(typical) // 2))
     sums = {sensor: np.zeros((n_lags, 3)) for sensor in SENSORS}
     for window in windows:
-        for sensor, measured, predicted in zip(SENSORS, (window.force_s, window.rate_s),
-                                               predict(model, values, table, window.motion, window.temperature_c)):
-            rest = measured - predicted
+        for sensor, rest in result.residuals_of(window).items():
             sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
     bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
     return {sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound) for sensor, total in sums.items()}
@@ -112,7 +114,7 @@ class _Lags:
         axis_legend(panels[-1])
 
 
-def noise_rows(calibration):
+def noise_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Return one row per sensor: noise of a sample, factor at low frequency, scatter between windows, wander."""
     rows = []
     for sensor in SENSORS:
@@ -128,14 +130,14 @@ def noise_rows(calibration):
     return rows
 
 
-def chi2_rows(calibration):
+def chi2_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Return chi-square per degree of freedom by kind of window, one row per kind."""
     found = {sensor: calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {} for sensor in SENSORS}
     kinds = list(dict.fromkeys(kind for sensor in SENSORS for kind in found[sensor]))
     return [{'kind': KIND_TEXT.get(kind, kind), 'values': [text(found[sensor].get(kind)) for sensor in SENSORS]} for kind in kinds]
 
 
-def error_rows(errors):
+def error_rows(errors: WindowErrors) -> list[dict[str, Any]]:
     """Return rms errors of window means by kind, before and after."""
     rows = []
     for kind in dict.fromkeys(errors.kind.tolist()):

@@ -1,9 +1,12 @@
 """How to apply the calibration: the formula, the numbers to copy, and one sample carried through."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of, compensate, invertible
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.reference.kinematics import reference_motion
@@ -11,7 +14,7 @@ from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.report.numbers import fixed, text
 
 
-def worked_sample(result):
+def worked_sample(result: CalibrationResult) -> dict[str, Any]:
     """Return the section: matrices, arms, one raw sample, each step and the outcome."""
     calibration = result.calibration
     sample = _sample(result)
@@ -28,7 +31,7 @@ def worked_sample(result):
         'reference_known': sample.true_force is not None}
 
 
-def further_effects(calibration):
+def further_effects(calibration: Calibration) -> list[str]:
     """Return the effects beside bias, matrix and size effect that compensation takes out."""
     return [effect.name for effect in invertible(calibration.model).further if effect.role is not Role.ARMS]
 

@@ -1,11 +1,14 @@
 """Smooth motion through the points of a joint trajectory, as a table's controller would drive it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.simulation.motion_builder import Profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +30,11 @@ class JointTrajectory:
     """Accelerations, rad/s^2, shape (n, n_joints)."""
 
     @property
-    def end(self):
+    def end(self) -> float:
         """Time of the last point, s."""
         return float(self.time[-1])
 
-    def at(self, time):
+    def at(self, time: Sequence[float] | np.ndarray) -> JointMotion:
         """Return the JointMotion at `time`, shape (m,): before the first point as there at rest, after the last at rest."""
         time = np.atleast_1d(np.asarray(time, float))
         inside = np.clip(time, self.time[0], self.time[-1])
@@ -64,7 +67,8 @@ def _polynomial(coefficients, share, order):
     return total
 
 
-def trajectory_from(start, time, position, rate=None, acceleration=None):
+def trajectory_from(start: JointMotion, time: Sequence[float], position: np.ndarray, *, rate: np.ndarray | None = None,
+                    acceleration: np.ndarray | None = None) -> JointTrajectory:
     """
     Return the JointTrajectory from the present motion through points.
 
@@ -113,19 +117,20 @@ class TableMotion:
 
     """
 
-    def __init__(self, profile, n_joints, repeat=False):
-        self._profile, self._n_joints, self._repeat, self._trajectory = profile, n_joints, repeat, None
+    def __init__(self, profile: Profile | None, n_joints: int, repeat: bool = False):
+        self._profile, self._n_joints, self._repeat = profile, n_joints, repeat
+        self._trajectory: JointTrajectory | None = None
 
     @property
-    def end(self):
+    def end(self) -> float:
         """When the motion ends, s; infinite when it repeats or waits for trajectories."""
         return np.inf if self._profile is None or self._repeat or self._trajectory is not None else self._profile.duration
 
-    def follow(self, time, *points):
-        """Let a trajectory take over at `time`; the points as for `trajectory_from`."""
-        self._trajectory = trajectory_from(self.at(np.array([time])), *points)
+    def follow(self, now: float, **points: Any) -> None:
+        """Let a trajectory take over at the time `now`; the points as for `trajectory_from`."""
+        self._trajectory = trajectory_from(self.at(np.array([now])), **points)
 
-    def at(self, time):
+    def at(self, time: np.ndarray) -> JointMotion:
         """Return the JointMotion at `time`, shape (m,)."""
         if self._trajectory is not None:
             return self._trajectory.at(time)

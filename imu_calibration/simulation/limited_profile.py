@@ -1,16 +1,19 @@
 """A session for joints that have ends: no further, no faster than each of them may."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
+from imu_calibration.simulation.motion_builder import MotionBuilder
 from imu_calibration.simulation.motion_primitives import run, spin_joint
 
 LARGEST_SWING = 0.5
 """Amplitude of a swing at most, rad or m."""
 
 
-def within_limits(builder, rng, n_poses=24, frequencies=(0.25, 0.5, 1.0), swing_time=5.0, n_other=20):
+def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int = 24, *, frequencies: Sequence[float] = (0.25, 0.5, 1.0),
+                  swing_time: float = 5.0, n_other: int = 20) -> None:
     """Poses, swings of one joint and of two at once (with at most `n_other` others) and, where a joint has no end, spins."""
     limits, count = builder.limits, builder.n_joints
     lower, upper = np.where(limits.endless, -np.pi, limits.lower), np.where(limits.endless, np.pi, limits.upper)
@@ -36,7 +39,8 @@ def within_limits(builder, rng, n_poses=24, frequencies=(0.25, 0.5, 1.0), swing_
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
-            tasks += [partial(spin_joint, joint=joint, at_deg=np.where(limits.turns, np.degrees(at), np.nan), dwell=4.0, speeds_deg=speed)
+            tasks += [partial(spin_joint, joint=int(joint), at_deg=np.where(limits.turns, np.degrees(at), np.nan), dwell=4.0,
+                              speeds_deg=speed)
                       for at, speed in zip(places(len(shares)), speeds, strict=True)]
     run(builder, rng, tasks)
 

@@ -7,8 +7,11 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import warped_reference
 from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.reference_motion import lever_matrix
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.simulation.joint_trajectory import TableMotion
 from imu_calibration.simulation.sensor_noise import quantise, read_encoders
 from imu_calibration.simulation.session import SimulationOptions, temperature_at
 
@@ -50,7 +53,8 @@ class LiveSimulation:
 
     """
 
-    def __init__(self, model, values, table, motion, options=SimulationOptions(), seed=0, start_ns=0):
+    def __init__(self, model: SensorModel, values: np.ndarray, table: Table, *, motion: TableMotion,
+                 options: SimulationOptions = SimulationOptions(), seed: int = 0, start_ns: int = 0):
         self.model, self.values, self.table, self.motion, self.options = model.at(values), values, table, motion, options
         self.start_ns = start_ns
         self._rng = np.random.default_rng([seed, 3])
@@ -59,7 +63,7 @@ class LiveSimulation:
         self._wander = [_Wander(sd, noise.correlation_time, 1 / options.imu_rate, self._rng)
                         for sd in (noise.accel_instability, noise.gyro_instability)]
 
-    def take(self, until):
+    def take(self, until: float) -> SimulatedBlock:
         """Return everything from where the last block ended to `until` (s, exclusive)."""
         time = self._times('imu', self.options.imu_rate, 0.0, until)
         imu, truth = self._imu(time)

@@ -1,12 +1,14 @@
 """Smooth joint motion put together from segments: rests, moves, ramps, spins and oscillations, with exact derivatives."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import free_limits
+from imu_calibration.reference.motion_limits import MotionLimits, free_limits
 
 # Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
 # by the quintic both leave position, rate, acceleration and jerk continuous where segments meet.
@@ -57,11 +59,11 @@ class Segment:
     """Time over which the sines come and go, s; at most half the duration."""
 
     @property
-    def end(self):
+    def end(self) -> float:
         """Joint positions at the end, rad, shape (n_joints,)."""
         return self.start + self.shift + 0.5 * (self.rate_from + self.rate_to) * self.duration
 
-    def at(self, time):
+    def at(self, time: np.ndarray) -> np.ndarray:
         """Return position, rate, acceleration and jerk at `time` since the start of the segment, shape (4, n, n_joints)."""
         motion = np.zeros((4, len(time), len(self.start)))
         motion[0] = self.start + time[:, None] * self.rate_from
@@ -109,16 +111,16 @@ class Profile:
     """Description of the table that the profile is made for (as in the table's YAML), when it brings its own."""
 
     @property
-    def edges(self):
+    def edges(self) -> np.ndarray:
         """Start of every segment and the end of the last, s, shape (n_segments + 1,)."""
         return np.concatenate([[0.0], np.cumsum([segment.duration for segment in self.segments])])
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """Length, s."""
         return float(self.edges[-1])
 
-    def at(self, time):
+    def at(self, time: np.ndarray) -> JointMotion:
         """
         Return the joints' motion at any times.
 
@@ -151,7 +153,7 @@ class Profile:
         unsorted[:, order] = motion
         return unsorted
 
-    def find(self, kind):
+    def find(self, kind: str) -> np.ndarray:
         """Return (start, end) of every segment of a kind, s, shape (n, 2)."""
         edges = self.edges
         return np.array([(edges[i], edges[i + 1]) for i, s in enumerate(self.segments) if s.kind == kind]).reshape(-1, 2)
@@ -164,28 +166,28 @@ class MotionBuilder:
     Angles in degrees here, as people state motions; the segments hold radians. Where joints slide, use the methods that speak SI.
     """
 
-    def __init__(self, n_joints, dwell=1.0, limits=None):
+    def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None):
         """Start at rest at zero; `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps."""
-        self.segments = []
+        self.segments: list[Segment] = []
         self.dwell = dwell
         self.limits = limits or free_limits(n_joints)
         self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
         self._position = self.home
 
     @property
-    def n_joints(self):
+    def n_joints(self) -> int:
         """Number of joints."""
         return len(self._position)
 
-    def rest(self, duration):
+    def rest(self, duration: float) -> None:
         """Stay for `duration` times dwell, s."""
         self._append('rest', duration * self.dwell)
 
-    def move(self, angles_deg, shortest=True):
+    def move(self, angles_deg: ArrayLike, shortest: bool = True) -> None:
         """Move to the joint angles (NaN: leave that joint), each by less than half a turn when `shortest`."""
         self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
 
-    def move_to(self, target, shortest=True):
+    def move_to(self, target: np.ndarray, shortest: bool = True) -> None:
         """Move to joint positions in rad and m; endless joints by less than half a turn when `shortest`."""
         shift = np.where(np.isnan(target), 0.0, target - self._position)
         if shortest:
@@ -195,7 +197,7 @@ class MotionBuilder:
             return
         self._append('move', move_time(distance, self.limits), shift=shift)
 
-    def spin(self, rates_deg, duration):
+    def spin(self, rates_deg: ArrayLike, duration: float) -> None:
         """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
         last = np.zeros(self.n_joints)
         for rate in np.radians(np.atleast_2d(np.asarray(rates_deg, float))):
@@ -204,11 +206,13 @@ class MotionBuilder:
             last = rate
         self._ramp(last, np.zeros(self.n_joints))
 
-    def oscillate(self, amplitude_deg, frequency, duration, phase=0.0, fade=None):
+    def oscillate(self, amplitude_deg: ArrayLike, frequency: ArrayLike, duration: float, *,
+                  phase: ArrayLike = 0.0, fade: float | None = None) -> None:
         """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
-        self.swing(np.radians(amplitude_deg), frequency, duration, phase, fade)
+        self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
 
-    def swing(self, amplitude, frequency, duration, phase=0.0, fade=None):
+    def swing(self, amplitude: np.ndarray, frequency: ArrayLike, duration: float, *, phase: ArrayLike = 0.0,
+              fade: float | None = None) -> None:
         """Do the same with amplitudes in rad and m."""
         amplitude = np.atleast_2d(np.asarray(amplitude, float))
         frequency, phase = (np.broadcast_to(np.asarray(value, float), amplitude.shape) for value in (frequency, phase))
@@ -229,13 +233,13 @@ class MotionBuilder:
         self._position = segment.end
 
 
-def move_time(distance, limits):
+def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
     """Return how long a move of all joints by `distance`, shape (n_joints,), takes within the limits, s."""
     rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
     return float(max(SHORTEST_MOVE, rate, np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))))
 
 
-def stretch(build, duration):
+def stretch(build: Callable, duration: float) -> list[Segment]:
     """
     Return the segments of `build(dwell)` with the dwell that makes them last `duration` seconds.
 

@@ -1,8 +1,12 @@
 """What a turntable session is made of: poses, spins, swings and simultaneous turns of a table with axes z, y, x from the base outwards."""
 
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from imu_calibration.simulation.motion_builder import MotionBuilder
 
 GOLDEN_ANGLE_DEG = 137.50776
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -11,7 +15,7 @@ EDGES = np.array([[a, b, 0] for a in (1, -1) for b in (1, -1)] + [[a, 0, b] for 
 CORNERS = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
 
 
-def pose_deg(up_b, heading_deg=0.0):
+def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
     """
     Return the joint angles of a z-y-x table (outer, middle, inner) that bring the vertical along `up_b`, deg.
 
@@ -22,19 +26,19 @@ def pose_deg(up_b, heading_deg=0.0):
     return np.array([heading_deg, *np.degrees([-np.arcsin(np.clip(x, -1, 1)), inner])])
 
 
-def pose(builder, up_b, heading_deg, dwell):
+def pose(builder: MotionBuilder, up_b: np.ndarray, heading_deg: float, *, dwell: float) -> None:
     """Rest with `up_b` vertical."""
     builder.move(pose_deg(up_b, heading_deg))
     builder.rest(dwell)
 
 
-def spin_vertical(builder, up_b, speeds_deg, dwell):
+def spin_vertical(builder: MotionBuilder, up_b: np.ndarray, speeds_deg: ArrayLike, *, dwell: float) -> None:
     """Turn the outer joint both ways with `up_b` vertical: the body turns about `up_b` and gravity stays where it is."""
     builder.move(pose_deg(up_b, np.nan))
     builder.spin([[sense * speed, 0.0, 0.0] for speed in np.atleast_1d(speeds_deg) for sense in (1, -1)], dwell)
 
 
-def spin_joint(builder, joint, at_deg, speeds_deg, dwell):
+def spin_joint(builder: MotionBuilder, joint: int, at_deg: ArrayLike, *, speeds_deg: ArrayLike, dwell: float) -> None:
     """Turn one joint both ways at each speed."""
     builder.move(at_deg)
     rates = np.zeros((2 * len(np.atleast_1d(speeds_deg)), builder.n_joints))
@@ -42,7 +46,7 @@ def spin_joint(builder, joint, at_deg, speeds_deg, dwell):
     builder.spin(rates, dwell)
 
 
-def swing(builder, axis, amplitude_deg, frequency, duration):
+def swing(builder: MotionBuilder, axis: int, amplitude_deg: float, *, frequency: float, duration: float) -> None:
     """Swing about sensor axis 0, 1 or 2: the inner joint, the middle one, or the middle one with the inner a quarter turn on."""
     builder.move([[0, 0, 0], [0, 0, 0], [0, 0, 90]][axis])
     builder.rest(1.0)
@@ -50,25 +54,26 @@ def swing(builder, axis, amplitude_deg, frequency, duration):
     builder.rest(1.0)
 
 
-def two_axes(builder, at_deg, rates_deg, dwell):
+def two_axes(builder: MotionBuilder, at_deg: Sequence[float], rates_deg: ArrayLike, *, dwell: float) -> None:
     """Turn two joints at once, then both the other way, so that a delay cannot pass for an arm."""
     builder.move(at_deg)
-    builder.spin([rates_deg, -np.asarray(rates_deg)], dwell)
+    builder.spin(np.multiply.outer((1, -1), rates_deg), dwell)
 
 
-def tumble(builder, amplitude_deg, frequency, phase, duration):
+def tumble(builder: MotionBuilder, amplitude_deg: ArrayLike, frequency: ArrayLike, *, phase: ArrayLike,
+           duration: float) -> None:
     """Swing all joints at once from zero."""
     builder.move([0, 0, 0])
-    builder.oscillate(amplitude_deg, frequency, duration, phase, fade=2.0)
+    builder.oscillate(amplitude_deg, frequency, duration, phase=phase, fade=2.0)
 
 
-def rest_at_zero(builder, dwell):
+def rest_at_zero(builder: MotionBuilder, dwell: float) -> None:
     """Rest at the reference pose: zero, or what is nearest to it within the limits."""
     builder.move_to(builder.home)
     builder.rest(dwell)
 
 
-def run(builder, rng, tasks, reference_every=12):
+def run(builder: MotionBuilder, rng: np.random.Generator, tasks: Sequence[Callable], *, reference_every: int = 12) -> None:
     """Run tasks in a drawn order; come back to the reference pose now and then, so that drift is not taken for anything else."""
     rest_at_zero(builder, 8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
@@ -78,31 +83,31 @@ def run(builder, rng, tasks, reference_every=12):
     rest_at_zero(builder, 6.0)
 
 
-def poses(directions, dwell):
+def poses(directions: Sequence[np.ndarray] | np.ndarray, dwell: float) -> list[Callable]:
     """Return the tasks of resting with each direction vertical, at headings spread by the golden angle."""
     return [partial(pose, up_b=up_b, heading_deg=GOLDEN_ANGLE_DEG * k, dwell=dwell) for k, up_b in enumerate(directions)]
 
 
-def swings(amplitudes_and_frequencies, duration):
+def swings(amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float) -> list[Callable]:
     """Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz)."""
     return [partial(swing, axis=axis, amplitude_deg=amplitude, frequency=frequency, duration=duration)
             for axis in range(3) for amplitude, frequency in amplitudes_and_frequencies]
 
 
-def simultaneous(speeds_deg, dwell):
+def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Callable]:
     """Outer and inner, outer and middle (about y, about z), middle and inner: turns about two axes at a time."""
     a, b = speeds_deg
     return [partial(two_axes, at_deg=at, rates_deg=rates, dwell=dwell) for at, rates in (
         ([0, 0, 0], [a, 0, b]), ([0, 0, 0], [a, b, 0]), ([0, 0, 90], [a, -b, 0]), ([0, 45, 0], [a, 0, -b]), ([0, 0, 30], [0, b, a]))]
 
 
-def at_angles(builder, angles_deg):
+def at_angles(builder: MotionBuilder, angles_deg: np.ndarray) -> None:
     """Rest at joint angles."""
     builder.move(angles_deg)
     builder.rest(4.0)
 
 
-def swing_joints(builder, at_deg, amplitude_deg, frequency):
+def swing_joints(builder: MotionBuilder, at_deg: np.ndarray, amplitude_deg: np.ndarray, *, frequency: ArrayLike) -> None:
     """Swing one or several joints about joint angles."""
     builder.move(at_deg)
     builder.rest(1.0)

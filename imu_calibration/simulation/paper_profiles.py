@@ -1,5 +1,6 @@
 """Motions of the two source papers, each with the table (and fixture) it is made for."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -24,7 +25,7 @@ def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, height=170.0, rpy_deg=(0.0,
 GIMBALS = _table([AXIS[axis] for axis in 'ZYX'])
 
 
-def avrutov_rates_deg(sample):
+def avrutov_rates_deg(sample: int) -> np.ndarray:
     """Return the rates about x, y, z of Avrutov's gyroscope series (sample 3 or 4), deg/s, shape (11, 3)."""
     if sample == 3:
         rate = np.arange(0.0, 101.0, 10.0)
@@ -76,23 +77,23 @@ def _zhang_oscillations(builder, _rng):
     _six_faces(builder)
     for axis in range(3):
         for amplitude, frequency in ((10.0, 1.0), (5.0, 2.0), (90.0, 0.5)):
-            swing(builder, axis, amplitude, frequency, 12.0)
+            swing(builder, axis, amplitude, frequency=frequency, duration=12.0)
 
 
 def _zhang_mixed(builder, _rng):
     _six_faces(builder)
     for axis in np.eye(3):
-        spin_vertical(builder, axis, [200.0], 6.0)
+        spin_vertical(builder, axis, [200.0], dwell=6.0)
     for axis in range(3):
-        swing(builder, axis, 10.0, 1.0, 12.0)
+        swing(builder, axis, 10.0, frequency=1.0, duration=12.0)
     for at_deg, rates in (([0, 0, 0], [200, 0, 200]), ([0, 0, 0], [200, 200, 0]), ([0, 0, 90], [200, 200, 0])):
-        two_axes(builder, at_deg, rates, 6.0)
+        two_axes(builder, at_deg, rates, dwell=6.0)
 
 
 SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()
 """A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three sensor axes."""
 
-REGISTRY = {
+REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
                                     'gravity', _equal_angles, _table([AXIS[axis] for axis in order], up), 3)
        for order in ORDERS for suffix, up in (('', AXIS['Z']), ('_up_x', AXIS['X']), ('_up_y', AXIS['Y']))},

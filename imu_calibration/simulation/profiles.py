@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Callable
+from typing import Any, Callable
 
 import numpy as np
 
@@ -47,12 +47,12 @@ class _Entry:
     """Whether a table with another number of joints gets `any_table` instead, and one whose joints have ends `within_limits`."""
 
 
-def profile_names():
+def profile_names() -> dict[str, str]:
     """Return the names of all profiles with one line of description each, a dict."""
     return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
 
 
-def make_profile(name, seed=0, table=None, duration=None):
+def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None = None, *, duration: float | None = None) -> Profile:
     """
     Return the motion called `name`.
 
@@ -181,9 +181,9 @@ def _thermal(builder, _rng):
         for task in poses(FACES, 5.0):
             task(builder)
         for axis in np.eye(3):
-            spin_vertical(builder, axis, SPEEDS_DEG[1], 3.0)
+            spin_vertical(builder, axis, SPEEDS_DEG[1], dwell=3.0)
         for axis in range(3):
-            swing(builder, axis, 10.0, 1.0, 3.0)
+            swing(builder, axis, 10.0, frequency=1.0, duration=3.0)
         builder.move([90.0 * turn, 0.0, 0.0])
         builder.rest(15.0)
 
@@ -191,15 +191,15 @@ def _thermal(builder, _rng):
 def _navigation(builder, _rng):
     """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
     builder.rest(10.0)
-    tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], [0.3, 1.1, 2.0], 50.0)
+    tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], phase=[0.3, 1.1, 2.0], duration=50.0)
     builder.rest(10.0)
-    tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], [0.3, 1.1, 2.0], 50.0)
+    tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], phase=[0.3, 1.1, 2.0], duration=50.0)
     builder.rest(5.0)
 
 
 def _tumbling(builder, _rng):
     builder.rest(5.0)
-    tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], [0.3, 1.1, 2.0], 60.0)
+    tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], phase=[0.3, 1.1, 2.0], duration=60.0)
     builder.rest(5.0)
 
 

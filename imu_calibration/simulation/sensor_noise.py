@@ -37,7 +37,7 @@ class SimulatedNoise:
     encoder_resolution: float = 0.0
     """Step of the joint positions, rad; 0: continuous."""
 
-    def white_only(self):
+    def white_only(self) -> 'SimulatedNoise':
         """Return the model with nothing but the white noise of the IMU."""
         return SimulatedNoise(accel_density=self.accel_density, gyro_density=self.gyro_density)
 
@@ -83,12 +83,13 @@ GRADES = {
 """Grades by name."""
 
 
-def realistic(grade='industrial', encoder_resolution=0.001 * DEG, stamp_jitter=50e-6):
+def realistic(grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG, stamp_jitter: float = 50e-6) -> SimulatedNoise:
     """Return the noise of a grade, with an encoder's resolution (rad) and a stamp jitter (s) beside it."""
     return replace(GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter)
 
 
-def gauss_markov(standard_deviation, correlation_time, step, shape, rng):
+def gauss_markov(standard_deviation: float, correlation_time: float, step: float, *, shape: tuple[int, ...],
+                 rng: np.random.Generator) -> np.ndarray:
     """
     Return a stationary first-order Gauss-Markov process along the first axis of `shape`.
 
@@ -102,19 +103,20 @@ def gauss_markov(standard_deviation, correlation_time, step, shape, rng):
     return lfilter([1.0], [1.0, -decay], drive, axis=0)
 
 
-def quantise(values, step):
+def quantise(values: np.ndarray, step: float) -> np.ndarray:
     """Round `values` to multiples of `step`; 0 leaves them as they are."""
     return np.asarray(values) if step == 0.0 else np.round(np.asarray(values) / step) * step
 
 
-def jitter_stamps(stamp_ns, standard_deviation, rng):
+def jitter_stamps(stamp_ns: np.ndarray, standard_deviation: float, rng: np.random.Generator) -> np.ndarray:
     """Return stamps that came with white jitter (s), still int64 and in the order of arrival."""
     if standard_deviation == 0.0:
         return stamp_ns
     return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(np.int64)
 
 
-def add_imu_noise(force_s, rate_s, model, sample_rate, rng):
+def add_imu_noise(force_s: np.ndarray, rate_s: np.ndarray, model: SimulatedNoise, *, sample_rate: float,
+                  rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """
     Return the readings with white noise, bias wander and resolution.
 
@@ -133,11 +135,11 @@ def add_imu_noise(force_s, rate_s, model, sample_rate, rng):
     for true, density, instability, resolution in ((force_s, model.accel_density, model.accel_instability, model.accel_resolution),
                                                    (rate_s, model.gyro_density, model.gyro_instability, model.gyro_resolution)):
         values = true + rng.normal(0.0, density * np.sqrt(sample_rate), true.shape)
-        values += gauss_markov(instability, model.correlation_time, 1.0 / sample_rate, true.shape, rng)
+        values += gauss_markov(instability, model.correlation_time, 1.0 / sample_rate, shape=true.shape, rng=rng)
         noisy.append(quantise(values, resolution))
     return tuple(noisy)
 
 
-def read_encoders(position, model, rng):
+def read_encoders(position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator) -> np.ndarray:
     """Return joint positions as noisy encoders of finite resolution tell them, rad, shape (n, n_joints)."""
     return quantise(position + rng.normal(0.0, model.encoder_noise, np.shape(position)), model.encoder_resolution)

@@ -6,8 +6,11 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders
 
 START_NS = 1_700_000_000_000_000_000
@@ -37,7 +40,7 @@ class SimulationOptions:
     """Frame of the messages."""
 
 
-def random_values(model, grade='industrial', seed=0):
+def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) -> np.ndarray:
     """
     Return parameter values of a random IMU of a grade, shape (n_params,).
 
@@ -58,7 +61,7 @@ def random_values(model, grade='industrial', seed=0):
     return values
 
 
-def hidden_effect(model, name, seed=0, share=0.3):
+def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3) -> tuple[str, np.ndarray]:
     """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size, with random signs and spread."""
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
@@ -73,7 +76,8 @@ def hidden_effect(model, name, seed=0, share=0.3):
     return sensor, values
 
 
-def simulate(model, values, table, profile, options=SimulationOptions(), seed=0):
+def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: Profile, options: SimulationOptions = SimulationOptions(),
+             seed: int = 0) -> tuple[ImuSamples, JointSamples, TemperatureSamples | None]:
     """
     Simulate a session.
 
@@ -97,7 +101,7 @@ def simulate(model, values, table, profile, options=SimulationOptions(), seed=0)
     n_imu, n_joint = (int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate))
     time = np.arange(n_imu) / options.imu_rate
     outputs = _outputs(model, values, table, profile, time, options)
-    force, rate = add_imu_noise(*outputs, options.noise, options.imu_rate, rng)
+    force, rate = add_imu_noise(outputs[0], outputs[1], options.noise, sample_rate=options.imu_rate, rng=rng)
     force, rate = (clip(model, sensor, values, output) for sensor, output in zip(SENSORS, (force, rate)))
     stamps = jitter_stamps(START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
@@ -117,7 +121,7 @@ def _outputs(model, values, table, profile, time, options):
     return tuple(np.concatenate(sensor) for sensor in zip(*parts))
 
 
-def temperature_at(time, options):
+def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
     """Return the temperature of the warm-up, or None without a temperature topic: ``start + rise (1 - exp(-t / tau))``."""
     if options.temperature_start_c is None:
         return None

@@ -90,16 +90,16 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
 
     """
     given = table_of(table or config_file('table_three_axis.yaml'))
-    motion = make_profile(profile, seed, given, duration)
+    motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue)
     for name in effects:
-        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, size))
+        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, share=size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
     frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
     options = SimulationOptions(imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None)
-    samples = SampleBlock(*run_session(model, values, mover, motion, options, seed))
+    samples = SampleBlock(*run_session(model, values, mover, profile=motion, options=options, seed=seed))
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), options.frame_id,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
                         provenance={'simulated': {'seed': seed, 'profile': profile}})

@@ -71,7 +71,7 @@ def make_arm_world(seed, joint_error=3e-4, place_error=0.0, text=SIX_AXES, link=
     forces = [_force(poses, arm) for arm in accelerometer.arms]
     still = np.full(len(time), 25.0)
     outputs = (accelerometer.respond(forces, time, still, forces[0]), gyroscope.respond([_rate(poses)] * 3, time, still, forces[0]))
-    imu = ImuSamples(START_NS + to_ns(time), *add_imu_noise(*outputs, noise, rate, generator(seed, 'noise')), link)
+    imu = ImuSamples(START_NS + to_ns(time), *add_imu_noise(*outputs, noise, sample_rate=rate, rng=generator(seed, 'noise')), link)
     # As joint states come: in another order, with joints that are nobody's business.
     joint_time = time[:-1] + 0.5 / rate
     motion = profile.at(joint_time)
@@ -168,7 +168,8 @@ def _places_of(table, position):
         at = dict(zip(table.joint_names, values, strict=True))
         for joint in table.joints:
             place = place + turn.apply(joint.xyz)
-            turn = turn * Rotation.from_euler('xyz', joint.rpy_deg, degrees=True) * Rotation.from_rotvec(at[joint.source] * np.array(joint.axis))
+            turn = turn * Rotation.from_euler('xyz', joint.rpy_deg,
+                                              degrees=True) * Rotation.from_rotvec(at[joint.source] * np.array(joint.axis))
         found[row] = place + turn.apply(table.mount_xyz)
     return found
 

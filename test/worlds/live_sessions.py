@@ -22,7 +22,8 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
     """Return (imu, joints, true values, model) of a simulated session, or of its first seconds."""
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=TABLE.joint_names)
     values = random_values(model, 'industrial', seed)
-    imu, joints, _ = simulate(model, values, TABLE, make_profile(profile, 1, TABLE), SimulationOptions(rate, joint_rate or rate), seed)
+    imu, joints, _ = simulate(model, values, TABLE, profile=make_profile(profile, 1, TABLE),
+                              options=SimulationOptions(rate, joint_rate or rate), seed=seed)
     if seconds is not None:
         end = imu.stamp_ns[0] + int(seconds * 1e9)
         imu, joints = imu.select(imu.stamp_ns < end), joints.select(joints.stamp_ns < end)

@@ -128,7 +128,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     if knock or 'knock_step' in values:
         outputs = [out + shock for out, shock in zip(outputs, _shock(sampling.time, events['knock']))]
     _set_limits(triads, outputs, values)
-    outputs = add_imu_noise(*outputs, model, imu_rate, generator(seed, 'noise'))
+    outputs = add_imu_noise(*outputs, model, sample_rate=imu_rate, rng=generator(seed, 'noise'))
     outputs = [np.clip(out, -triad.limit, triad.limit) for out, triad in zip(outputs, triads)]
 
     clock = generator(seed, 'clock')
