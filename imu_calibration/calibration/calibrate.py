@@ -6,6 +6,7 @@ from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.gathered import join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
+from imu_calibration.calibration.proof import prove_solution
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
@@ -78,7 +79,8 @@ def finish(gathered, model, table, options=CalibrationOptions(), provenance=None
         solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
     tolerances = tolerances_of(narrow, options.tolerances)
     needed = motions_needed(solution, tolerances, table)
-    calibration = document(solution, tolerances, table, gathered, needed, provenance)
+    proof = prove_solution(gathered.held_out, solution, model)
+    calibration = document(solution, tolerances, table, gathered, needed, provenance, proof)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=narrow, gathered_model=model)
 

@@ -59,9 +59,9 @@ class Collector:
         return [self._reduce(window) for window in windows if window.kind != 'unused']
 
     def _reduce(self, window):
-        reduced = reduce_window(window, self.model, self.table, session=self.session)
+        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True)
         found = self.gathered
-        found.accumulator.add(reduced)
+        found.take(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
         if window.kind == 'static':
             found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))

@@ -20,8 +20,8 @@ def motions_needed(solution, tolerances, table):
     return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd)
 
 
-def document(solution, tolerances, table, gathered, needed, provenance=None):
-    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, and the verdict."""
+def document(solution, tolerances, table, gathered, needed, provenance=None, proof=None):
+    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its proof (`proof`) and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
     sd = np.sqrt(np.diag(covariance))
@@ -33,7 +33,8 @@ def document(solution, tolerances, table, gathered, needed, provenance=None):
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
-                              statistics(solution, gathered), conditions(gathered, table.gravity_value), {'software': imu_calibration.__version__, **(provenance or {})})
+                              statistics(solution, gathered), conditions(gathered, table.gravity_value),
+                              {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {})
     return judged(calibration, tolerances)
 
 

@@ -1,11 +1,14 @@
 """What the map step of a calibration leaves behind, and how the parts of several recordings join."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from imu_calibration.calibration.held_out import HeldOut
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.window_statistics import WindowStatistics
 
 KEPT_SAMPLES = 200_000
 """Samples of moving windows kept for plots and for the autocorrelation of residuals."""
@@ -19,6 +22,8 @@ class Gathered:
 
     accumulator: Accumulator = field(default_factory=Accumulator)
     """The least-squares system."""
+    held_out: HeldOut = field(default_factory=HeldOut)
+    """The same windows dealt out, so that each part can be predicted from the others."""
     kept: list = field(default_factory=list)
     """Windows with all samples, as far as KEPT_SAMPLES reaches."""
     poses: list = field(default_factory=list)
@@ -40,6 +45,18 @@ class Gathered:
     findings: tuple = ()
     """What a look at the recording found before anything was estimated (`preflight.finding.CheckFinding`)."""
 
+    def take(self, window: WindowStatistics) -> None:
+        """Take a reduced window."""
+        self.accumulator.add(window)
+        self.held_out.add(window)
+
+    def anew(self, windows: Iterable[WindowStatistics]) -> 'Gathered':
+        """Return the same with the windows reduced anew."""
+        fresh = replace(self, accumulator=Accumulator(), held_out=HeldOut())
+        for window in windows:
+            fresh.take(window)
+        return fresh
+
     @property
     def duration(self):
         """Seconds from the first to the last IMU stamp, recordings added."""
@@ -52,6 +69,7 @@ def merge(parts):
     total = parts[0]
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
+        total.held_out.merge(part.held_out)
         total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)

@@ -187,7 +187,7 @@ class LiveCalibration:
             if moved is None or not store.complete:
                 break
             model = moved
-            total = replace(total, accumulator=store.reduced(model, self.table, self._collector.session))
+            total = total.anew(store.reduced(model, self.table, self._collector.session))
         else:
             result = finish(total, model, self.table, self.options, provenance)
         self.result = result
@@ -279,5 +279,5 @@ class _LiveCollector(Collector):
 
 def _copied(gathered):
     """Return a copy that shares only what nobody changes in place."""
-    accumulator = gathered.accumulator.copy()
-    return replace(gathered, accumulator=accumulator, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))
+    copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
+    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))

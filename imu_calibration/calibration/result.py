@@ -12,7 +12,7 @@ from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceError
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import Verdict, judge
+from imu_calibration.calibration.verdict import BAD, Verdict, judge
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.segmentation.window import Window
 
@@ -87,6 +87,6 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> t
 
 
 def exit_code(calibration: Calibration) -> int:
-    """Return 0 when every requested parameter is determined and nothing was lost, else 3."""
-    lacking = any(status != DETERMINED for status in calibration.requested.values())
+    """Return 0 when every requested parameter is determined, nothing was lost and the verdict is not bad, else 3."""
+    lacking = calibration.verdict == BAD or any(status != DETERMINED for status in calibration.requested.values())
     return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0

@@ -1,9 +1,9 @@
 """May a calibration be used? What its document says against it, and what whoever uses it should know."""
 
 from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.proof_words import disproved
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import BAD, GOOD, listed
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
 
 
@@ -12,22 +12,11 @@ def objections(calibration):
     Return why nobody should be corrected with a calibration unless they insist, a line each; the first is the gravest.
 
     A bad verdict; values beyond what is known of any instrument; a proof that does not show a smaller error with the calibration
-    than without (`disproved`).
+    than without, or a larger one in some motion (`proof_words.disproved`).
     """
     reasons = calibration.verdict_reasons[:1]
     bad = [': '.join(['its verdict is bad', *reasons])] if calibration.verdict == BAD else []
-    return [*bad, *implausible(calibration), *disproved(calibration)]
-
-
-def disproved(calibration):
-    """Return a line for each sensor whose error on held-out data is not shown to be smaller with the calibration than without."""
-    lines = []
-    for sensor, found in calibration.proof.items():
-        if sensor in SENSORS and not (found['windows'] and found['after'] < found['before'] and found['ci95'][1] < 1.0):
-            low, high = found['ci95']
-            lines.append(f'on {found["windows"]} windows that took no part the {sensor} error is {found["after"]:.3g} {found["unit"]} with it and '
-                         f'{found["before"]:.3g} without (after / before {low:.2f} to {high:.2f}): that it helps is not shown')
-    return lines
+    return list(dict.fromkeys([*bad, *implausible(calibration), *disproved(calibration)]))
 
 
 def caveats(calibration):

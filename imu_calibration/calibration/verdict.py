@@ -6,6 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.proof_words import disproved, proven
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Role
@@ -77,7 +78,7 @@ def judge(calibration, tolerances):
     """
     Return the Verdict on a calibration.
 
-    Bad: a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
+    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
     nothing was determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not
     determined to its tolerance. Good: neither.
 
@@ -88,7 +89,7 @@ def judge(calibration, tolerances):
         Largest standard deviation of a determined parameter.
 
     """
-    against = _implausible(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
+    against = _disproved(calibration) + _implausible(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
     word = BAD if any(r.word == BAD for r in against) else WEAK if against else GOOD
     favour = [] if against else [_all_well(calibration, tolerances)]
     order = (BAD, WEAK)
@@ -100,6 +101,10 @@ def judged(calibration, tolerances):
     """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
     found = judge(calibration, tolerances)
     return replace(calibration, verdict=str(found.word), verdict_reasons=tuple(found.lines()))
+
+
+def _disproved(calibration):
+    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause") for line in disproved(calibration)]
 
 
 def _implausible(calibration):
@@ -190,7 +195,11 @@ def _all_well(calibration, tolerances):
 
 
 def _notes(calibration, tolerances):
-    return _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
+    return _proven(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
+
+
+def _proven(calibration):
+    return [] if disproved(calibration) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
 
 
 def _loose(calibration):

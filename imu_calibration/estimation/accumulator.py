@@ -39,9 +39,9 @@ class Accumulator:
         """Take one window (WindowStatistics)."""
         for sensor in SENSORS:
             statistics = window.sensors[sensor]
-            _stack(self.within, (sensor, window.kind), statistics.within)
+            stack(self.within, (sensor, window.kind), statistics.within)
             if statistics.slow_rows:
-                _stack(self.slow, (sensor, window.kind), statistics.slow)
+                stack(self.slow, (sensor, window.kind), statistics.slow)
         self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + statistics.slow_rows
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
@@ -56,7 +56,7 @@ class Accumulator:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
         for mine, its in ((self.within, other.within), (self.slow, other.slow)):
             for key, factor in its.items():
-                _stack(mine, key, factor)
+                stack(mine, key, factor)
         for kind, count in other.slow_rows.items():
             self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
         self.rows.extend(other.rows)
@@ -80,7 +80,7 @@ class Accumulator:
                 index += 1
                 continue
             for sensor in SENSORS:
-                _stack(self.within, (sensor, first.kind), _difference(first, second, sensor))
+                stack(self.within, (sensor, first.kind), _difference(first, second, sensor))
             thinned.append(_joined(first, second))
             index += 2
         if len(thinned) == len(self.rows):
@@ -88,7 +88,7 @@ class Accumulator:
         self.rows = thinned
 
 
-def _stack(factors, key, factor):
+def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
     """Add rows to the triangular factor under `key`."""
     known = factors.get(key)
     factors[key] = factor if known is None or not len(known) else triangular(np.concatenate([known, factor])) if len(factor) else known
@@ -113,7 +113,7 @@ def _joined(first, second):
 
 
 def _without_within(window):
-    if all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
+    if not window.pieces and all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
         return window
     sensors = {name: SensorStatistics(s.mean, s.within[:0].copy(), s.noise_variance, s.inflation) for name, s in window.sensors.items()}
     return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session)

@@ -1,13 +1,14 @@
 """One window of data, reduced to what least squares needs of it."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.pieces import moving_pieces, pieces_at_rest
 from imu_calibration.estimation.triangular import triangular
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
@@ -56,10 +57,12 @@ class WindowStatistics:
     """Sensor name -> SensorStatistics."""
     session: int = 0
     """Recording that the window comes from."""
+    pieces: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    """Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a proof is wanted (see `pieces`)."""
 
 
 def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, *, session: int = 0,
-                   column_function: Callable = columns) -> list[WindowStatistics]:
+                   column_function: Callable = columns, with_pieces: bool = False) -> list[WindowStatistics]:
     """
     Reduce windows to their statistics, their columns worked out in one go.
 
@@ -75,18 +78,22 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
         Recording that the windows come from.
     column_function : callable
         Same signature as `effects.columns.columns`.
+    with_pieces : bool
+        Keep the short pieces that a proof is made on.
 
     """
     motion, temperature = joined_motion(windows)
     references = References(model, table, motion, temperature)
     designs = {sensor: column_function(model, sensor, table, motion, temperature, references=references) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
-    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session) for window, a, b in zip(windows, edges, edges[1:])]
+    inputs = {s: model.columns_of(s, Role.LINEAR) for s in SENSORS} if with_pieces else None
+    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session, inputs) for window, a, b in zip(windows, edges, edges[1:])]
 
 
-def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, column_function: Callable = columns) -> WindowStatistics:
+def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, column_function: Callable = columns,
+                  with_pieces: bool = False) -> WindowStatistics:
     """Reduce one window to its statistics; arguments as in `reduce_windows`."""
-    return reduce_windows([window], model, table, session=session, column_function=column_function)[0]
+    return reduce_windows([window], model, table, session=session, column_function=column_function, with_pieces=with_pieces)[0]
 
 
 def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
@@ -99,11 +106,18 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
     return motion, None if temperatures is None else np.concatenate(temperatures)
 
 
-def _reduced(window, designs, session):
+def _reduced(window, designs, session, inputs):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     static, length = window.kind == 'static', piece_length(window)
     sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
-    return WindowStatistics(window.kind, float(window.time.mean()), float(window.time[-1] - window.time[0]), len(window.time), sensors, session)
+    duration = float(window.time[-1] - window.time[0])
+    pieces = {}
+    if inputs and static:
+        pieces = {s: pieces_at_rest(sensors[s].mean, duration) for s in SENSORS}
+    elif inputs:
+        rate_s = designs['gyroscope'][:, inputs['gyroscope']]
+        pieces = {s: moving_pieces(np.concatenate([designs[s], outputs[s]], axis=1), window.time, designs[s][:, inputs[s]], rate_s) for s in SENSORS}
+    return WindowStatistics(window.kind, float(window.time.mean()), duration, len(window.time), sensors, session, pieces)
 
 
 def _reduce_static(design, output):

@@ -1,12 +1,13 @@
 """A bounded store of windows, for effects that must be linearised anew without reading the recording again."""
 
 from dataclasses import replace
+from typing import Iterator
 
 import numpy as np
 
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.pieces import pieces_at_rest
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
@@ -55,22 +56,20 @@ class WindowStore:
         if self._n_samples > self._most or self._n_static > STATIC_MOST:
             self.complete, self._entries = False, []
 
-    def reduced(self, model: SensorModel, table: Table, session: int) -> Accumulator:
-        """Return the accumulator of all windows with the columns of `model`."""
-        accumulator = Accumulator()
+    def reduced(self, model: SensorModel, table: Table, session: int) -> Iterator[WindowStatistics]:
+        """Yield all windows in order with the columns of `model`, as `calibration.collector` reduces them."""
         for entry in self._entries:
             if isinstance(entry, Window):
-                accumulator.add(reduce_window(entry, model, table, session=session))
+                yield reduce_window(entry, model, table, session=session, with_pieces=True)
             else:
-                accumulator.add(_again(*entry, model, table))
-        return accumulator
+                yield _again(*entry, model, table)
 
 
 def _again(reduced, motion, temperature, model, table):
     """Return a static window's statistics with the columns taken anew."""
     sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion, temperature).mean(axis=0), known.mean[-3:]]))
                for name, known in reduced.sensors.items()}
-    return replace(reduced, sensors=sensors)
+    return replace(reduced, sensors=sensors, pieces={name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()})
 
 
 def owned_window(window: Window) -> Window:

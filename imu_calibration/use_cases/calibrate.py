@@ -42,7 +42,7 @@ class Calibrated:
 
     @property
     def exit_code(self) -> int:
-        """0 when every requested parameter is determined and nothing was lost, else 3."""
+        """0 when every requested parameter is determined, nothing was lost and the verdict is not bad, else 3."""
         return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:

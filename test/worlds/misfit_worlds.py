@@ -245,7 +245,7 @@ def make_pair(cause, seed, *, size=1.0, table='three_axis', profile='quick', noi
     size : float
         Of the cause; 1: clearly visible, 0: none.
     table, profile : str or dict, str
-        As for `worlds.physics.make_session`; table 'shaft' with profile 'sweeps': one joint swept to and fro, twice as fast in the second session.
+        As for `worlds.physics.make_session`; table 'shaft' with profile 'sweeps': one joint swept to and fro, a quarter faster in the second session.
     noise, grade, options
         As for `worlds.physics.make_session`.
 
@@ -259,12 +259,11 @@ def make_pair(cause, seed, *, size=1.0, table='three_axis', profile='quick', noi
     return Pair(cause, *sessions)
 
 
-def sweeps(pace=1.0, count=60):
-    """Return half turns of one joint to and fro with short stops, peak rate 330 deg/s at pace 1, after a rest."""
-    builder = MotionBuilder(1, rate_limit_deg=330.0 * pace, acceleration_limit_deg=3000.0)
+def sweeps(pace=1.0, seconds=100.0):
+    """Return what a motor that advances in jerks does: 190 deg/s to and fro at pace 1 with 6 Hz on top, between rests."""
+    builder = MotionBuilder(1)
     builder.rest(5.0)
-    for turn in range(count):
-        builder.move([180.0 if turn % 2 == 0 else 0.0], shortest=False)
-        builder.rest(0.3)
-    builder.rest(5.0)
+    for _ in range(round(seconds / 25.0)):
+        builder.oscillate([[60.0], [6.0]], [[0.5 * pace], [6.0]], 20.0, fade=1.0)
+        builder.rest(5.0)
     return Profile('sweeps', tuple(builder.segments))

@@ -1,0 +1,196 @@
+"""
+Does a calibration help on data that took no part? Errors of short pieces before and after, by sensor and by what the IMU does.
+
+The error of a piece is its mean reading, corrected as compensation would correct it, minus what the reference says. Before: with a nominal
+sensor; after: with the calibration. What compensation leaves to others counts for neither: where the table's reference point lies, and how
+late the readings come, are fitted for each of the two. A wrong scale that a lag has bought is so seen as what it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.held_out import HeldOut
+from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
+from imu_calibration.estimation.solution import Solution
+
+RESAMPLES = 1000
+"""Of whole blocks, for an interval."""
+LEAST_BLOCKS = 3
+"""Blocks below which nothing is said of a regime."""
+LARGEST_DELAY = 0.1
+"""A delay is looked for up to this size, s."""
+UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What one set of parameters leaves of one sensor."""
+
+    squares: np.ndarray
+    """Sum of squared errors by block and regime, shape (n_blocks, n_regimes)."""
+    delay: float
+    """By how much the readings came late beside these parameters, s."""
+    without_delay: float
+    """Sum of squared errors if nobody asked for a delay."""
+
+
+def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: SensorModel) -> dict:
+    """
+    Return the proof of a solution on windows that took no part: sensor -> entry of a document.
+
+    Every fold of windows is predicted with parameters from which it was left out.
+
+    Parameters
+    ----------
+    held_out : HeldOut
+        The windows of the solution, dealt out.
+    solution : Solution
+    gathered_model : SensorModel
+        The model whose columns were gathered.
+
+    """
+    dealt = held_out.restricted(gathered_model, solution.model)
+    return prove(dealt, solution.model, dealt.values_without(solution), solution.values)
+
+
+def prove_calibration(held_out: HeldOut, model: SensorModel, calibration: Calibration) -> dict:
+    """Return the proof of any calibration on a recording that was gathered with `model`, which has its effects (`model_for`)."""
+    values = nominal_values(model)
+    for effect in calibration.model.effects:
+        if effect.key in model.slices and not effect.in_reference:
+            values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
+    return prove(held_out, model, [values], nominal_values(model))
+
+
+def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], reference: np.ndarray) -> dict:
+    """
+    Return sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows', 'seconds', 'delay_s', 'regimes'}.
+
+    Parameters
+    ----------
+    held_out : HeldOut
+        With the columns of `model`.
+    model : SensorModel
+    folds : sequence of array
+        Parameters for the blocks of each fold, in turn.
+    reference : array, shape (n_params,)
+        Parameters whose table and clock a nominal sensor may be compared with, where that suits it better than the table as described.
+
+    """
+    folds = [_as_compensated(model, values) for values in folds]
+    regimes = [name for name in Regime if any(name in block.counts for block in held_out.blocks)]
+    counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in held_out.blocks])
+    if (counts.sum(axis=1) > 0).sum() < LEAST_BLOCKS:
+        return {}
+    proof = {}
+    for sensor in SENSORS:
+        after = _errors(held_out, model, sensor, folds, regimes)
+        nominal = [_errors(held_out, model, sensor, [values], regimes) for values in (nominal_values(model), _with_reference(model, reference))]
+        before = min(nominal, key=lambda errors: errors.squares.sum())
+        entry = _compared(before.squares.sum(axis=1), after.squares.sum(axis=1), counts.sum(axis=1))
+        moving = {str(name): _compared(before.squares[:, k], after.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
+                  if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
+        late = {'delay_s': after.delay, 'delay_explains': 1.0 - after.squares.sum() / max(after.without_delay, 1e-300)}
+        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': held_out.n_windows} | late | {'regimes': moving}
+    return proof
+
+
+def nominal_values(model: SensorModel) -> np.ndarray:
+    """Return the parameters of a sensor as its data sheet has it on a table as described."""
+    values = model.start()
+    return np.where(np.isfinite(values), values, 0.0)
+
+
+def model_for(calibration: Calibration, model: SensorModel) -> SensorModel:
+    """Return the model of a recording's table with the effects of a calibration that act on the sensors."""
+    for effect in calibration.model.effects:
+        if not effect.in_reference and effect.key not in model.slices:
+            model = model.with_effect(effect.sensor, effect.name)
+    return model
+
+
+def _as_compensated(model, values):
+    """Return the values with what compensation does not undo at zero; table, clock and lags stay."""
+    values = values.copy()
+    for effect in model.effects:
+        if effect.compensation == 'none' and not effect.in_reference and effect.warp is None:
+            values[model.slices[effect.key]] = effect.prior_values()
+    return np.where(np.isfinite(values), values, 0.0)
+
+
+def _with_reference(model, reference):
+    values = nominal_values(model)
+    for effect in model.effects:
+        if _of_reference(effect):
+            values[model.slices[effect.key]] = reference[model.slices[effect.key]]
+    return values
+
+
+def _of_reference(effect: Effect) -> bool:
+    return effect.in_reference or effect.sensor == 'reference' or effect.warp is not None
+
+
+def _errors(held_out, model, sensor, folds, regimes):
+    """Return the Errors of parameters (one set for each fold in turn), with the delay and the common arm that suit them best."""
+    parts = [(k, regimes.index(regime), rows, folds[k % len(folds)]) for k, block in enumerate(held_out.blocks)
+             for (name, regime), rows in block.pieces.items() if name == sensor and len(rows)]
+    known = {id(values): _Correction(model, sensor, values) for values in folds}
+    stacks = [known[id(values)].errors(rows) for _, _, rows, values in parts]
+    best, delay_free = _nuisances(np.concatenate(stacks, axis=1))
+    squares = np.zeros((len(held_out.blocks), len(regimes)))
+    for (k, regime, *_), (error, *changes) in zip(parts, stacks):
+        left = error + np.tensordot(best, changes, axes=1) if len(best) else error
+        squares[k, regime] += (left**2).sum()
+    return Errors(squares, float(best[0]), delay_free)
+
+
+def _nuisances(stacked):
+    """Return what makes ``error + sum(nuisance change)`` least, the delay first, and the sum of squares without a delay."""
+    error, changes = stacked[0].ravel(), stacked[1:].reshape(len(stacked) - 1, -1)
+    best = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
+    others = changes[1:]
+    rest = np.linalg.lstsq(others.T, -error, rcond=1e-9)[0] if len(others) else np.zeros(0)
+    without = error + rest @ others
+    best[0] = np.clip(best[0], -LARGEST_DELAY, LARGEST_DELAY)
+    return best, float(without @ without)
+
+
+class _Correction:
+    """How rows ``[columns | d(true input)/dt | output]`` become errors of corrected readings, and how nuisances change these."""
+
+    def __init__(self, model, sensor, values):
+        total = coefficients(model, sensor, values)
+        self.matrix = model.value(sensor, Role.LINEAR, values)
+        self.inverse = np.linalg.inv(self.matrix)
+        self.total, self.arms = total, []
+        arm = model.part(sensor, Role.ARM)
+        for index in range(arm.start, arm.stop):
+            moved = values.copy()
+            moved[index] += 1.0
+            self.arms.append(coefficients(model, sensor, moved) - total)
+
+    def errors(self, rows):
+        """Return errors and their change with each nuisance, (1 + n_nuisances, k, 3): the delay, s, and the arm, m."""
+        columns, slope, output = rows[:, :-2 * AXES], rows[:, -2 * AXES:-AXES], rows[:, -AXES:]
+        # measured(t) = matrix @ true(t - delay): what is missing is delay times the slope.
+        parts = [output - columns @ self.total, slope @ self.matrix.T, *(-columns @ arm for arm in self.arms)]
+        return np.stack(parts) @ self.inverse.T
+
+
+def _compared(before, after, count):
+    """Return the entry of squares by block: rms per axis before and after, the interval of their ratio over resamples of blocks, and on how much."""
+    held = count > 0
+    before, after, count = before[held], after[held], count[held]
+    draw = np.random.default_rng(1).integers(0, len(count), (RESAMPLES, len(count)))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
+    low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
+    total = AXES * count.sum()
+    return {'before': float(np.sqrt(before.sum() / total)), 'after': float(np.sqrt(after.sum() / total)), 'ci95': [float(low), float(high)],
+            'seconds': float(count.sum() * PIECE_TIME)}

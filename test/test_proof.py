@@ -1,0 +1,112 @@
+"""A calibration is proven on windows that took no part, before it is handed over."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration import held_out, trust
+from imu_calibration.calibration.proof_words import disproved
+from imu_calibration.errors import DocumentError
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.pieces import Regime, moving_pieces
+from imu_calibration.estimation.solver import solve
+from imu_calibration.reference.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.compensate import compensate
+
+from worlds.misfit_worlds import make_pair
+
+SENSORS = ('accelerometer', 'gyroscope')
+
+
+def calibrated(pair, **choices):
+    return calibrate(pair.first.block, Table.from_mapping(pair.table), **choices)
+
+
+@pytest.fixture(scope='module')
+def clean():
+    return calibrated(make_pair(None, 1))
+
+
+@pytest.fixture(scope='module')
+def late():
+    return calibrated(make_pair('driver_lag', 1, table='shaft', profile='sweeps'), reference_model='table_tilt')
+
+
+def test_a_good_calibration_is_proven_in_every_motion(clean):
+    found = clean.calibration.proof
+    assert set(found) == set(SENSORS) and not disproved(clean.calibration) and clean.verdict.word != 'bad'
+    for entry in found.values():
+        assert entry['windows'] == sum(clean.calibration.statistics['windows'].values())
+        assert set(entry['regimes']) >= {Regime.REST, Regime.FAST, Regime.ACCELERATING}
+        for part in (entry, *entry['regimes'].values()):
+            assert part['ci95'][0] <= part['after'] / part['before'] <= part['ci95'][1] < 0.6
+    assert 'error on data that took no part' in str(clean)
+
+
+def test_a_gain_that_a_lag_has_spoiled_is_refused_with_its_cause(late, tmp_path):
+    true = make_pair('driver_lag', 1, table='shaft', profile='sweeps').first.truth['gyroscope'].matrix[0, 0]
+    gain = late.calibration.value('gyroscope', 'matrix')[0, 0]
+    assert abs(gain - true) > 2 * abs(1.0 - true)   # what has to be noticed
+    assert late.verdict.word == 'bad' and late.exit_code == 3
+    assert late.calibration.proof['gyroscope']['delay_s'] == pytest.approx(0.012, abs=2e-3)
+    line = disproved(late.calibration)[0]
+    assert 'gyroscope' in line and 'ms too late' in line and '\n' not in line
+    with pytest.raises(DocumentError, match='took no part'):
+        compensate(make_pair('driver_lag', 1, table='shaft', profile='sweeps').second.imu, late.calibration)
+    late.save(tmp_path, report=False)
+    assert 'proof:' in (tmp_path / 'calibration.yaml').read_text()
+
+
+def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
+    result = clean.result
+    dealt = result.gathered.held_out.restricted(result.gathered_model, result.model)
+    without = dealt.values_without(result.solution)
+    rest = Accumulator()
+    for k, block in enumerate(dealt.blocks):
+        if k % held_out.FOLDS != 2:
+            rest.merge(block.accumulator)
+    again = solve(rest, result.model, noise=result.solution.noise)
+    free = ~(result.solution.held | again.held)
+    step, wanted = ((values - result.solution.values)[free] / result.solution.sd[free] for values in (without[2], again.values))
+    # biases wander from window to window: what is dealt out apart is whitened apart
+    assert np.corrcoef(step, wanted)[0, 1] > 0.95 and np.abs(step - wanted).max() < 0.3
+
+
+def test_every_window_is_dealt_to_one_block(clean):
+    gathered = clean.result.gathered
+    blocks = gathered.held_out.blocks
+    for kind, count in gathered.accumulator.windows.items():
+        each = [block.accumulator.windows.get(kind, 0) for block in blocks]
+        assert sum(each) == count and max(each) - min(each) <= 1
+
+
+def test_memory_does_not_grow_with_the_session(clean):
+    twice = held_out.HeldOut()
+    for _ in range(3):
+        twice.merge(clean.result.gathered.held_out)
+    sizes = [factor.shape for block in twice.blocks for factor in block.pieces.values()]
+    assert twice.n_windows == 3 * clean.result.gathered.held_out.n_windows and max(rows for rows, _ in sizes) <= max(width for _, width in sizes)
+
+
+def test_one_motion_that_gets_worse_is_enough(clean):
+    entry = clean.calibration.proof['gyroscope']
+    worse = {'before': 1.0, 'after': 1.2, 'ci95': [1.1, 1.3], 'seconds': 10.0}
+    spoiled = replace(clean.calibration, proof=clean.calibration.proof | {'gyroscope': entry | {'regimes': entry['regimes'] | {'fast turns': worse}}})
+    assert 'fast turns' in trust.objections(spoiled)[0] and 'makes this motion worse' in trust.objections(spoiled)[0]
+    unsure = entry | {'regimes': {'fast turns': worse | {'ci95': [0.9, 1.5]}}}
+    assert not trust.objections(replace(clean.calibration, proof={'gyroscope': unsure}))
+
+
+def test_a_piece_knows_its_mean_and_how_the_input_changed():
+    time = np.arange(0.0, 5.0, 0.01)
+    rate = np.stack([2.5 * np.sin(time), np.zeros_like(time), np.zeros_like(time)], axis=1)
+    rows = np.concatenate([np.ones((len(time), 1)), rate], axis=1)
+    pieces = moving_pieces(rows, time, rate, rate)
+    assert set(pieces) == {Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING}
+    total = np.concatenate(list(pieces.values()))
+    assert len(total) == 19 and np.all(total[:, 0] == 1.0)
+    middle = np.arcsin(np.clip(total[:, 4] / 2.5, -1, 1))
+    np.testing.assert_allclose(np.abs(total[:, 1]), np.abs(2.5 * np.cos(middle)), atol=0.15)
+    assert np.all(np.abs(pieces[Regime.ACCELERATING][:, 1]) > 90 * np.pi / 180)
