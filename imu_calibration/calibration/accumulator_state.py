@@ -12,11 +12,11 @@ from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, shortened
-from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 from imu_calibration.reference.joint import JointNames
 
-FORMAT = 'imu_calibration/accumulator/1'
+FORMAT = 'imu_calibration/accumulator/2'
 _MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
@@ -40,7 +40,8 @@ def to_bytes(gathered, model):
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
               'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
-              'slow_rows': accumulator.slow_rows, **{name: getattr(gathered, name) for name in _PLAIN}}
+              'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length, 'blocks': [_outline(block) for block in accumulator.blocks],
+              **{name: getattr(gathered, name) for name in _PLAIN}}
     arrays = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
               'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
               'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
@@ -51,6 +52,9 @@ def to_bytes(gathered, model):
             arrays[f'{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
     for name in ('within', 'slow'):
         arrays |= {f'{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
+    for number, block in enumerate(accumulator.blocks):
+        for name in ('within', 'slow'):
+            arrays |= {f'block{number}.{name}.{k}': factor for k, factor in enumerate(getattr(block, name).values())}
     target = io.BytesIO()
     np.savez(target, **arrays)
     return target.getvalue()
@@ -126,7 +130,19 @@ def _gathered(header, arrays):
     poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
     plain = {name: header[name] for name in _PLAIN}
     plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
-    return Gathered(Accumulator(rows, within, slow, header['slow_rows'], header['samples'], header['windows']), poses=poses, **plain)
+    blocks = [_block(outline, f'block{number}', arrays) for number, outline in enumerate(header['blocks'])]
+    accumulator = Accumulator(rows, within, slow, header['slow_rows'], header['samples'], header['windows'], blocks, header['block_length'])
+    return Gathered(accumulator, poses=poses, **plain)
+
+
+def _outline(block):
+    return {'session': block.session, 'start': block.start, 'windows': block.windows,
+            'within': [list(key) for key in block.within], 'slow': [list(key) for key in block.slow]}
+
+
+def _block(outline, label, arrays):
+    within, slow = ({tuple(key): arrays[f'{label}.{name}.{k}'] for k, key in enumerate(outline[name])} for name in ('within', 'slow'))
+    return WindowBlock(outline['session'], outline['start'], outline['windows'], within, slow)
 
 
 def _sensors(rows):

@@ -1,6 +1,6 @@
 """The streaming least-squares system: windows go in one at a time, memory stays bounded, systems of several recordings merge."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,46 @@ from imu_calibration.estimation.window_statistics import SensorStatistics, Windo
 
 CAPACITY = 4096
 """Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
+MOST_BLOCKS = 48
+"""Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there."""
+
+
+@dataclass(eq=False)
+class WindowBlock:
+    """The centred rows of consecutive windows: what parts of a recording say by themselves."""
+
+    session: int
+    """Recording of the first window."""
+    start: float
+    """Middle of the first window, s."""
+    windows: int
+    """Number of windows."""
+    within: dict = field(default_factory=dict)
+    """As in `Accumulator`."""
+    slow: dict = field(default_factory=dict)
+    """As in `Accumulator`."""
+
+    def add(self, window: WindowStatistics) -> None:
+        """Take the centred rows of one window."""
+        for sensor in SENSORS:
+            statistics = window.sensors[sensor]
+            stack(self.within, (sensor, window.kind), statistics.within)
+            if statistics.slow_rows:
+                stack(self.slow, (sensor, window.kind), statistics.slow)
+        self.windows += 1
+
+    def copy(self) -> 'WindowBlock':
+        """Return a block that goes its own way; factors are never changed in place."""
+        return replace(self, within=dict(self.within), slow=dict(self.slow))
+
+    def joined(self, other: 'WindowBlock') -> 'WindowBlock':
+        """Return this block and the one after it as one."""
+        both = self.copy()
+        both.windows += other.windows
+        for mine, its in ((both.within, other.within), (both.slow, other.slow)):
+            for key, factor in its.items():
+                stack(mine, key, factor)
+        return both
 
 
 @dataclass(eq=False)
@@ -34,6 +74,10 @@ class Accumulator:
     """Kind -> number of samples."""
     windows: dict = field(default_factory=dict)
     """Kind -> number of windows."""
+    blocks: list[WindowBlock] = field(default_factory=list)
+    """The centred rows once more, part by part in order of time."""
+    block_length: int = 1
+    """Windows per block."""
 
     def add(self, window: WindowStatistics) -> None:
         """Take one window (WindowStatistics)."""
@@ -43,6 +87,7 @@ class Accumulator:
             if statistics.slow_rows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
         self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + statistics.slow_rows
+        self._add_to_blocks(window)
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
         if len(self.rows) > CAPACITY:
@@ -50,7 +95,8 @@ class Accumulator:
 
     def copy(self) -> 'Accumulator':
         """Return an accumulator that goes its own way; rows and factors are never changed in place."""
-        return Accumulator(list(self.rows), *(dict(getattr(self, f.name)) for f in fields(self)[1:]))
+        maps = (dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows'))
+        return Accumulator(list(self.rows), *maps, [block.copy() for block in self.blocks], self.block_length)
 
     def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
@@ -62,8 +108,30 @@ class Accumulator:
         self.rows.extend(other.rows)
         for kind, count in other.samples.items():
             self._count(kind, count, other.windows[kind])
+        self.blocks.extend(block.copy() for block in other.blocks)
+        self.block_length = max(self.block_length, other.block_length)
+        self._join_blocks()
         while len(self.rows) > CAPACITY:
             self._thin()
+
+    def block_of(self, session: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Return the number of the block in which windows of these recordings and middles lie."""
+        starts = np.array([(block.session, block.start) for block in self.blocks])
+        later = (starts[:, :1] > session) | ((starts[:, :1] == session) & (starts[:, 1:] > time))
+        return np.maximum((~later).sum(axis=0) - 1, 0)
+
+    def _add_to_blocks(self, window):
+        last = self.blocks[-1] if self.blocks else None
+        if last is None or last.windows >= self.block_length or last.session != window.session:
+            self.blocks.append(WindowBlock(window.session, window.time, 0))
+        self.blocks[-1].add(window)
+        self._join_blocks()
+
+    def _join_blocks(self):
+        while len(self.blocks) > MOST_BLOCKS:
+            pairs = [self.blocks[at:at + 2] for at in range(0, len(self.blocks), 2)]
+            self.blocks = [pair[0].joined(pair[1]) if len(pair) == 2 else pair[0] for pair in pairs]
+            self.block_length *= 2
 
     def _count(self, kind, samples, windows):
         self.samples[kind] = self.samples.get(kind, 0) + samples
@@ -79,8 +147,10 @@ class Accumulator:
                 thinned.append(first)
                 index += 1
                 continue
+            place = int(self.block_of(np.array([first.session]), np.array([first.time]))[0])
             for sensor in SENSORS:
-                stack(self.within, (sensor, first.kind), _difference(first, second, sensor))
+                for factors in (self.within, self.blocks[place].within):
+                    stack(factors, (sensor, first.kind), _difference(first, second, sensor))
             thinned.append(_joined(first, second))
             index += 2
         if len(thinned) == len(self.rows):
@@ -132,10 +202,15 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
     chosen = selected_columns(wide, narrow)
     small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
-    small.within, small.slow = ({(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
-                                for factors in (accumulator.within, accumulator.slow))
+    small.within, small.slow = (_chosen(factors, chosen) for factors in (accumulator.within, accumulator.slow))
+    small.blocks = [replace(block, within=_chosen(block.within, chosen), slow=_chosen(block.slow, chosen)) for block in accumulator.blocks]
+    small.block_length = accumulator.block_length
     small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
     return small
+
+
+def _chosen(factors, chosen):
+    return {(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:

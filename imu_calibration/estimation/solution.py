@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.noise_model import NoiseModel
 
 
@@ -30,6 +31,9 @@ class Solution:
     """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
     session_biases: dict = field(default_factory=dict)
     """Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean."""
+
+    model_error: ModelError | None = None
+    """What the covariance has grown by, beyond what noise gives."""
 
     @property
     def param_names(self) -> list[str]:

@@ -6,6 +6,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, scaled_lstsq
@@ -73,8 +74,10 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
     data = system.jacobian(values, factors)
     covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior.sd)
+    error = model_error(system, values, noises, free & ~held)
+    covariance = error.added(covariance)
     chi2, rms = _fit_quality(system, values, noises)
-    return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises))
+    return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error)
 
 
 def _refuse(without, held, model, allow_holding):

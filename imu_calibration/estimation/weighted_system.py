@@ -8,7 +8,7 @@ import scipy.linalg
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
 from imu_calibration.estimation.prior import Prior
 from imu_calibration.estimation.triangular import triangular
@@ -68,22 +68,34 @@ class WeightedSystem:
         variance = self.mean_variance(noise) + noise.offset_sd**2
         return Whitening(variance, self.times, self.sessions, noise.bias_processes, noise.session_variance)(rows)
 
+    def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
+        """Return the whitened mean rows ``[columns | output]`` of each axis, shape (n_windows, 3, p + 1)."""
+        return self.whitened(np.stack([self.means[sensor][:, self.columns_and(sensor, axis)] for axis in range(3)], axis=1), noise)
+
+    def columns_and(self, sensor: str, axis: int) -> list[int]:
+        """Return the places of all columns and of the output of one axis in rows of a sensor."""
+        p = self.means[sensor].shape[1] - 3
+        return [*range(p), p + axis]
+
     def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
         """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
-        p = self.means[sensor].shape[1] - 3
-        picked = [list(range(p)) + [p + axis] for axis in range(3)]
-        white = self.whitened(np.stack([self.means[sensor][:, at] for at in picked], axis=1), noise)
-        weighed = list(self.weighed_rows(sensor, noise))
-        return [triangular(np.concatenate([white[:, axis], *(rows[:, picked[axis]] * weight[axis] for rows, weight in weighed)]))
+        white, weighed = self.whitened_means(sensor, noise), list(self.weighed_rows(sensor, noise))
+        return [triangular(np.concatenate([white[:, axis], *(rows[:, self.columns_and(sensor, axis)] * weight[axis] for rows, weight in weighed)]))
                 for axis in range(3)]
 
-    def weighed_rows(self, sensor: str, noise: NoiseModel):
-        """Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more."""
-        for kind, factor in self.within[sensor].items():
-            yield factor, 1 / np.sqrt(noise.row_variance(kind))
+    def weighed_rows(self, sensor: str, noise: NoiseModel, part: Accumulator | WindowBlock | None = None):
+        """
+        Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more.
+
+        Of all windows, or those of a block.
+        """
+        part = part or self.accumulator
+        for kind in self.within[sensor]:
+            if (sensor, kind) in part.within:
+                yield part.within[sensor, kind], 1 / np.sqrt(noise.row_variance(kind))
             extra = noise.slow_weight(kind)
-            if extra.any():
-                yield self.accumulator.slow[sensor, kind], extra
+            if extra.any() and (sensor, kind) in part.slow:
+                yield part.slow[sensor, kind], extra
 
     def residuals(self, values: np.ndarray, factors: dict) -> np.ndarray:
         """Return the residual rows of both sensors and all axes, those of the prior last."""

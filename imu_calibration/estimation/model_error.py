@@ -1,0 +1,155 @@
+"""
+What standard deviations must allow for beside noise: misfit that differs from stretch to stretch, and parameters that drift.
+
+The gradient of the cost falls into parts, one for each block of consecutive windows; at the estimate they add up to nothing. Their sums
+weighted with slow cosines of the blocks' numbers are, times the covariance, what parts of the recording ask for beyond the whole, and
+noise alone says how large they may be. Where they are larger than chance allows, the covariance grows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
+from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.weighted_system import WeightedSystem
+
+LEAST_BLOCKS = 8
+"""Fewer blocks tell nothing of their scatter."""
+MOST_WAVES = 12
+"""Cosines used; faster ones say no more than the scatter within windows does."""
+SLOW_WAVES = 3
+"""Cosines that show a drift."""
+CHANCE = 0.01
+"""Chance of a drift for each sensor, and of misfit for each, in a recording without."""
+UNSEEN = 1.5
+"""Misfit in excess of noise is taken larger by this factor: what repeats in every block shows in none."""
+SEEN = 1e-6
+"""Share of a parameter's variance that must come from the recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """What the covariance grows by."""
+
+    factor: np.ndarray
+    """Factor on the standard deviations that noise alone gives, at least 1, shape (n_params,)."""
+    added_variance: np.ndarray
+    """Variance on top, of parameters that drift and of biases that go with the attitude, shape (n_params,)."""
+
+    def added(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance that noise alone gives, grown by what the model misses."""
+        return covariance * np.outer(self.factor, self.factor) + np.diag(self.added_variance)
+
+
+def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], free: np.ndarray) -> ModelError:
+    """
+    Return by how much the blocks of a recording ask for different parameters than noise explains.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    values : ndarray, shape (n_params,)
+        The estimate.
+    noises : dict
+        Sensor -> NoiseModel, with which it was made.
+    free : ndarray of bool, shape (n_params,)
+        Parameters that were estimated.
+
+    """
+    factor, more = np.ones(len(values)), np.zeros(len(values))
+    if len(system.accumulator.blocks) >= LEAST_BLOCKS and free.any():
+        waves = _Waves(*block_scores(system, values, noises), system.prior.root, free)
+        for sensor in {effect.sensor for effect in system.model.effects}:
+            groups = [waves.group(system.model.slices[e.key]) for e in system.model.effects if e.sensor == sensor]
+            groups = [group for group in groups if len(group)]
+            if groups and fisher([waves.drift(group)[0] for group in groups]) < CHANCE:
+                for group in groups:
+                    more[waves.places[group]] = waves.drift(group)[1]
+            if groups and fisher([waves.scatter(group)[0] for group in groups]) < CHANCE:
+                for group in groups:
+                    factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
+                if sensor == 'accelerometer':   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
+                    more[system.model.part(sensor, Role.OFFSET)] += noises[sensor].offset_sd**2
+    return ModelError(factor, more)
+
+
+def fisher(p_values: list[float]) -> float:
+    """Return the p-value of several independent ones together (Fisher)."""
+    return float(chi2.sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
+
+
+def block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the information of each block of windows, shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params)."""
+    blocks = system.accumulator.blocks
+    information, gradient = np.zeros((len(blocks),) + (len(values),) * 2), np.zeros((len(blocks), len(values)))
+    block = system.accumulator.block_of(np.array([row.session for row in system.accumulator.rows]), system.times)
+    for sensor in SENSORS:
+        own, slope, noise = coefficients(system.model, sensor, values), coefficient_jacobian(system.model, sensor, values), noises[sensor]
+        white = system.whitened_means(sensor, noise)
+        for number, part in enumerate(blocks):
+            weighed = list(system.weighed_rows(sensor, noise, part))
+            for axis in range(3):
+                at = system.columns_and(sensor, axis)
+                rows = np.concatenate([white[block == number, axis], *(rows[:, at] * weight[axis] for rows, weight in weighed)])
+                design = rows[:, :-1] @ slope[:, axis]
+                information[number] += design.T @ design
+                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
+    return information, gradient
+
+
+class _Waves:
+    """The parts' gradients as cosines over the recording, with the covariance that noise gives them."""
+
+    def __init__(self, information, gradient, prior_root, free):
+        self.places = np.flatnonzero(free)
+        information, gradient = information[:, free][:, :, free], gradient[:, free]
+        covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
+        count = len(information)
+        number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
+        weights = np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
+        self.moved = weights @ gradient @ covariance
+        mixed = np.einsum('kc,cij->kij', weights, information)
+        squared = np.einsum('kc,cij->kij', weights**2, information)
+        self.expected = covariance @ (squared - mixed @ covariance @ mixed) @ covariance
+        self.walk = 1 / (np.pi * number)**2
+        """Variance of each cosine of a random walk that has unit variance after the whole recording."""
+        diagonal = np.einsum('kii->ki', self.expected)
+        self._seen = np.all(diagonal > SEEN * np.diag(covariance), axis=0)
+
+    def group(self, part):
+        """Return the places among the free parameters of those of one effect that the recording shows."""
+        return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & self._seen)
+
+    def drift(self, group):
+        """
+        Return (chance of so slow a change by noise, variance to add for it, shape (n,)) of parameters that each walk at random.
+
+        All alike, but for those that walk by more by themselves. The mean over another recording of the same length differs by two thirds
+        of the variance that the walk reaches in one, a third for each of both.
+        """
+        p_value, common = self._walked(self.moved[:SLOW_WAVES, group], self._inverse(group)[:SLOW_WAVES])
+        own = [self._walked(self.moved[:SLOW_WAVES, at], self._inverse(at)[:SLOW_WAVES]) for at in group[:, None]]
+        return p_value, np.array([max(common, variance if chance < CHANCE / len(group) else 0.0) for chance, variance in own])
+
+    def _walked(self, moved, information):
+        """Return (chance, variance to add) by the score test of the variance of a walk."""
+        walk = self.walk[:SLOW_WAVES]
+        score = walk @ (np.einsum('kij,kj->ki', information, moved)**2).sum(axis=1)
+        mean = walk @ np.einsum('kii->k', information)
+        spread = walk**2 @ np.einsum('kij,kij->k', information, information)
+        dof = mean**2 / spread
+        return float(chi2.sf(score / mean * dof, dof)), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
+
+    def scatter(self, group):
+        """Return (chance of so much scatter by noise, factor on the variance of each parameter) of a group."""
+        moved = self.moved[:, group]
+        ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
+        single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
+        return float(chi2.sf(ratio * moved.size, moved.size)), 1.0 + UNSEEN * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+
+    def _inverse(self, group):
+        return np.array([inverse_normal(expected) for expected in self.expected[:, group][:, :, group]])

@@ -1,0 +1,137 @@
+"""Standard deviations allow for what the model misses: parameters that drift, misfit that goes with the motion; clean sessions stay as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation import accumulator as accumulator_module
+from imu_calibration.estimation.accumulator import Accumulator, restrict
+from imu_calibration.estimation.model_error import LEAST_BLOCKS
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import reduce_windows
+from imu_calibration.reference.table import Table
+
+from worlds.misfit_coverage import base_sd, calibrated, errors_in_sd
+from worlds.misfit_worlds import make_pair
+from worlds.physics import TABLES
+
+TABLE = Table.from_mapping(TABLES['three_axis'])
+MODEL = SensorModel(joint_names=tuple(TABLE.joint_names))
+YAW = 'gyroscope.matrix.zx'
+
+
+@pytest.fixture(scope='module')
+def windows():
+    """Windows of a clean session."""
+    return calibrated(make_pair(None, 11).first).windows
+
+
+def measured(windows, change_of, seed):
+    """Return the windows with white noise, the gyroscope's matrix moved by `change_of(share of the session)` at each window."""
+    rng, end, found = np.random.default_rng(seed), windows[-1].time[-1], []
+    for window in windows:
+        values = MODEL.start()
+        values[MODEL.param_names.index(YAW)] += change_of(window.time.mean() / end)
+        outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out, sd in zip(predict(MODEL, values, TABLE, window.motion), (2e-2, 2e-3))]
+        found.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
+    return found
+
+
+def accumulated(windows, model=MODEL):
+    """Return the Accumulator of windows."""
+    total = Accumulator()
+    for row in reduce_windows(windows, model, TABLE):
+        total.add(row)
+    return total
+
+
+def solved(windows):
+    """Return the Solution."""
+    return solve(accumulated(windows), MODEL)
+
+
+def grown(solution):
+    """Return the standard deviations over those that noise alone gives."""
+    return solution.sd / base_sd(solution)
+
+
+def test_clean_sessions_stay_as_they_are(windows):
+    """Where the model holds nothing is wider, but by the chance that the tests leave."""
+    ratios = np.array([grown(solved(measured(windows, lambda share: 0.0, seed))) for seed in range(12)])
+    assert np.median(ratios) == 1.0
+    assert np.quantile(ratios, 0.95) < 1.3
+
+
+def test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats(windows):
+    """A cross term that walks by 2e-3 during the session is not known to 2e-5; what is another sensor's stays."""
+    rng = np.random.default_rng(3)
+    walk = np.cumsum(rng.normal(0, 1, 50)) * 2e-3 / np.sqrt(50)
+    found = solved(measured(windows, lambda share: np.interp(share, np.linspace(0, 1, 50), walk), 1))
+    place = MODEL.param_names.index(YAW)
+    assert base_sd(found)[place] < 1e-4
+    assert 3e-4 < found.sd[place] < 6e-3
+    assert np.all(grown(found)[:12] < 1.3)
+
+
+@pytest.mark.parametrize('cause', ['encoder_eccentricity', 'flexible_mount'])
+def test_errors_that_go_with_the_motion_are_in_the_standard_deviations(cause):
+    """With noise alone the errors of matrices are many standard deviations; with what the blocks show they are as large as they should be."""
+    errors = [errors_in_sd(calibrated(make_pair(cause, seed).first)) for seed in (21, 22)]
+    alone, with_it = (np.concatenate([error[what, group] for error in errors for group in ('accelerometer.matrix', 'gyroscope.matrix')])
+                      for what in ('noise alone', 'reported'))
+    assert np.sqrt(np.mean(alone**2)) > 3.0
+    assert np.sqrt(np.mean(with_it**2)) < 1.7
+
+
+def test_few_blocks_say_nothing(windows):
+    """Scatter of fewer blocks than it takes is not looked at."""
+    few = solved(measured(windows, lambda share: 0.01 * share, 1)[:LEAST_BLOCKS - 1])
+    assert np.all(grown(few) == 1.0)
+
+
+def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
+    """However long the session, the number of blocks is bounded, and together they hold what the whole holds; columns are picked in both."""
+    monkeypatch.setattr(accumulator_module, 'MOST_BLOCKS', 6)
+    total = accumulated(windows)
+    assert 3 <= len(total.blocks) <= 6
+    assert sum(block.windows for block in total.blocks) == len(windows)
+    narrow = SensorModel(accelerometer=('bias', 'matrix'), joint_names=MODEL.joint_names)
+    for found in (total, restrict(total, MODEL, narrow)):
+        for key, factor in found.within.items():
+            parts = sum(block.within[key].T @ block.within[key] for block in found.blocks if key in block.within)
+            np.testing.assert_allclose(parts, factor.T @ factor, rtol=1e-9, atol=1e-9 * np.max(factor.T @ factor))
+
+
+def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
+    """The difference of two windows that are joined into one mean row goes to their block as well."""
+    monkeypatch.setattr(accumulator_module, 'CAPACITY', 20)
+    total = accumulated(windows)
+    key = ('gyroscope', 'static')
+    parts = sum(block.within[key].T @ block.within[key] for block in total.blocks if key in block.within)
+    np.testing.assert_allclose(parts, total.within[key].T @ total.within[key], rtol=1e-9, atol=1e-9 * np.max(parts))
+
+
+def test_copies_and_merged_systems_go_their_own_way(windows):
+    """A window added to one accumulator shows in no copy of it, nor in one that it was merged into."""
+    first = accumulated(windows[:9])
+    total, twin = Accumulator(), first.copy()
+    total.merge(first)
+    before = [block.windows for block in total.blocks]
+    first.block_length = 20
+    first.add(reduce_windows(windows[9:10], MODEL, TABLE)[0])
+    assert sum(block.windows for block in first.blocks) == 10
+    assert [block.windows for block in total.blocks] == before == [block.windows for block in twin.blocks]
+
+
+def test_blocks_survive_a_restart(windows):
+    """A session that goes on where it was saved has the same standard deviations."""
+    total = accumulated(measured(windows, lambda share: 5e-3 * share, 1))
+    again = from_bytes(to_bytes(Gathered(total), MODEL), MODEL).accumulator
+    first, second = solve(total, MODEL), solve(again, MODEL)
+    assert np.any(grown(first) > 1.0)
+    np.testing.assert_array_equal(first.sd, second.sd)
