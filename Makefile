@@ -32,11 +32,11 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config bench soak hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config answers bench soak hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, bench, soak, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, hide-and-seek, clean'
 
 setup: $(STAMP)
 
@@ -95,6 +95,10 @@ $(STAMP)-validate: $(STAMP) constraints/validate.txt
 config: $(STAMP)
 	@$(PY) -m imu_calibration.nodes.parameter_files
 	@$(PY) -m imu_calibration.effects.tolerance_file
+
+# Pages that are written from what runs: the targets of exports.
+answers: $(STAMP)
+	@$(PY) -m imu_calibration.exports.page
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

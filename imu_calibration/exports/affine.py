@@ -34,6 +34,8 @@ class AffineImu:
     """Row i: from the origin to the sensitive point of accelerometer i, m, shape (3, 3)."""
     temperature_ref_c: float = 25.0
     """T0, degrees Celsius."""
+    temperature_range_c: tuple[float, float] | None = None
+    """Where the thermal part was measured, degrees Celsius; None: not known."""
 
     def value(self, holding: Holding) -> np.ndarray:
         """Return the values of the effects of one kind."""
@@ -51,7 +53,8 @@ def held_values(calibration: Calibration, effect: Effect, holding: Holding | Non
 
 def affine_of(calibration: Calibration, holdings: tuple[Holding, ...]) -> AffineImu:
     """Return that part of a calibration which lies in `holdings`."""
-    found = AffineImu(temperature_ref_c=calibration.model.temperature_ref_c)
+    limits = calibration.conditions.get('temperature_range_c')
+    found = AffineImu(temperature_ref_c=calibration.model.temperature_ref_c, temperature_range_c=tuple(limits) if limits else None)
     for holding in holdings:
         for effect in filter(holding.covers, calibration.model.effects):
             found.value(holding)[...] = held_values(calibration, effect, holding).reshape(effect.shape)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
+from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import InputError
@@ -63,11 +64,11 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     motion = motion or standard_motion(calibration)
     loss = loss_of(target, calibration, numbers, placement, motion)
     lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
-             *loss_lines(target, loss), *(f'note: {line}' for line in (*target.ignored(numbers), *unknown))]
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*target.ignored(numbers), *unknown, *filter(None, [target.hint])))]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
     assert target.write is not None   # `registry.find_target` gives no other
-    content = target.write(Page(numbers, found, [*head, *lines, *([target.hint] if target.hint else [])], calibration, rate))
+    content = target.write(Page(numbers, found, [*head, *lines], calibration, rate))
     return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines))
 
 
@@ -91,11 +92,16 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
         return None, []
     found = _noise_of(calibration, figures, rate)
     if found is None or (target.needs_walk and not found.walk_known):
-        lacks = 'noise with random walks' if target.needs_walk else 'noise and the rate at which the readings come'
+        lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings beside the calibration,'
         if target.only_noise:
-            raise InputError(f'{target.title} must be given {lacks}, none came; give a noise document', key='noise')
-        return None, [f'the noise figures are left out: {lacks} must come from a noise document']
-    return target.noise(found), []
+            raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise')
+        return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
+    return target.noise(found), _walk_lines(found) if target.needs_walk else []
+
+
+def _walk_lines(noise: Noise) -> list[str]:
+    """Say of random walks that were not found as such what they are."""
+    return [f'random walk of the {sensor}: {BASIS[basis]}' for sensor in SENSORS for basis in [getattr(noise, sensor).basis] if basis != 'walk']
 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:

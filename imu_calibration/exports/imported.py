@@ -64,7 +64,7 @@ def _document(target: Target, found: Read, imu: AffineImu, path: Any, frame_id: 
     reasons = (f'imported from {target.title} ({name}), which says no uncertainties and was not proven on a recording',
                'next: see what it does to a recording, or calibrate')
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
-    conditions = {'temperature_range_c': found.temperature_range_c} if found.temperature_range_c else {}
+    conditions = {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
     gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN, 'axes': target.axes}
     provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN}
     return check_numbers(Calibration(

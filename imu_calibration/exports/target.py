@@ -69,8 +69,6 @@ class Read:
     """What the program could hold and this file does not."""
     sample_sd: dict[str, float] = field(default_factory=dict)
     """Sensor -> standard deviation of the noise of a sample, where the file says it."""
-    temperature_range_c: list[float] | None = None
-    """Range in which thermal numbers hold, where the file says it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -107,6 +107,17 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     return found
 
 
-def diagonal(values) -> np.ndarray:
-    """Return a diagonal matrix."""
-    return np.diag(np.asarray(values, float))
+def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
+    """
+    Refuse thermal polynomials of an order that the catalogue does not have.
+
+    Raises
+    ------
+    InputError
+        When a parameter with one of these beginnings is not zero.
+
+    """
+    curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
+    if curved:
+        raise InputError(f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
+                         'set it to 0, or calibrate with a temperature topic')
