@@ -101,7 +101,8 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
 
 def _walk_lines(noise: Noise) -> list[str]:
     """Say of random walks that were not found as such what they are."""
-    return [f'random walk of the {sensor}: {BASIS[basis]}' for sensor in SENSORS for basis in [getattr(noise, sensor).basis] if basis != 'walk']
+    basis = {sensor: getattr(noise, sensor).basis for sensor in SENSORS}
+    return [f'random walk of the {sensor}: {BASIS[found]}' for sensor, found in basis.items() if found != 'walk']
 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:
@@ -147,8 +148,9 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
     """Return what is lost, a line each."""
     if target.only_noise:
         left = ', '.join(f'{sensor} {significant(value)} {UNIT[sensor]}' for sensor, value in loss.left.items())
+        beside = ' beside a constant bias' if target.estimates else ''
         return ['takes no calibration: feed it compensated readings (compensator_node, or the verb compensate)',
-                f'fed with raw readings it is left with an error of rms {left} beside a constant bias, on {loss.motion}']
+                f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
     lines = []
     if loss.estimated:
         lines.append('not written, because the target estimates it while it runs: ' + _names(loss.estimated))

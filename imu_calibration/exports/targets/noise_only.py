@@ -53,7 +53,7 @@ def write(page: Page, inside: str = '', gravity: str = '', head: str = '') -> st
 
 def _target(name, title, formula, source, noise, noise_is, writer, **more):
     return Target(name=name, title=title, formula=formula, source=source, noise=noise, noise_is=noise_is, write=writer,
-                  estimates=SLOW_OFFSETS, **more)
+                  **{'estimates': SLOW_OFFSETS, **more})
 
 
 TARGETS = (
@@ -73,5 +73,5 @@ TARGETS = (
     _target('robot-localization', 'covariances for robot_localization and imu_tools',
             'both take the covariances of the messages and nothing else',
             'cra-ros-pkg/robot_localization, CCNYRoboticsLab/imu_tools', covariances, 'discrete: N^2 rate, as in the messages', write,
-            needs_walk=False, hint='compensator_node fills them in by itself; these numbers are for drivers that take them as parameters'),
+            needs_walk=False, estimates=(), hint='compensator_node fills them in by itself; these numbers are for drivers that take them as parameters'),
 )
