@@ -73,5 +73,6 @@ TARGETS = (
     _target('robot-localization', 'covariances for robot_localization and imu_tools',
             'both take the covariances of the messages and nothing else',
             'cra-ros-pkg/robot_localization, CCNYRoboticsLab/imu_tools', covariances, 'discrete: N^2 rate, as in the messages', write,
-            needs_walk=False, estimates=(), hint='compensator_node fills them in by itself; these numbers are for drivers that take them as parameters'),
+            needs_walk=False, estimates=(),
+            hint='compensator_node fills them in by itself; these numbers are for drivers that take them as parameters'),
 )
