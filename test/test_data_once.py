@@ -3,14 +3,20 @@
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration import live as live_calibration
+from imu_calibration.calibration import verdict
 from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.samples import ImuSamples
+from imu_calibration.estimation import observability
+from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
 from imu_calibration.use_cases.inspect import inspect
 from imu_calibration.use_cases.recordings import Topics, source_of
@@ -63,3 +69,46 @@ def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, se
     (look,) = inspect(BAG, [Topics()], table if with_table else None, PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
     assert (look.calibrated is not None) == with_table
+
+
+def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):
+    def enough(windows, *arguments, **options):
+        raise ImuCalibrationError(f'{len(windows)} windows')
+    monkeypatch.setattr('imu_calibration.diagnosis.workflow.diagnose', enough)
+    with pytest.raises(ImuCalibrationError, match=r'^\d\d+ windows'):
+        diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
+    assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
+
+
+def counting(monkeypatch, module, name):
+    """Count the calls of a function of a module."""
+    calls, function = [], getattr(module, name)
+
+    def counted(*arguments, **options):
+        calls.append(arguments)
+        return function(*arguments, **options)
+    monkeypatch.setattr(module, name, counted)
+    return calls
+
+
+def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monkeypatch):
+    judged, needed = counting(monkeypatch, verdict, 'judge'), counting(monkeypatch, observability, 'needed_motions')
+    result = calibrate([source_of(BAG, Topics(), table.joint_names)], table, CalibrationOptions(reference_model='table_tilt'))
+    assert result.verdict.lines() and result.needed is not None
+    assert len(judged) == len(needed) == 1
+
+
+def test_columns_of_a_window_are_computed_once_for_its_statistics_and_its_residuals(table, monkeypatch):
+    (block,) = list(source_of(BAG, Topics(), table.joint_names)())
+    half = block.imu.stamp_ns[len(block.imu) // 2]
+    first, second = (SampleBlock(*(s.select((s.stamp_ns < half) == early) for s in (block.imu, block.joints))) for early in (True, False))
+    live = LiveCalibration(table, PLAIN)
+    live.push(first)
+    live.solve()
+    calls = counting(monkeypatch, live_calibration, 'columns')
+    windows = live.push(second)
+    told = live.residuals(windows)
+    assert len(told) > len(windows) > 10 and len(calls) == 2 * len(windows)
+    live._designs = {}
+    np.testing.assert_allclose(live.residuals(windows).force_s, told.force_s, atol=1e-12)
+    assert len(calls) == 4 * len(windows), 'without the columns at hand they are computed again'

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration import accumulator_state
-from imu_calibration.calibration.calibrate import calibrate, finish
+from imu_calibration.calibration.calibrate import calibrate, conclude, solve_gathered
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.pacing import SolvePacer
@@ -147,7 +147,8 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     data = accumulator_state.to_bytes(gathered, live.model)
     again = accumulator_state.from_bytes(data, live.model)
     assert accumulator_state.to_bytes(again, live.model) == data
-    assert_same(finish(again, live.model, TABLE).calibration, finish(gathered, live.model, TABLE).calibration, 1e-12)
+    found, expected = (conclude(solve_gathered(each, live.model), each, live.model, TABLE).calibration for each in (again, gathered))
+    assert_same(found, expected, 1e-12)
 
 
 def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):

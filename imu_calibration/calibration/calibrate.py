@@ -50,15 +50,16 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
     model = choose_model(options, table)
     if model.needs_temperature:
         model = model.with_reference_temperature(_first_temperature(sources))
+    again = model
     for _ in range(PASSES):
+        model = again
         step = GatherStep(table, model, options.windows, options.nominal, names, progress)
         gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
-        result = finish(gathered, model, table, options, provenance)
-        again = linearise_again(model, result.solution)
+        solution = solve_gathered(gathered, model, options)
+        again = linearise_again(model, solution)
         if again is None:
             break
-        model = again
-    return result
+    return conclude(solution, gathered, model, table, options, provenance)
 
 
 def _first_temperature(sources):
@@ -69,20 +70,25 @@ def _first_temperature(sources):
     raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
 
 
-def finish(gathered, model, table, options=CalibrationOptions(), provenance=None):
-    """Solve what was gathered and judge it: the reduce step of calibration; the live node calls it after each window."""
+def solve_gathered(gathered, model, options=CalibrationOptions()):
+    """Return the Solution of what was gathered with the columns of `model`, with the effects that it asks for: the reduce step."""
     narrow = settle_model(model, options, gathered)
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
     solution = solve(accumulator, narrow)
     if options.accelerometer_model is None and _size_effect_unseen(solution):
         smaller = narrow.without_arms()
-        solution, narrow = solve(restrict(accumulator, narrow, smaller), smaller), smaller
-    tolerances = tolerances_of(narrow, options.tolerances)
+        solution = solve(restrict(accumulator, narrow, smaller), smaller)
+    return solution
+
+
+def conclude(solution, gathered, model, table, options=CalibrationOptions(), provenance=None):
+    """Judge a solution of what was gathered with `model`, say which motions it lacks, and return the TableResult."""
+    tolerances = tolerances_of(solution.model, options.tolerances)
     needed = motions_needed(solution, tolerances, table)
     proof = prove_solution(gathered.held_out, solution, model)
     calibration = document(solution, tolerances, table, gathered, needed, provenance, proof)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
-                       table=table, model=narrow, gathered_model=model)
+                       table=table, model=solution.model, gathered_model=model)
 
 
 def _size_effect_unseen(solution):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.gathered import KEPT_POSES, KEPT_SAMPLES, Gathered, naming
+from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
 from imu_calibration.preflight.checks import Preflight
@@ -17,9 +18,9 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 class Collector:
     """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
 
-    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=()):
-        self.table, self.model, self.session = table, model, session
-        self.gatherer = MotionGatherer(table, settings, nominal=nominal, watchers=watchers)
+    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=(), windows: list | None = None):
+        self.table, self.model, self.session, self.windows = table, model, session, windows
+        self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
         self.gathered = Gathered()
 
     def push(self, block: SampleBlock):
@@ -56,10 +57,12 @@ class Collector:
             self.gathered.temperature_c = (float(min(low, finite.min())), float(max(high, finite.max())))
 
     def _take(self, windows):
+        if self.windows is not None:
+            self.windows += windows
         return [self._reduce(window) for window in windows if window.kind != 'unused']
 
     def _reduce(self, window):
-        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True)
+        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True, column_function=self._columns(window))
         found = self.gathered
         found.take(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
@@ -70,6 +73,10 @@ class Collector:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
         self._store(window, reduced)
         return reduced
+
+    def _columns(self, window):
+        """Return the function that gives the columns of a window."""
+        return columns
 
     def _store(self, window, reduced: WindowStatistics):
         kept = self.gathered.kept
@@ -99,9 +106,9 @@ class GatherStep:
         session, source = numbered
         return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
 
-    def read(self, blocks, session, preflight):
+    def read(self, blocks, session, preflight, windows=None):
         """
-        Return the Gathered of a recording, which is read once, for its windows and for the checks.
+        Return the Gathered of a recording, which is read once, for its windows and for the checks; `windows` takes them all, unused ones too.
 
         Raises
         ------
@@ -109,7 +116,8 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        collector, count = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,)), 0
+        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,), windows=windows)
+        count = 0
         for block in blocks:
             collector.push(block)
             count += 0 if block.imu is None else len(block.imu)

@@ -1,6 +1,9 @@
 """The calibration: what a recording says about an IMU, as a document that people and nodes exchange."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +16,9 @@ from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.verdict import Verdict
 
 FORMAT = 'imu_calibration/1'
 UNKNOWN = 'unknown'
@@ -51,6 +57,8 @@ class Calibration:
     """What speaks for or against it, a line each, and what to do next."""
     proof: dict = field(default_factory=dict)
     """Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured."""
+    judgement: Verdict | None = None
+    """The verdict with its reasons one by one, where it was not read from a file."""
 
     @property
     def param_names(self):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration import accumulator_state
-from imu_calibration.calibration.calibrate import finish
+from imu_calibration.calibration.calibrate import conclude, solve_gathered
 from imu_calibration.calibration.collector import Collector
 from imu_calibration.calibration.effect_states import group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
@@ -16,6 +16,8 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.errors import InputError
+from imu_calibration.estimation.accumulator import selected_columns
+from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.estimation.window_store import WindowStore
 from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.samples import ImuSamples
@@ -74,7 +76,7 @@ class LiveCalibration:
         self.table, self.options, self.settings, self.earlier = table, options, settings, None
         self._asked = choose_model(options, table)
         self._waiting, self._collector = [], None
-        self.result = None
+        self.result, self._too_far, self._designs = None, False, {}
         self.open_windows = []
         """Windows that were still open at the last solution with `pending`, closed in a copy."""
         if saved is not None and self._asked.needs_temperature:
@@ -134,7 +136,9 @@ class LiveCalibration:
         return self._completed()
 
     def _completed(self):
-        return self._collector.take_completed()
+        """Return the windows since the last call; their columns stay until the next one."""
+        self._designs = self._collector.take_completed()
+        return list(self._designs)
 
     def _push_before_temperature(self, block):
         self._waiting.append(block)
@@ -153,7 +157,7 @@ class LiveCalibration:
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = _LiveCollector(self.table, model, self.options, session, store)
+        self._collector = _LiveCollector(self.table, model, self.options, session, store, self._told)
 
     def solve(self, pending=False, provenance=None):
         """
@@ -181,17 +185,17 @@ class LiveCalibration:
         model = self._collector.model
         total = self._with_earlier(gathered)
         check_units(total, model)
-        for _ in range(PASSES - 1):
-            result = finish(total, model, self.table, self.options, provenance)
-            moved = linearise_again(model, result.solution)
+        moved = model
+        for _ in range(PASSES):
+            if moved is not model:
+                model = moved
+                total = total.anew(store.reduced(model, self.table, self._collector.session))
+            solution = solve_gathered(total, model, self.options)
+            moved = linearise_again(model, solution)
             if moved is None or not store.complete:
                 break
-            model = moved
-            total = total.anew(store.reduced(model, self.table, self._collector.session))
-        else:
-            result = finish(total, model, self.table, self.options, provenance)
-        self.result = result
-        return result
+        self.result, self._too_far = conclude(solution, total, model, self.table, self.options, provenance), moved is not None
+        return self.result
 
     @property
     def store_is_complete(self):
@@ -200,7 +204,7 @@ class LiveCalibration:
 
     def needs_linearising(self):
         """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
-        return self.result is not None and linearise_again(self.result.gathered_model, self.result.solution) is not None
+        return self._too_far
 
     def gathered(self, pending=False):
         """Return everything that was gathered, an earlier run included, to be saved."""
@@ -228,18 +232,21 @@ class LiveCalibration:
         parts = [self._residual(window) for window in windows]
         return ImuSamples.concatenate(parts)
 
-    def _residual(self, window):
-        model, values = self.result.model, self.result.solution.values
+    def _told(self, window):
+        """Return the samples of a window whose residuals are told."""
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
-        pick = slice(every // 2 if len(window) > every // 2 else 0, None, every)
-        static = window.kind == 'static'
-        motion = window.motion if static else window.motion.select(pick)
-        temperature = window.temperature_c
-        if temperature is not None:
-            temperature = np.array([temperature.mean()]) if static else temperature[pick]
-        parts = [measured[pick] - columns(model, sensor, self.table, motion, temperature) @ coefficients(model, sensor, values)
+        return slice(every // 2 if len(window) > every // 2 else 0, None, every)
+
+    def _residual(self, window):
+        model, values, gathered_with = self.result.model, self.result.solution.values, self._collector.model
+        told, designs = self._designs.get(window, (None, None))
+        if designs is None or self.result.gathered_model is not gathered_with:   # the solution was linearised elsewhere
+            told, gathered_with = self._told(window), model
+            designs = _columns_of(window, model, self.table, told)
+        chosen = selected_columns(gathered_with, model)
+        parts = [measured[told] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
                  for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
-        return ImuSamples(window.stamp_ns[pick], *parts, self._collector.gathered.frame_id)
+        return ImuSamples(window.stamp_ns[told], *parts, self._collector.gathered.frame_id)
 
     def groups(self):
         """Return the GroupState of every effect."""
@@ -248,33 +255,50 @@ class LiveCalibration:
         return group_states(self.result)
 
 
-class _LiveCollector(Collector):
-    """A Collector that hands completed windows on and keeps a bounded number of them."""
+def _columns_of(window, model, table, told):
+    """Return sensor -> columns at the samples `told` of a window."""
+    motion, temperature = joined_motion([window])
+    if window.kind != 'static':
+        motion, temperature = motion.select(told), None if temperature is None else temperature[told]
+    return {sensor: columns(model, sensor, table, motion, temperature) for sensor in SENSORS}
 
-    def __init__(self, table, model, options, session, store):
+
+class _LiveCollector(Collector):
+    """A Collector that hands completed windows on, with their columns at the samples `told`, and keeps a bounded number of them."""
+
+    def __init__(self, table, model, options, session, store, told):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
-        self.store, self._completed = store, []
+        self.store, self._told, self._completed = store, told, {}
+
+    def _columns(self, window):
+        told, designs = self._told(window), {}
+
+        def kept(model, sensor, *arguments, **options):
+            found = columns(model, sensor, *arguments, **options)
+            designs[sensor] = found if window.kind == 'static' else found[told].copy()
+            return found
+        self._completed[window] = told, designs
+        return kept
 
     def _store(self, window, reduced):
-        self._completed.append(window)
         if self.model.relinearised:
             self.store.add(window, reduced)
 
     def take_completed(self):
-        """Return the windows since the last call."""
-        completed, self._completed = self._completed, []
+        """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
+        completed, self._completed = self._completed, {}
         return completed
 
     def snapshot(self, pending):
         """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
         twin = copy.copy(self)
-        twin.gathered, twin.store, twin._completed = _copied(self.gathered), self.store.copy(), []
+        twin.gathered, twin.store, twin._completed = _copied(self.gathered), self.store.copy(), {}
         if pending:
             twin.gatherer = copy.deepcopy(self.gatherer)
             twin.finish()
         else:
             twin.update_counts()
-        return twin.gathered, twin.store, twin.take_completed()
+        return twin.gathered, twin.store, list(twin.take_completed())
 
 
 def _copied(gathered):

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +11,7 @@ from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceError
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import BAD, Verdict, judge
+from imu_calibration.calibration.verdict import BAD, Verdict
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.segmentation.window import Window
 
@@ -35,10 +34,10 @@ class CalibrationResult(ABC):
     observations: ClassVar[str]
     """What the data consist of: 'windows' or 'poses'."""
 
-    @cached_property
+    @property
     def verdict(self) -> Verdict:
         """Good, weak or bad, with reasons."""
-        return judge(self.calibration, self.tolerances)
+        return self.calibration.judgement
 
     @property
     @abstractmethod

@@ -100,7 +100,7 @@ def judge(calibration, tolerances):
 def judged(calibration, tolerances):
     """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
     found = judge(calibration, tolerances)
-    return replace(calibration, verdict=str(found.word), verdict_reasons=tuple(found.lines()))
+    return replace(calibration, verdict=str(found.word), verdict_reasons=tuple(found.lines()), judgement=found)
 
 
 def _disproved(calibration):

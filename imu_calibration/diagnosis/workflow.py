@@ -18,7 +18,6 @@ from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.units import for_people, significant
 
 
@@ -57,7 +56,7 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     Parameters
     ----------
     source : callable
-        Returns an iterator of SampleBlock, twice.
+        Returns an iterator of SampleBlock, each time anew.
     table : Table
     options : CalibrationOptions
         The model to start from; where nothing is asked for, bias and matrix alone, so that everything else has to prove itself.
@@ -71,8 +70,11 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
 
     """
     options = baseline_options(options)
-    baseline = calibrate([source], table, options, provenance)
-    windows = collect_windows(source(), table, options)
+    windows = []
+
+    def read(step, numbered):
+        return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session, source in numbered]
+    baseline = calibrate([source], table, options, provenance, mapper=read)
     diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
     tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
     needed = motions_needed(diagnosis.solution, tolerances, table)
@@ -110,12 +112,6 @@ def diagnose_without_table(source, options=CalibrationOptions(), provenance=None
     found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
     result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings)
     return DiagnosisResult(found.diagnosis, result.calibration, result.tolerances, result.needed, result.observations, options)
-
-
-def collect_windows(blocks, table, options=CalibrationOptions()):
-    """Return all windows of a recording with their samples, unused ones too."""
-    gatherer = MotionGatherer(table, options.windows, keep_unused=True, nominal=options.nominal)
-    return gatherer.all_of(blocks)
 
 
 def _percent(advance):

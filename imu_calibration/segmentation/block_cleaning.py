@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock, TemperatureSamples
@@ -11,7 +11,7 @@ from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStat
 STREAMS = ('imu', 'joints', 'temperature')
 BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
-_KINDS = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+_KINDS: dict[str, type[ImuSamples | JointSamples | TemperatureSamples]] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,8 @@ class BlockCleaner:
     def __init__(self, joint_names: Sequence[str] = (), nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
         self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
         self._checks = {name: StreamCheck() for name in STREAMS}
-        self._raw, self._ready = ({name: [] for name in STREAMS} for _ in range(2))
+        self._raw: dict[str, list] = {name: [] for name in STREAMS}
+        self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: dict[str, int] = {}
         """Messages that could not be turned into samples: reason -> count."""
 
