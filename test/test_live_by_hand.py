@@ -38,6 +38,11 @@ def offline(imu, gravity=GRAVITY):
     return calibrate_without_table([lambda: iter([SampleBlock(imu)])], CalibrationOptions(gravity=gravity))
 
 
+def all_kept(live):
+    """What a live calibration remembers, with the few samples that the filter of spikes still holds."""
+    return make_live(live.saved())._store.samples()
+
+
 def assert_same(live, expected, share=1e-6):
     """Assert that two calibrations agree to a share of their standard deviations."""
     a, b = live.calibration, expected.calibration
@@ -199,7 +204,7 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     assert largest < len(session) + 7000 and live.status().values['samples forgotten'] > 8_000
     result = live.solve(pending=True)
     assert live.found.attitudes == 12 and live.found.turns == 11
-    assert_same(result, offline(live._store.samples()), 1e-4)
+    assert_same(result, offline(all_kept(live)), 1e-4)
     assert np.all(np.abs(result.calibration.values - expected.calibration.values) < 4 * expected.calibration.sd + 1e-12)
 
 
@@ -207,7 +212,7 @@ def test_without_a_long_rest_the_oldest_go(session):
     live = make_live(hand_samples=len(session) * 6 // 10)
     run(live, session)
     assert len(live._store) <= len(session) * 6 // 10 + 100
-    assert_same(live.solve(pending=True), offline(live._store.samples()), 1e-4)
+    assert_same(live.solve(pending=True), offline(all_kept(live)), 1e-4)
 
 
 @pytest.mark.parametrize(('model', 'what'), [('bias+matrix+accel_thermal_bias', 'record a bag'),

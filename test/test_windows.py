@@ -9,6 +9,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.segmentation.spike_filter import REACH
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
@@ -445,7 +446,8 @@ def test_memory_is_bounded_when_a_stream_is_silent(case):
     longest = JOINT_WAIT + 2 * 20 + 4 * 2 + 5  # waiting, two chunks or windows, margins, batch
     assert held < 2 * 20 * longest
     used = sum(len(window) for window in windows)
-    assert used == {'no joints': 0, 'no imu': 0, 'both there': 12000}.get(case, 2000)
+    held_back = REACH if case == 'imu stops' else 0   # by the filter of spikes, and late when the joints have gone on for so long
+    assert used == {'no joints': 0, 'no imu': 0, 'both there': 12000}.get(case, 2000 - held_back)
     expected = {'no joints': 12000, 'joints stop': 10000}.get(case, 0)
     assert gatherer.counts.get('no joint state', 0) == expected
 

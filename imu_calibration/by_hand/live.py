@@ -192,7 +192,9 @@ class LiveByHand:
 
     def saved(self, pending=False):
         """Return the samples as bytes, for `saved` of another run."""
-        return self._store.to_bytes()
+        store = self._store.copy()
+        store.add(self._check.waiting())
+        return store.to_bytes()
 
     def residuals(self, poses):
         """

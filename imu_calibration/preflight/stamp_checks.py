@@ -11,8 +11,11 @@ ADVICE = {
     'repeated stamp': 'stamp each sample when it is measured; the second of equal stamps is left out',
     'backward stamp': 'samples that arrive late are left out; publish in order',
     'stray stamp': 'a single stamp far from its neighbours is left out',
+    'spike': 'readings that no motion of the samples around them explains are left out; if they are many, look at the bus and the driver',
     'clock reset': 'the clock was set while recording; each part is taken by itself',
 }
+SPIKE_SHARE = 1e-3
+"""A knock now and then looks like one; more of them have a cause."""
 GAP_SHARE = 0.01
 RATE_SHARE = 0.02
 IRREGULAR_SHARE = 0.05
@@ -30,7 +33,8 @@ def stamps(evidence):
                           f'({reasons}); correct the driver and record again')
             continue
         for reason, count in found.dropped.items():
-            yield CheckFinding('stamps', WARNING, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
+            severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
+            yield CheckFinding('stamps', severity, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
                           if reason != 'clock reset' else f'{NAMES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
         clean += [] if found.dropped else [NAMES[name]]
     if clean:
@@ -39,7 +43,7 @@ def stamps(evidence):
 
 def _phrase(reason):
     return {'not finite': 'are not finite', 'repeated stamp': 'repeat the stamp before', 'backward stamp': 'step back in time',
-            'stray stamp': 'have a stray stamp'}[reason]
+            'stray stamp': 'have a stray stamp', 'spike': 'are spikes'}[reason]
 
 
 def _times(count):

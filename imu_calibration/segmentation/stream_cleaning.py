@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.segmentation.sample_times import SampleTimes
+from imu_calibration.segmentation.spike_filter import SpikeFilter
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -20,7 +21,8 @@ class StreamCheck:
     Cleans one stream; the outcome does not depend on how it is cut into pieces.
 
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays), 'backward stamp' (a sample that came
-    late) and 'stray stamp' (one sample far from both neighbours). 'clock reset' counts the jumps, each of which starts a new epoch.
+    late), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of
+    which starts a new epoch.
     Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, whole milliseconds, jitter) its samples get times
     of their own first (see `sample_times`).
     """
@@ -36,6 +38,7 @@ class StreamCheck:
         self._held = None
         self._newest_raw = None
         self._times = None
+        self._spikes, self._filtered_epoch = SpikeFilter(), 0
 
     @property
     def line(self):
@@ -46,12 +49,12 @@ class StreamCheck:
         """Return a list of (epoch, samples) that are accepted; a few are held while their times are open."""
         if samples is None or not len(samples):
             return []
-        return self._accept(self._without_strays(self._finite(samples)))
+        return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
 
     def finish(self):
         """Return what was held, as `push` does."""
         held, self._held = self._held, None
-        return ([] if held is None else self._accept(held)) + self._end_epoch()
+        return self._without_spikes(([] if held is None else self._accept(held)) + self._end_epoch(), ended=True)
 
     def statistics(self, gap=0.1):
         """
@@ -66,6 +69,25 @@ class StreamCheck:
         period = self._steps.median()
         return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, period, self._steps.common_step_ns,
                                 *self._steps.longer_than(max(gap, 5 * period)))
+
+    def _without_spikes(self, accepted, ended=False):
+        """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
+        passed = []
+        for epoch, samples in accepted:
+            if not isinstance(samples, ImuSamples):
+                passed.append((epoch, samples))
+                continue
+            if epoch != self._filtered_epoch:
+                passed += self._let_out()
+                self._filtered_epoch = epoch
+            passed += [(epoch, part) for part in self._spikes.push(samples)]
+        passed += self._let_out() if ended else []
+        if self._spikes.dropped:
+            self.counts['spike'] = self._spikes.dropped
+        return passed
+
+    def _let_out(self):
+        return [(self._filtered_epoch, part) for part in self._spikes.finish()]
 
     def _count(self, reason, number):
         if number:
