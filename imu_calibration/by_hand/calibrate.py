@@ -1,23 +1,18 @@
 """Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
+from imu_calibration.by_hand.full_scale import full_scale_factor
 from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
-from imu_calibration.by_hand.poses import (
-    average_poses,
-    collect_turns,
-    distinct_attitudes,
-    g_sensitivity_evidence,
-    known_turn_data,
-    noise_statistics,
-)
-from imu_calibration.by_hand.solver import solve_joint
+from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, g_sensitivity_evidence, noise_statistics
+from imu_calibration.by_hand.solver import first_state, solve_joint
+from imu_calibration.by_hand.turns import collect_turns, known_turn_data, rising
 from imu_calibration.calibration.status import DETERMINED, statuses
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
@@ -162,7 +157,7 @@ class HandData:
 def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
                    known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
-    time = _rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    time = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:
@@ -184,6 +179,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
                           catalogue=options.catalogue)
     model = HandModel(sensors, options.gravity)
     _check_temperature(model, poses)
+    model = replace(model, gyro_factor=full_scale_factor(first_state(model, poses), poses, turns))
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
@@ -194,7 +190,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
     advice = missing_motion(model, found.factor, found.state.values, status, goals, pose_sd, turn_sd)
-    statistics = {**data.statistics, **evidence, **_statistics(model, found, poses, turns)}
+    statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
     index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
@@ -242,14 +238,6 @@ def _statistics(model, found, poses, turns):
         result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
         result[f'{name}_dof'] = float(found.scatter.dof[index])
     return result
-
-
-def _rising(time):
-    """Spread repeated stamps over the step that follows: their order is known, their moments are not."""
-    if np.all(np.diff(time) > 0):
-        return time
-    kept = np.concatenate([[True], np.diff(time) > 0])
-    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))
 
 
 def _as_ranges(imu, stills):

@@ -193,7 +193,7 @@ class LiveByHand:
     def saved(self, pending=False):
         """Return the samples as bytes, for `saved` of another run."""
         store = self._store.copy()
-        store.add(self._check.waiting())
+        store.add(copy.deepcopy(self._check).finish())
         return store.to_bytes()
 
     def residuals(self, poses):

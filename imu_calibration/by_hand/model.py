@@ -1,6 +1,6 @@
 """The parameters of a calibration by hand: bias and matrix of both sensors, and further effects straight from the catalogue."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -57,6 +57,8 @@ class HandModel:
     """The effects; bias and matrix of both sensors are among them."""
     gravity: float
     """Reference, m/s^2."""
+    gyro_factor: float = 1.0
+    """Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the full-scale range that is set."""
 
     def __post_init__(self):
         """Refuse what cannot be seen by hand."""
@@ -89,14 +91,17 @@ class HandModel:
     @cached_property
     def nominal(self):
         """Values before any data, shape (n,)."""
-        start = self.model.start()
-        return np.concatenate([BASE_NOMINAL, *(start[self.model.slices[e.key]] for e in self.extras)])
+        start, base = self.model.start(), BASE_NOMINAL.copy()
+        base[GYRO_MATRIX] *= self.gyro_factor
+        return np.concatenate([base, *(start[self.model.slices[e.key]] for e in self.extras)])
 
     @cached_property
     def priors(self):
         """Standard deviations about `nominal` before any data, shape (n,)."""
         known = dict(zip(self.model.param_names, self.model.prior()[1]))
-        return np.array([known[name] for name in self.param_names])
+        sd = np.array([known[name] for name in self.param_names])
+        sd[GYRO_MATRIX] *= self.gyro_factor
+        return sd
 
     def tolerances(self, given):
         """Return the standard deviations that are good enough, shape (n,); the catalogue's where `given` has none."""
@@ -114,7 +119,7 @@ class HandModel:
 
     def at(self, values):
         """Return the same model with the columns of warm-ups taken at `values`."""
-        return HandModel(self.model.at(self.in_model_order(values)), self.gravity)
+        return replace(self, model=self.model.at(self.in_model_order(values)))
 
     def in_model_order(self, values):
         """Return the parameters in the order of the SensorModel."""

@@ -1,11 +1,11 @@
-"""From samples to the data of a calibration by hand: means over the poses held still, and the turns between them."""
+"""From samples to poses: means over the intervals held still, and what the noise within them leaves."""
 
 from typing import Sequence
 
 import numpy as np
 from scipy.special import fdtrc
 
-from imu_calibration.by_hand.equations import Poses, TurnData
+from imu_calibration.by_hand.equations import Poses
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.samples import ImuSamples
@@ -63,46 +63,6 @@ def distinct_attitudes(force, apart):
         if all(np.arccos(np.clip(direction @ other, -1, 1)) > apart for other in kept):
             kept.append(direction)
     return len(kept)
-
-
-def collect_turns(time, imu, poses, settings, temperature_c=None):
-    """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
-    turns, dropped, rate = [], {}, imu.rate_s
-    limit = max(settings.gap, 5 * poses.period)
-    extreme = np.max(np.abs(rate), axis=0)
-    for first in range(len(poses.start) - 1):
-        piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
-        reason = _unusable(time[piece], rate[piece], extreme, limit, settings.turn_maximum)
-        if reason:
-            dropped[reason] = dropped.get(reason, 0) + 1
-            continue
-        density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
-        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
-                              temperature_c=None if temperature_c is None else temperature_c[piece]))
-    return turns, dropped
-
-
-def _unusable(time, rate, extreme, gap, longest):
-    if time[-1] - time[0] > longest:
-        return 'too long'
-    if np.max(np.diff(time)) > gap:
-        return 'gap'
-    at_limit = np.abs(rate) >= extreme  # three equal extreme readings in a row: the range ended, not the motion
-    if np.any(at_limit[:-2] & at_limit[1:-1] & at_limit[2:]):
-        return 'clipped'
-    return ''
-
-
-def known_turn_data(time, imu, turn, poses, settings, temperature_c=None):
-    """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
-    axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
-    along = np.outer(axis, axis)
-    cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
-    piece = slice(turn.start, turn.stop)
-    density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
-    noise_variance = density * (time[piece][-1] - time[piece][0])
-    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
-                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
 
 
 def g_sensitivity_evidence(poses):

@@ -55,7 +55,7 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
 
     """
     memory, priors = {}, model.priors
-    state = _first_state(model, poses)
+    state = first_state(model, poses)
     every = np.ones(model.size, bool)
     state, scatter, steps = _iterate(model, state, poses, turns, every, priors, fallback, fallback, memory)
     held = choose_held(_factor(model, state, poses, turns, scatter, memory), priors)
@@ -93,8 +93,8 @@ def _data_sd(scaled):
     return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
 
 
-def _first_state(model, poses):
-    """Fit the norms alone, then take directions and the gyroscope's bias from the poses."""
+def first_state(model: HandModel, poses: Poses) -> State:
+    """Return a `State` from the norms in poses alone, which give directions too, and the rates at rest."""
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     for _ in range(ITERATIONS):
         residual, columns = model.norm_rows(values, poses.force, poses.time, poses.temperature_c)

@@ -6,7 +6,8 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST
 from imu_calibration.by_hand.options import ByHandSettings
-from imu_calibration.by_hand.poses import average_poses, collect_turns, distinct_attitudes
+from imu_calibration.by_hand.poses import average_poses, distinct_attitudes
+from imu_calibration.by_hand.turns import collect_turns
 from imu_calibration.calibration.effect_states import Progress
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import SCALES

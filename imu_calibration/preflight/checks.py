@@ -11,7 +11,7 @@ from imu_calibration.preflight.evidence import EvidenceGatherer
 from imu_calibration.preflight.finding import REFUSE, WARNING
 
 CHECKS = (
-    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.handedness,
+    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.full_scale, value_checks.handedness,
     value_checks.gravity, value_checks.clipping, value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
     stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )

@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.preflight.extremes import Extremes
+from imu_calibration.preflight.full_scale import factor_between_rests
 from imu_calibration.preflight.rest import find_rest
 from imu_calibration.preflight.turning import relate_turns
 from imu_calibration.segmentation.block_cleaning import STREAMS
@@ -71,6 +72,11 @@ class RecordingEvidence:
     def turning(self):
         """How gravity turns against the rates, or None."""
         return relate_turns(self.chunks)
+
+    @cached_property
+    def rate_factor(self):
+        """Measured rates over those that carry gravity from rest to rest, or None."""
+        return factor_between_rests(self.chunks, self.rest)
 
     @cached_property
     def quiet_range(self):

@@ -24,6 +24,8 @@ class Rest:
     """Median of the mean rate, shape (3,)."""
     range: np.ndarray
     """Median over the chunks at rest of largest minus smallest, force then rate, shape (6,); 0 where the noise does not show."""
+    ranges: np.ndarray
+    """First chunk of each stretch and the one after its last, shape (n_stretches, 2)."""
 
     @property
     def norm(self):
@@ -56,7 +58,9 @@ def find_rest(chunks):
     still = still_chunks(chunks)
     if still.sum() < LEAST_CHUNKS:
         return None
-    return Rest(_stretches(chunks, still), np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0))
+    runs = _stretches(still)
+    force = np.array([chunks.mean[a:b, :3].mean(axis=0) for a, b in runs])
+    return Rest(force, np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0), runs)
 
 
 def still_chunks(chunks):
@@ -83,7 +87,7 @@ def still_chunks(chunks):
     return still & (away <= np.maximum(0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))))
 
 
-def _stretches(chunks, still):
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    runs = [(a, b) for a, b in edges.reshape(-1, 2) if b - a >= 2] or list(edges.reshape(-1, 2))
-    return np.array([chunks.mean[a:b, :3].mean(axis=0) for a, b in runs])
+def _stretches(still):
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
+    long = edges[edges[:, 1] - edges[:, 0] >= 2]
+    return long if len(long) else edges

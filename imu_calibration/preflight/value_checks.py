@@ -5,6 +5,7 @@ import numpy as np
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
+from imu_calibration.preflight.full_scale import FACTORS, nearest_power
 from imu_calibration.units import significant
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
@@ -63,6 +64,8 @@ def rate_unit(evidence):
         elif 0.6 < ratio / DEG < 1.6:
             yield _unit('rate_unit', f'{came}they look as if converted from deg/s twice; convert once, or give a nominal scaling with '
                                      'gyroscope_scale 0.01745329')
+        elif _full_scale(evidence) is not None:
+            return
         elif not 0.5 < ratio < 2.0:
             yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
         else:
@@ -71,6 +74,28 @@ def rate_unit(evidence):
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
                                  f'convert them in the driver or {scaling}')
+
+
+def full_scale(evidence):
+    """The driver converts for the full-scale range that is set: gravity goes from rest to rest as the rates add up."""
+    factor = _full_scale(evidence)
+    if factor is None:
+        return
+    came = f'angular rates are {factor:.3g} times those that turn gravity from one rest to the next'
+    if abs(np.log2(factor)) % 1 == 0:
+        yield CheckFinding('full_scale', WARNING, f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
+                      'setting (a calibration takes the factor up into the matrix, and is wrong once the setting is right)')
+    else:
+        yield CheckFinding('full_scale', WARNING, f'{came}: the scale of the driver is far off; correct it, or check that the IMU rested where it seems to')
+
+
+def _full_scale(evidence):
+    """Return the factor by which the rates are wrong when it may be that of a full-scale range, else None."""
+    factor, turning = evidence.rate_factor, evidence.turning
+    if factor is None and turning is not None:   # no rests to go by
+        factor = nearest_power(1.0 / turning.factor)
+        factor = factor if np.log2(factor) % 1 == 0 else None
+    return factor if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1] else None
 
 
 def handedness(evidence):

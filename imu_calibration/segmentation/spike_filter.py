@@ -30,8 +30,8 @@ class SpikeFilter:
 
     A reading is a spike when it departs by more than `LARGE` sds of the noise and much more than its neighbours depart from each other: from the
     cubic through the four nearest, which follows fast motion, or, where one of those is wrong as well, from the median of the nine around it
-    (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second differences; white noise passes 8 sds once in 1e15
-    samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
+    (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second differences;
+    white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
     """
 
     def __init__(self):
@@ -77,32 +77,32 @@ class SpikeFilter:
         values = self._values
         if len(values) < 2 * REACH + 1:
             return np.zeros(len(at), bool)
-        bend = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
-        bend = np.vstack([bend[:1], bend, bend[-1:]])
-        self._add_noise(bend)
+        second = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
+        second = np.vstack([second[:1], second, second[-1:]])
+        self._add_noise(second)
         chunk = np.maximum((self._first + at) // CHUNK - 1, 0)
         limit = LARGE * self._noise[np.clip(chunk - self._n_noise + len(self._noise), 0, len(self._noise) - 1)]
         spiky = np.zeros(len(at), bool)
-        row, column = np.nonzero(bend[at] > _CANDIDATE / LARGE * limit)
+        row, column = np.nonzero(second[at] > _CANDIDATE / LARGE * limit)
         if len(row):
             first = np.clip(at[row] - REACH, 0, len(values) - 2 * REACH - 1)
             window, column = first[:, None] + np.arange(2 * REACH + 1), column[:, None]
-            # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike bends three rows, two bend six
-            shaking = LARGE * _NORMAL * np.median(bend[window[:, 1:-1], column], axis=1)
+            # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike shows in three second differences, two in six
+            shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - NEAR, 0, len(values) - 2 * NEAR - 1)
             around, place = values[first[:, None] + np.arange(2 * NEAR + 1), column], at[row] - first
             spiky[row[_off_the_cubic(around, place, limit) | _off_the_median(around, place, limit)]] = True
         return spiky
 
-    def _add_noise(self, bend):
+    def _add_noise(self, second):
         """Take the noise sd of each chunk that is whole by now, never below the converter's step, shape (n_chunks, 6)."""
         start = self._n_noise * CHUNK - self._first
-        count = (len(bend) - 1 - start) // CHUNK if len(bend) > CHUNK else 0
+        count = (len(second) - 1 - start) // CHUNK if len(second) > CHUNK else 0
         if self._n_noise == 0 and count == 0:   # a stream that ended before
-            parts, values = bend[None], self._values[None]
+            parts, values = second[None], self._values[None]
         else:
-            parts, values = (rows[start:start + count * CHUNK].reshape(count, CHUNK, 6) for rows in (bend, self._values))
+            parts, values = (rows[start:start + count * CHUNK].reshape(count, CHUNK, 6) for rows in (second, self._values))
         if not len(parts):
             return
         change = np.abs(np.diff(values, axis=1))

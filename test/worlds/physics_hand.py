@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from worlds.hand_sessions import GRAVITY, NOMINAL, SENSITIVITY, random_truth, turn_samples
-
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.samples import ImuSamples
+
+from worlds.hand_sessions import GRAVITY, NOMINAL, SENSITIVITY, random_truth, turn_samples
 
 
 def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.002, drift_sd=2e-4,

@@ -1,0 +1,39 @@
+"""The factor by which the readings of a gyroscope are wrong as a whole, from the directions of gravity before and after each turn."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from imu_calibration.by_hand.equations import Poses, State, TurnData
+from imu_calibration.by_hand.preintegration import integrate_turn
+from imu_calibration.preflight.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
+
+
+def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
+    """
+    Return the factor between measured and true rates, 1 when they carry gravity to where it is found (`preflight.full_scale`).
+
+    Only turns that gravity is the reference of count; the bias of each is the mean of the rates at rest before and after it.
+
+    Parameters
+    ----------
+    state : State
+        Directions of gravity from the norms alone.
+    poses : Poses
+    turns : sequence of TurnData
+
+    """
+    some = [turn for turn in turns if turn.rotation is None][:MOST_TURNS]
+    if len(some) < LEAST_TURNS:
+        return 1.0
+
+    def missed(factor):
+        return float(np.median([_missed(state, poses, turn, factor * np.eye(3)) for turn in some]))
+
+    return believed_factor(missed)
+
+
+def _missed(state, poses, turn, matrix):
+    bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
+    mat_ji = integrate_turn(turn.time, turn.rate, bias, matrix).mat_ji
+    return np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0))

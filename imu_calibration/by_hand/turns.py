@@ -1,0 +1,101 @@
+"""From samples to the turns between poses, and which of them can be used."""
+
+import numpy as np
+
+from imu_calibration.by_hand.equations import Poses, TurnData
+from imu_calibration.by_hand.options import ByHandSettings, KnownTurn
+from imu_calibration.samples import ImuSamples
+
+TOP = 20
+"""Readings below the largest that tell how closely readings lie there."""
+CROWDED = 20.0
+"""Times as many readings at the extreme as chance puts there are the end of the range."""
+CERTAIN = 1e-3
+"""With chance readings below this, two that are equal are no chance, neighbours neither."""
+SUMMIT = 3
+"""Neighbours that the top of one smooth turn may leave in the same coarse step."""
+
+
+def collect_turns(time: np.ndarray, imu: ImuSamples, poses: Poses, settings: ByHandSettings,
+                  temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
+    """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
+    turns, dropped, rate = [], {}, imu.rate_s
+    limit = max(settings.gap, 5 * poses.period)
+    ended = at_range_end(rate)
+    density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
+    for first in range(len(poses.start) - 1):
+        piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
+        reason = _unusable(time[piece], ended[piece], limit, settings.turn_maximum)
+        if reason:
+            dropped[reason] = dropped.get(reason, 0) + 1
+            continue
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
+                              temperature_c=None if temperature_c is None else temperature_c[piece]))
+    return turns, dropped
+
+
+def _unusable(time, ended, gap, longest):
+    if time[-1] - time[0] > longest:
+        return 'too long'
+    if np.max(np.diff(time)) > gap:
+        return 'gap'
+    return 'clipped' if ended.any() else ''
+
+
+def at_range_end(rate: np.ndarray) -> np.ndarray:
+    """
+    Return which samples stand at the end of the gyroscope's range, shape (n,).
+
+    Where the range ends, different motions end at the same reading, on either side and on all axes; without it two readings are
+    hardly ever both the largest, as far as the converter's step is finer than the distance between the largest readings.
+
+    Parameters
+    ----------
+    rate : array, shape (n, 3)
+        Readings in any unit.
+
+    """
+    fresh = np.concatenate([[True], np.any(np.diff(rate, axis=0) != 0, axis=1)])   # a reading published twice is one reading
+    ended = np.zeros(len(rate), bool)
+    for signed in (np.abs(rate), *(sign * rate[:, [axis]] for axis in range(3) for sign in (1, -1))):
+        ended |= _at_end(signed, fresh)
+    return ended
+
+
+def _at_end(values, fresh):
+    """Return the rows with a value at the largest of all `values` (n, m), when that is the end of a range."""
+    some = np.sort(values[fresh].ravel())[-4000:]
+    step = np.diff(some)
+    step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
+    margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is a step further out
+    margin = min(margin, 1e-4 * np.abs(some[-1]))
+    at = (values >= some[-1] - margin).any(axis=1)
+    below = some[some < some[-1] - margin][-TOP:]
+    if len(below) < TOP:
+        return np.zeros(len(values), bool)
+    chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
+    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], at[fresh], [False]]))))[::2]
+    # the top of one smooth turn may fill a coarse step for some samples
+    number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
+    return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)
+
+
+def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, poses: Poses, settings: ByHandSettings,
+                    temperature_c: np.ndarray | None = None) -> TurnData:
+    """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
+    axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
+    along = np.outer(axis, axis)
+    cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
+    piece = slice(turn.start, turn.stop)
+    density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
+    noise_variance = density * (time[piece][-1] - time[piece][0])
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
+                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+
+
+def rising(time: np.ndarray) -> np.ndarray:
+    """Spread repeated stamps over the step that follows: their order is known, their moments are not."""
+    if np.all(np.diff(time) > 0):
+        return time
+    kept = np.concatenate([[True], np.diff(time) > 0])
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))

@@ -1,0 +1,74 @@
+"""A gyroscope that is read for another full-scale range than is set: all rates are wrong by one factor, usually a power of two."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+FAR = 0.25
+"""Rms angle by which gravity misses the direction after a turn, rad, from which on factors are tried at all: scales off by a tenth leave less."""
+BETTER = 0.3
+"""A factor is believed when it leaves less than this share of that angle."""
+FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
+"""Readings over true rates that are tried: full-scale ranges from a sixteenth to sixteen times the one that is set, and what lies between."""
+NEAR_POWER = 0.15
+"""A factor within this share of a power of two is one: scales are off by a few per cent."""
+LEAST_TURNS, MOST_TURNS = 3, 16
+LEAST_ANGLE = 0.3
+"""Turns of gravity below it say little of factors, rad."""
+LONGEST = 30.0
+"""s; the gyroscope's wander adds up in longer turns."""
+
+
+def believed_factor(missed: Callable[[float], float]) -> float:
+    """
+    Return the factor between measured and true rates that carries gravity from before each turn to after it, 1 when they fit as they are.
+
+    Parameters
+    ----------
+    missed : callable
+        Factor -> typical angle by which gravity misses its direction after a turn, rad.
+
+    """
+    as_it_is = missed(1.0)
+    if as_it_is < FAR:
+        return 1.0
+    angles = [missed(factor) for factor in FACTORS]
+    best = int(np.argmin(angles))
+    return nearest_power(FACTORS[best]) if angles[best] < BETTER * as_it_is else 1.0
+
+
+def nearest_power(factor: float) -> float:
+    """Return the power of two that a factor is within `NEAR_POWER` of, else the factor itself."""
+    power = 2.0 ** np.round(np.log2(factor))
+    return float(power if abs(factor / power - 1) < NEAR_POWER else factor)
+
+
+def factor_between_rests(chunks, rest) -> float | None:
+    """
+    Return the `believed_factor` of a recording in chunks, or None when too few turns lie between rests.
+
+    The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well enough for a factor.
+    """
+    if rest is None or len(rest.ranges) <= LEAST_TURNS:
+        return None
+    centre = rest.sphere[0] if rest.sphere is not None else np.zeros(3)
+    up = (rest.force - centre) / np.linalg.norm(rest.force - centre, axis=1, keepdims=True)
+    whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
+    turns = []
+    for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+        span = chunks.time[stop] - chunks.time[start - 1]
+        unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (stop - start + 1)
+        if stop > start and unbroken and span < LONGEST and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE):
+            turns.append(((chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None], up[first], up[first + 1]))
+    if len(turns) < LEAST_TURNS:
+        return None
+    turns = turns[::max(len(turns) // MOST_TURNS, 1)]
+    return believed_factor(lambda factor: float(np.median([_missed(vectors / factor, before, after) for vectors, before, after in turns])))
+
+
+def _missed(vectors, before, after):
+    turned = before
+    for step in Rotation.from_rotvec(-vectors).as_matrix():   # gravity turns the other way in the sensor's axes
+        turned = step @ turned
+    return np.arccos(np.clip(turned @ after, -1.0, 1.0))
