@@ -10,11 +10,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import NoiseProcess, mean_covariance
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import SENSORS
 
 FINEST, MOST_BLOCKS = 150, 1000
 """Blocks of the run at most, and of alignment and run together."""
+RUNS = (1.0, 10.0, 60.0, 600.0)
+"""Lengths of dead reckoning, s."""
+
+
+def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]]]:
+    """Return the standard deviation of the position along one horizontal axis after each of `RUNS`, m, by sensor, of the worst axes."""
+    return [(seconds, {sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor)) for sensor in SENSORS})
+            for seconds in RUNS]
+
+
+def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
+    processes = axis.processes()
+    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds)
+    return float(np.sqrt((shares**2).sum()))
 
 
 def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float], sensor: str, seconds: float, *,

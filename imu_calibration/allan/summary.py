@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.allan.dead_reckoning import position_budget
 from imu_calibration.allan.document import TERMS, UNIT, UNITS
 from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE
@@ -110,9 +111,14 @@ def lines(figures: NoiseFigures) -> list[str]:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
     longest = _longest(figures)
-    if longest:
-        found.append(longest)
-    return found
+    return [*found, *([longest] if longest else []), _metres(figures)]
+
+
+def _metres(figures):
+    """Return what the noise becomes in dead reckoning."""
+    runs = [f'{significant(float(np.hypot(*shares.values())), 2)} m after {duration(seconds)}'
+            for seconds, shares in position_budget(figures)]
+    return f'dead reckoning from rest errs by noise alone: {", ".join(runs)}'
 
 
 def _rest_line(recording):

@@ -7,6 +7,7 @@ from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import parse_effects
+from imu_calibration.errors import InputError
 from imu_calibration.settings import setting
 
 
@@ -72,9 +73,11 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     Raises
     ------
     InputError
-        When an effect does not exist.
+        When an effect does not exist, or something is asked for that only a table makes use of.
 
     """
+    if options.noise is not None:
+        raise InputError('noise that was measured apart weighs the windows of a table; by hand it must be left out', key='table')
     asked = (options.accelerometer_model, options.gyroscope_model)
     names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
              for sensor, text in zip(SENSORS, asked, strict=True)}

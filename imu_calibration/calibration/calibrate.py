@@ -74,10 +74,10 @@ def solve_gathered(gathered, model, options=CalibrationOptions()):
     """Return the Solution of what was gathered with the columns of `model`, with the effects that it asks for: the reduce step."""
     narrow = settle_model(model, options, gathered)
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
-    solution = solve(accumulator, narrow)
+    solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
     if options.accelerometer_model is None and _size_effect_unseen(solution):
         smaller = narrow.without_arms()
-        solution = solve(restrict(accumulator, narrow, smaller), smaller)
+        solution = solve(restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes)
     return solution
 
 

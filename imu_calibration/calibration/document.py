@@ -83,10 +83,21 @@ class Calibration:
         """Return whether the model contains the effect."""
         return (sensor, effect) in self.model.slices
 
-    def noise(self, sensor):
-        """Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics."""
+    @property
+    def knows_density(self):
+        """Whether the noise is known at any sampling rate."""
+        return 'noise_density' in self.statistics.get('accelerometer', {})
+
+    def noise(self, sensor, period=None):
+        """
+        Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics.
+
+        With a density of the noise and a `period` (s), the sample is one at that rate; else at that of the recording.
+        """
         found = self.statistics.get(sensor, {})
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
+        if period is not None and 'noise_density' in found:
+            white = np.asarray(found['noise_density'], float) / np.sqrt(period)
         return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
 
     @property

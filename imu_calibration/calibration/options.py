@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, field
 
+from imu_calibration.allan.bias_processes import bias_processes
+from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.samples import NominalScaling
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -29,6 +32,13 @@ class CalibrationOptions:
     """Local gravity where there is no table, m/s^2; None: the standard gravity, with what it may be off by."""
     catalogue: Catalogue = CATALOGUE
     """The effects that there are."""
+    noise: NoiseFigures | None = None
+    """The noise of this IMU at rest; None: the recording says how the biases move."""
+
+    @property
+    def bias_processes(self) -> dict[str, tuple[BiasProcess, ...]]:
+        """Sensor -> how its bias moves, where that was measured apart."""
+        return {} if self.noise is None else bias_processes(self.noise)
 
 
 def choose_model(options, table):

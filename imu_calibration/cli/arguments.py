@@ -47,6 +47,7 @@ def add_model_arguments(parser: ArgumentParser) -> None:
     group.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
     group.add_argument('--nominal', metavar='FILE', help='YAML with accelerometer_offset, accelerometer_scale, gyroscope_offset, '
                        'gyroscope_scale for recordings in volts or counts')
+    group.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise: how its biases move; needs a table')
     group.add_argument('--setting', metavar='NAME=VALUE', action='append', default=[],
                        help='how windows are found; may be repeated: '
                        + ', '.join(f'{d.name} [{d.unit}]' for d in describe(WindowSettings)))

@@ -20,13 +20,14 @@ def add_arguments(parser):
     parser.add_argument('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
                         help='roll, pitch, yaw of the sensor in the target frame, rad')
     parser.add_argument('--anyway', action='store_true', help='also with a calibration whose verdict is bad or whose proof failed')
+    parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
     parser.add_argument('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     add_topic_arguments(parser)
 
 
 def run(options):
     """Compensate into a new bag, print what was noticed, return the exit code."""
-    names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'correct_stamps', 'imu_topic',
+    names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'noise', 'correct_stamps', 'imu_topic',
              'temperature_topic')
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:

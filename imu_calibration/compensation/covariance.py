@@ -68,10 +68,12 @@ class Uncertainty:
     transfer : compensation.Transfer, optional
     derivative : differentiation.CausalDerivative, optional
         Where the angular acceleration comes from; None: it is not used.
+    period : float, optional
+        Time between samples, s, for a calibration that knows the density of its noise.
 
     """
 
-    def __init__(self, calibration, transfer=None, derivative=None):
+    def __init__(self, calibration, transfer=None, derivative=None, period=None):
         self._model, self._values = invertible_values(calibration)
         self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
@@ -79,11 +81,12 @@ class Uncertainty:
         index = np.concatenate(index)
         self._covariance = calibration.covariance[np.ix_(index, index)]
         self._slopes = [self._coefficient_slopes(sensor) for sensor in SENSORS]
-        self.use(derivative)
-        self.noise = tuple(np.diag(calibration.noise(sensor)[0]**2) for sensor in SENSORS)
+        self._calibration = calibration
+        self.use(derivative, period)
 
-    def use(self, derivative):
-        """Take the angular acceleration from another CausalDerivative, or from none."""
+    def use(self, derivative, period=None):
+        """Take the angular acceleration from another CausalDerivative, or from none, and the noise of samples `period` s apart."""
+        self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
         weights = np.zeros(1) if derivative is None else derivative.weights
         self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
 

@@ -73,6 +73,11 @@ class RateSlope:
         """Samples without a derivative because their stamps follow no clock."""
 
     @property
+    def period(self) -> float | None:
+        """Time between samples, s; None while the stamps are too few to tell."""
+        return None if self.line is None else 1e-9 * self.line.period_ns
+
+    @property
     def doubt(self) -> str:
         """Why there is no derivative; '' when there is one, or that is not known yet."""
         return f'{self.line}{WITHOUT}' if self.line is not None and self.line.word == IRREGULAR else ''

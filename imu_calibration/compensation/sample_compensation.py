@@ -35,6 +35,7 @@ class SampleCompensation:
         self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
+        self._follows = self.needs_slope or calibration.knows_density   # the stamps say how large the noise of a sample is
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer), self._take_derivative)
         self._kernel = make_kernel(calibration, transfer)
         self.last = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0)
@@ -53,7 +54,7 @@ class SampleCompensation:
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
             return self.refuse('no temperature yet' if dt is None else 'not finite')
-        slope = self.slope.push(stamp_ns, wx, wy, wz) if self.needs_slope else NO_SLOPE
+        slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
         ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
@@ -96,5 +97,5 @@ class SampleCompensation:
         self.slope.follow(before.slope)
 
     def _take_derivative(self):
-        self._uncertainty.use(self.slope.derivative)
+        self._uncertainty.use(self.slope.derivative, self.slope.period)
         self.refresh()

@@ -92,8 +92,8 @@ class CompensationStream:
             Those of the measured ones, shape (3, 3); zero, no covariances at all or None: the calibration's noise is taken.
 
         """
+        self._uncertainty.use(self.slope.derivative, self.slope.period)
         known = [c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
-        self._uncertainty.use(self.slope.derivative)
         return self._uncertainty.at(*self._last, slope_error=self.slope.error()).covariances(*known)
 
     def warnings(self):
@@ -115,7 +115,7 @@ def derivative_for(calibration, period, transfer=None):
     arm = float(np.max(np.linalg.norm(arms_of(calibration), axis=1)))
     if transfer is not None:
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
-    (force_sd, _), (rate_sd, _) = (calibration.noise(sensor) for sensor in ('accelerometer', 'gyroscope'))
+    (force_sd, _), (rate_sd, _) = (calibration.noise(sensor, period) for sensor in ('accelerometer', 'gyroscope'))
     return choose_derivative(period, float(rate_sd.max()), arm, float(force_sd.min()))
 
 

@@ -20,7 +20,8 @@ from imu_calibration.selection.gain import Gain, heldout_gain
 from imu_calibration.selection.investigation import investigate
 
 
-def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None) -> Diagnosis:
+def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
+             bias_processes: dict | None = None) -> Diagnosis:
     """
     Say what a model gets wrong, and why.
 
@@ -37,6 +38,8 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progre
         The model to diagnose.
     progress : callable, optional
         Called with the share that is done, in [0, 1].
+    bias_processes : dict, optional
+        Sensor -> how its bias moves, where that was measured apart.
 
     Returns
     -------
@@ -48,7 +51,7 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progre
         When there are too few windows to hold any out.
 
     """
-    found = investigate(windows, table, model, progress)
+    found = investigate(windows, table, model, progress, bias_processes=bias_processes)
     result = _assembled(windows, table, found)
     if progress:
         progress(1.0)

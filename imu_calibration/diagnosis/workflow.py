@@ -75,7 +75,8 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     def read(step, numbered):
         return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session, source in numbered]
     baseline = calibrate([source], table, options, provenance, mapper=read)
-    diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None)
+    diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None,
+                         bias_processes=options.bias_processes)
     tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
     needed = motions_needed(diagnosis.solution, tolerances, table)
     calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, needed, provenance)

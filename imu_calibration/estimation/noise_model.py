@@ -5,6 +5,8 @@ from typing import Sequence
 
 import numpy as np
 
+HOUR = 3600.0
+"""s; sessions are hardly longer, and what a bias does over days does not move within one."""
 DOF_FACTOR_MOST = 3.0
 """Largest factor by which a variance grows because it was itself estimated."""
 
@@ -50,6 +52,8 @@ class NoiseModel:
     """Standard deviation of an independent offset per window."""
     bias_processes: tuple[BiasProcess, ...] = ()
     """How the bias moves from window to window."""
+    known: tuple[BiasProcess, ...] = ()
+    """Those of them that were measured apart, on a recording at rest."""
     moving: dict[str, MovingFactors] = field(default_factory=dict)
     """Kind of window -> what it scatters beyond the noise at rest."""
     session_sd: float = 0.0
@@ -69,8 +73,8 @@ class NoiseModel:
 
     @property
     def bias_variance(self) -> float:
-        """Variance of all bias processes together."""
-        return sum(process.sd**2 for process in self.bias_processes)
+        """Variance of all bias processes together, of slow ones within an hour."""
+        return sum(process.sd**2 * min(1.0, HOUR / process.time) for process in self.bias_processes)
 
     @property
     def bias_time(self) -> float | None:

@@ -33,44 +33,52 @@ class NoiseLikelihood:
         As in `RestrictedLikelihood`.
     white : ndarray, shape (n, n_axes)
         Variance of the means by the noise within windows.
+    known : tuple of BiasProcess
+        Processes that are there in any case.
 
     """
 
-    def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray | None = None):
+    def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray | None = None, *,
+                 known: tuple[BiasProcess, ...] = ()):
         self.typical = float(np.sqrt(np.median(white)))
-        self.many = len(rows) >= LEAST_WINDOWS
-        self._white, self._likelihood, self._known = white, RestrictedLikelihood(rows, times, sessions, information), {}
+        self.many, self.known = len(rows) >= LEAST_WINDOWS, known
+        self._white, self._likelihood, self._losses = white, RestrictedLikelihood(rows, times, sessions, information), {}
 
     def loss(self, shape: tuple, used: np.ndarray | None = None, restricted: bool = True, session: float = 0.0) -> float:
         """Return minus twice the (restricted) log likelihood with the parameters `used`, all where not given."""
         key = (*map(float, shape), float(session))
-        if key not in self._known:
+        if key not in self._losses:
             offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
-            processes = (BiasProcess(bias, time),) if bias > 0 else ()
-            self._known[key] = self._likelihood.whitened(self._white + offset**2, processes, step**2)
-        logs, normal = self._known[key]
+            processes = self.processes(bias, time)
+            self._losses[key] = self._likelihood.whitened(self._white + offset**2, processes, step**2)
+        logs, normal = self._losses[key]
         if used is not None:
             at = np.r_[used, len(normal) - 1]
             normal = normal[np.ix_(at, at)]
         return logs + profile(normal, restricted)
 
+    def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
+        """Return the known processes with one more where its standard deviation is above zero."""
+        return (*self.known, BiasProcess(sd, time)) if sd > 0 else self.known
 
-def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray) -> dict:
+
+def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray, *,
+                     known: tuple[BiasProcess, ...] = ()) -> dict:
     """
     Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
 
     A short session leaves open how large a bias process is, and a bias is only as certain as its process is small. So the
     variances are averaged over the likelihood (posterior means on a grid); only a process that is plain gets its best value.
     With several recordings the bias may differ from one to the next; it does when the likelihood gains `SESSION_GAIN`
-    over the best that offsets and process alone can do.
+    over the best that offsets and process alone can do. Where it is known how the bias moves, a further process must be plain.
 
     Parameters
     ----------
-    rows, white, times, sessions, information
+    rows, white, times, sessions, information, known
         As in `NoiseLikelihood`.
 
     """
-    search = _Search(NoiseLikelihood(rows, white, times, sessions, information))
+    search = _Search(NoiseLikelihood(rows, white, times, sessions, information, known=known))
     trials, costs = search.grid(0.0)
     session = search.best_session(trials[np.argmin(costs)]) if len(sessions) > 1 else 0.0
     if session > 0:
@@ -83,7 +91,7 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, ses
     offset, bias, time = search.conclusion(trials, costs, session)
     dof = 3 * (len(sessions) - 1)
     factor = float(dof_factor(dof)) if dof else 1.0
-    return {'offset_sd': offset * typical, 'bias_processes': (BiasProcess(bias * typical, time),) if bias > 0 else (),
+    return {'offset_sd': offset * typical, 'bias_processes': search.likelihood.processes(bias * typical, time),
             'session_sd': session * typical, 'session_variance': (session * typical)**2 * factor}
 
 
@@ -124,6 +132,9 @@ class _Search:
         best = int(np.argmin(costs))
         if costs[:len(OFFSET_GRID)].min() - costs[best] > CLEAR_GAIN:
             return self._best(trials[best], session)
+        if self.likelihood.known:
+            trials, costs = trials[:len(OFFSET_GRID)], costs[:len(OFFSET_GRID)]
+            best = int(np.argmin(costs))
         return _posterior_mean(trials, costs - costs[best])
 
     def _best(self, start, session):

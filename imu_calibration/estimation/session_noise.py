@@ -7,15 +7,15 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.band_misfit import BandMisfit, band_misfit, misfit_along, own_misfit
-from imu_calibration.estimation.noise_model import NoiseModel, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, white_noise
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
 
-def first_noise(system: WeightedSystem, values: np.ndarray) -> dict[str, NoiseModel]:
+def first_noise(system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]) -> dict[str, NoiseModel]:
     """Return the noise before any residual is known; fast parts wait with weight zero where slow ones can be fitted better."""
-    return {sensor: _with_bands(system, sensor, _at_rest(system, sensor, values)) for sensor in SENSORS}
+    return {sensor: _with_bands(system, sensor, replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
 
 
 def updated_noise(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, NoiseModel]:
@@ -43,10 +43,10 @@ def _with_bands(system, sensor, noise):
 
 def _updated(system, sensor, values, noise):
     if white_noise(system.accumulator.rows, sensor) is None:
-        noise = _at_rest(system, sensor, values)
+        noise = replace(_at_rest(system, sensor, values), known=noise.known)
     noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})
     rows, information = system.linearised(sensor, values, noise)
-    return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, system.sessions, information))
+    return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, system.sessions, information, known=noise.known))
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:

@@ -7,7 +7,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.model_error import model_error
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
@@ -22,7 +22,7 @@ NOISE_ROUNDS = 6
 
 
 def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, prior: Prior | None = None,
-          noise: dict[str, NoiseModel] | None = None) -> Solution:
+          noise: dict[str, NoiseModel] | None = None, bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None) -> Solution:
     """
     Estimate all parameters jointly from accumulated windows.
 
@@ -40,6 +40,8 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         What is known before; that of the catalogue where not given.
     noise : dict, optional
         Sensor -> NoiseModel, when it is known.
+    bias_processes : dict, optional
+        Sensor -> how its bias moves, where that was measured apart; the rest of the noise is estimated.
 
     Returns
     -------
@@ -57,7 +59,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     prior = prior or make_prior(model)
     system = WeightedSystem(accumulator, model, prior)
     values, free = start(system), ~fixed_parameters(model)
-    noises = noise or first_noise(system, values)
+    noises = noise or first_noise(system, values, bias_processes or {})
     if noise is None:
         # Mostly once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
         # Where slow and fast parts are weighed apart, the weights move the parameters and these the weights.

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, replace
 
+from imu_calibration import files
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.comparison import moved_beyond_sd
 from imu_calibration.calibration.document import Calibration, calibration_from_text
+from imu_calibration.calibration.measured_noise import with_measured_noise
 from imu_calibration.compensation.stream import requested_transfer
 from imu_calibration.documents import version_of
 from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
@@ -69,6 +71,8 @@ def again(adopted: Adopted, settings: CompensatorSettings) -> Adopted:
 
 
 def _prepared(calibration: Calibration, settings: CompensatorSettings, before: Adopted | None) -> LiveCompensation:
+    if settings.noise_file:
+        calibration = with_measured_noise(calibration, files.read_noise(files.user_path(settings.noise_file)))
     transfer = requested_transfer(settings.target_frame, settings.target_xyz, settings.target_rpy)
     compensation = LiveCompensation(calibration, transfer, settings.check_frame_id, settings.parameter_covariance, settings.correct_stamps)
     if before is not None:

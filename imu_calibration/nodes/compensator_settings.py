@@ -41,6 +41,9 @@ class CompensatorSettings:
                                    symptom='stamps differ from those of the driver', live=True)
     parameter_covariance: bool = setting(True, '', 'add what the uncertainty of the calibration contributes to the covariances',
                                          symptom='covariances are too small, filters trust the readings too much', live=True)
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: covariances follow from it where the messages bring none; empty: '
+                              'from the noise that the calibration saw', symptom='filters trust the readings too much or too little',
+                              live=True, session=True)
     covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; 0: only with a new calibration',
                                      (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
     public_executor: bool = setting(False, '', "use rclpy's public executor, four times slower, instead of a wait set of our own",

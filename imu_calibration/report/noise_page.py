@@ -3,7 +3,7 @@
 import numpy as np
 
 from imu_calibration.allan import summary
-from imu_calibration.allan.dead_reckoning import position_sd
+from imu_calibration.allan.dead_reckoning import position_budget
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.terms import DETERMINED, HELD, WEAK
@@ -12,8 +12,6 @@ from imu_calibration.report.noise_curve import draw_curve
 from imu_calibration.report.numbers import text
 from imu_calibration.report.page import render
 
-RUNS = (1.0, 10.0, 60.0, 600.0)
-"""Lengths of dead reckoning, s."""
 RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
 """Rates for which discrete figures are given beside that of the recording, Hz."""
 
@@ -77,19 +75,9 @@ def _rates(figures, horizon):
 
 
 def _runs(figures):
-    """Return the position errors of dead reckoning from rest, by sensor and in all, root mean square over the horizontal axes' worst."""
-    rows = []
-    for seconds in RUNS:
-        shares = {sensor: max(_position(axis, sensor, seconds) for axis in figures.sensor(sensor)) for sensor in SENSORS}
-        total = float(np.hypot(*shares.values()))
-        rows.append({'seconds': text(seconds), 'both': text(total)} | {sensor: text(share) for sensor, share in shares.items()})
-    return rows
-
-
-def _position(axis, sensor, seconds):
-    processes = axis.processes()
-    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds)
-    return float(np.sqrt((shares**2).sum()))
+    """Return the rows of the budget in metres."""
+    return [{'seconds': text(seconds), 'both': text(float(np.hypot(*shares.values())))} | {sensor: text(m) for sensor, m in shares.items()}
+            for seconds, shares in position_budget(figures)]
 
 
 def _shortest(figures):

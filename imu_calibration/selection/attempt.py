@@ -42,13 +42,16 @@ class Attempt:
         That are asked about.
     point : (SensorModel, array), optional
         Where the columns are taken; at the baseline's own solution where not given.
+    bias_processes : dict, optional
+        Sensor -> how its bias moves, where that was measured apart.
     progress : callable, optional
         Called with the share that is done.
 
     """
 
     def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, effects: Sequence[Effect], *,
-                 point: tuple[SensorModel, np.ndarray] | None = None, progress: Callable | None = None):
+                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None,
+                 progress: Callable | None = None):
         self.baseline, self.effects = baseline, effects
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
@@ -60,7 +63,7 @@ class Attempt:
         self.all_samples = parameter_space(recording, baseline)
         self.space = in_trusted_band(self.all_samples)
         self.questions = questions(self.space, effects)
-        self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions))
+        self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions), bias_processes)
         self.locked = locked_windows(recording.kind)
         self.evidence = WindowEvidence(self.space, self.noise, folds_of(recording.kind, self.locked))
         self.search = Search(self.evidence, used, self.questions, encoder_step(windows))

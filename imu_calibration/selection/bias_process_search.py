@@ -2,7 +2,6 @@
 
 from typing import Callable, Sequence
 
-from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 
 TIMES = (100.0, 300.0)
@@ -49,7 +48,7 @@ class BiasProcessSearch:
         offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
         bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used), bias), self.least)
         unit = self.likelihood.typical
-        return {'offset_sd': offset * unit, 'bias_processes': (BiasProcess(bias * unit, time),)}
+        return {'offset_sd': offset * unit, 'bias_processes': self.likelihood.processes(bias * unit, time)}
 
 
 def _near(ratio):

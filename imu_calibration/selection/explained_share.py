@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import WindowEvidence
-from imu_calibration.selection.noise_beside_effects import natural_process
+from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
@@ -33,7 +33,7 @@ class Explained:
 
     def __init__(self, evidence: WindowEvidence, search: Search):
         self.search, recording = search, evidence.space.recording
-        noise = {s: own.at_rest_only(natural_process(own, recording.period)) for s, own in evidence.noise.items()}
+        noise = {s: own.at_rest_only(*natural_processes(own, recording.period)) for s, own in evidence.noise.items()}
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold)
         self.chosen = evidence.fold >= 0
         self.n_means = 3.0 * self.chosen.sum()

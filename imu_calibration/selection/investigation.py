@@ -1,6 +1,7 @@
 """The search from windows to named effects: clipped samples out, linearise, choose, prove, linearise anew."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Callable, Sequence
 
 import numpy as np
@@ -49,7 +50,8 @@ class Investigation:
     """Effects that could not be asked about."""
 
 
-def investigate(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None) -> Investigation:
+def investigate(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
+                bias_processes: dict | None = None) -> Investigation:
     """
     Ask every effect that a model lacks on held-out windows.
 
@@ -63,6 +65,8 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
         The model that is asked what it lacks.
     progress : callable, optional
         Called with the share that is done, in [0, 1].
+    bias_processes : dict, optional
+        Sensor -> how its bias moves, where that was measured apart.
 
     Raises
     ------
@@ -79,12 +83,13 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
     used, limits = _without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, used)
     asked = without_saturation(effects)
-    attempt = Attempt(used, table, model, asked, progress=lambda share: report(0.5 * share))
+    attempted = partial(Attempt, used, table, model, asked, bias_processes=bias_processes)
+    attempt = attempted(progress=lambda share: report(0.5 * share))
     chosen = attempt.search.run()
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
-        attempt = Attempt(used, table, model, asked, point=attempt.point(chosen), progress=lambda share: report(0.5 + 0.2 * share))
+        attempt = attempted(point=attempt.point(chosen), progress=lambda share: report(0.5 + 0.2 * share))
         chosen = attempt.search.run()
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
@@ -94,7 +99,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
-        attempt = Attempt(used, table, model, asked, point=attempt.point(named))
+        attempt = attempted(point=attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
         again = [next(q for q in attempt.questions if q.label == question.label) for question in named]
         named = _that_help(attempt, pruned(again, explained.share))

@@ -19,7 +19,8 @@ LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
 
-def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int, ...]]]) -> dict[str, NoiseModel]:
+def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int, ...]]],
+                         known: dict[str, tuple[BiasProcess, ...]] | None = None) -> dict[str, NoiseModel]:
     """
     Return sensor -> NoiseModel, estimated beside a model with every effect that is asked about.
 
@@ -32,18 +33,21 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
     smooth : dict
         Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, stays
         in the model beside which the bias process is estimated.
+    known : dict, optional
+        Sensor -> how its bias moves, where that was measured apart.
 
     """
     noise, every = first_noise(space), np.arange(space.size)
+    noise = {sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()}
     for look_along in (False, True):
         values = solve_normal(normal_matrix(space, noise), every, space.prior_sd, space.prior_mean)[0]
         noise = {sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along) for sensor in SENSORS}
     return {sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
 
 
-def natural_process(noise: NoiseModel, period: float) -> BiasProcess:
-    """Return how a bias moves at least, by the white noise of the sensor and the time between samples, s."""
-    return BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0])
+def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
+    """Return how a bias moves at least: as is known, else by the white noise of the sensor and the time between samples, s."""
+    return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0]),)
 
 
 def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
@@ -92,8 +96,10 @@ def _with_bias_process(space, sensor, noise, smooth):
     for axis in range(3):
         rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
     white = noise[sensor].mean_variance(recording.kind, recording.count)
-    likelihood = NoiseLikelihood(rows, white, recording.time, recording.sessions, _known_otherwise(space, sensor, noise, own))
-    search = BiasProcessSearch(likelihood, natural_process(noise[sensor], recording.period).sd)
+    likelihood = NoiseLikelihood(rows, white, recording.time, recording.sessions, _known_otherwise(space, sensor, noise, own),
+                                 known=noise[sensor].known)
+    least = 0.0 if noise[sensor].known else natural_processes(noise[sensor], recording.period)[0].sd
+    search = BiasProcessSearch(likelihood, least)
     options = [[place[k] for k in parameters] for parameters in smooth]
     structural = [k for k in range(len(own)) if not any(k in option for option in options)]
     used = structural + _needed_smooth(search, structural, options)

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import Any, TypedDict
 
 from imu_calibration import files
+from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import checked_tolerances
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
@@ -37,6 +39,8 @@ class Choices(TypedDict, total=False):
     """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
     nominal: str | PathLike | NominalScaling | None
     """File or scaling of recordings in volts or counts."""
+    noise: str | PathLike | NoiseFigures | None
+    """noise.yaml of this IMU: how its biases move, instead of what the recording says of it; needs a table."""
     catalogue: Catalogue
     """The effects that there are; default the package's own."""
     setting: Sequence[str] | Mapping[str, float]
@@ -66,7 +70,7 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
     return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
                               read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
-                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue)
+                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue, noise_of(choices.get('noise')))
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,6 +78,8 @@ def kept(choices: Mapping[str, Any]) -> dict[str, Any]:
     made = {name: choices[name] for name in sorted(IN_DOCUMENT) if choices.get(name)}
     if isinstance(made.get('setting'), Mapping):
         made['setting'] = [f'{name}={value}' for name, value in made['setting'].items()]
+    if isinstance(choices.get('noise'), (str, PathLike)):
+        made['noise'] = Path(choices['noise']).name
     return made
 
 
@@ -89,6 +95,11 @@ def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettin
         except ValueError as error:
             raise InputError(f"a setting must be NAME=NUMBER, got '{pair}'; write for example settling=1.0", key='setting') from error
     return override(WindowSettings(), values)
+
+
+def noise_of(chosen: str | PathLike | NoiseFigures | None) -> NoiseFigures | None:
+    """Return the noise, read where it is a file."""
+    return chosen if chosen is None or isinstance(chosen, NoiseFigures) else files.read_noise(chosen)
 
 
 def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling | None:

@@ -5,11 +5,14 @@ from os import PathLike
 from pathlib import Path
 
 from imu_calibration import files
+from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.measured_noise import with_measured_noise
 from imu_calibration.calibration.trust import caveats, objections, refuse_untrusted
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.use_cases.choices import noise_of
 from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
 
@@ -36,7 +39,8 @@ class Compensated:
 def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration: Calibration | str | PathLike, *,
                output: str | PathLike | None = None, corrected_topic: str = CORRECTED_TOPIC, target_frame: str = '',
                target_xyz=(0.0, 0.0, 0.0), target_rpy=(0.0, 0.0, 0.0), correct_stamps: bool = False, anyway: bool = False,
-               imu_topic: str | None = None, temperature_topic: str | None = None) -> Compensated:
+               noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
+               temperature_topic: str | None = None) -> Compensated:
     """
     Take the calibrated errors out of a recording.
 
@@ -57,6 +61,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         Move the stamps back by the calibration's time_offset.
     anyway : bool
         Also with a calibration whose verdict is bad or whose proof failed.
+    noise : NoiseFigures or path-like, optional
+        noise.yaml of this IMU: the covariances of the corrected readings follow from it where the messages bring none.
     imu_topic, temperature_topic : str, optional
         Topics to read.
 
@@ -70,6 +76,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     if not anyway:
         refuse_untrusted(calibration)
+    figures = noise_of(noise)
+    calibration = calibration if figures is None else with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
     late = late_ns(calibration, correct_stamps)
     if isinstance(recording, (ImuSamples, SampleBlock)):
