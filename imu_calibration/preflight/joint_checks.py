@@ -1,4 +1,4 @@
-"""Checks against the table: units, signs and order of the axes, from the windows that calibration gathered anyway."""
+"""Checks against the table: whether the IMU is on it, units, signs and order of the axes, from the windows that calibration gathered anyway."""
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.preflight.on_table import same_motion
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power say nothing."""
@@ -36,7 +37,7 @@ def against_joints(gathered, model, table=None):
     for sensor in ('gyroscope', 'accelerometer'):
         moments = _moments(gathered.accumulator, model, sensor)
         if moments is not None:
-            found += _rate_units(moments) if sensor == 'gyroscope' else []
+            found += _rates(moments, gathered.kept, table) if sensor == 'gyroscope' else []
             found += _axes(sensor, moments, table)
     return tuple(found)
 
@@ -68,6 +69,12 @@ def _seen(sensor, moment):
     shown = values > SEEN[sensor] * values.max()
     vectors = vectors[:, shown]
     return vectors @ vectors.T, vectors @ np.diag(1.0 / values[shown]) @ vectors.T
+
+
+def _rates(moments, windows, table):
+    found = list(_rate_units(moments))
+    stranger = None if found else same_motion(moments, windows, table)
+    return found if stranger is None else [stranger]
 
 
 def _rate_units(moments):

@@ -1,0 +1,87 @@
+"""Is this IMU on this table? What does not tell the motion of the joints is refused, with the cause."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.errors import InputError
+from imu_calibration.preflight.on_table import same_motion
+from imu_calibration.reference.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.diagnose import diagnose
+
+from worlds.misfit_worlds import make_pair
+
+
+@pytest.fixture(scope='module')
+def gimbals():
+    pair = make_pair(None, 1)
+    return pair.first.block, Table.from_mapping(pair.table)
+
+
+@pytest.fixture(scope='module')
+def shaft():
+    pair = make_pair(None, 1, table='shaft', profile='sweeps')
+    return pair.first.block, Table.from_mapping(pair.table)
+
+
+def later(block, seconds):
+    return replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + int(seconds * 1e9)))
+
+
+def still(block):
+    rng = np.random.default_rng(0)
+    force = np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.01, block.imu.force_s.shape)
+    return replace(block, imu=replace(block.imu, force_s=force, rate_s=rng.normal(0.0, 1e-3, force.shape)))
+
+
+def joints(block, names=None, sign=1.0):
+    known = block.joints
+    return replace(block, joints=replace(known, position=sign * known.position, velocity=sign * known.velocity, names=names or known.names))
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    (still, ('this IMU does not turn when the table does', 'right topic')),
+    (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer turns as middle should', 'middle turns as outer should')),
+    (lambda block: joints(block, sign=-1.0), ('outer turns the other way round', 'inner turns the other way round')),
+    (lambda block: later(block, 2.0), ('turns otherwise than the table', 'do both clocks agree')),
+], ids=('another IMU', 'exchanged joints', 'wrong signs', 'far apart in time'))
+def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
+    block, table = gimbals
+    with pytest.raises(InputError) as refused:
+        calibrate(change(block), table)
+    assert all(word in str(refused.value) for word in words) and '\n' not in str(refused.value)
+    assert '--imu-topic' in refused.value.told({'imu_topic': '--imu-topic'})
+
+
+@pytest.mark.parametrize(('seconds', 'words'), [(0.5, 'about 0.5 s behind'), (-0.5, 'about 0.5 s ahead of')])
+def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, words):
+    with pytest.raises(InputError, match=words):
+        calibrate(later(shaft[0], seconds), shaft[1])
+
+
+def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
+    with pytest.raises(InputError, match="minus the reference's x"):
+        calibrate(joints(shaft[0], sign=-1.0), shaft[1])
+
+
+def test_diagnose_refuses_the_same(gimbals):
+    with pytest.raises(InputError, match='does not turn when the table does'):
+        diagnose(still(gimbals[0]), gimbals[1])
+
+
+@pytest.mark.parametrize(('gain', 'noise', 'refused'), [(1.0, 0.1, False), (0.7, 0.1, False), (1e-5, 1e-3, True), (1e-5, 1.0, True), (1.0, 2.0, True)])
+def test_gain_and_coherence_decide(gain, noise, refused):
+    rng = np.random.default_rng(1)
+    told = rng.normal(size=(5000, 3))
+    felt = gain * told + noise * rng.normal(size=(5000, 3))
+    found = same_motion((felt.T @ told, told.T @ told, felt.T @ felt), [], None)
+    assert (found is not None) == refused
+
+
+@pytest.mark.real_data
+def test_the_imu_on_the_bench_is_refused(recordings):
+    folder = recordings / 'shaft_yaw_medium'
+    with pytest.raises(InputError, match='does not turn when the table does'):
+        calibrate(folder, folder / 'table.yaml', imu_topic='/imu_fixed/data_raw')
