@@ -47,15 +47,15 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
     if explained >= SAME and gain > 0.1 * TURNS:
         return None   # units, signs and axes are looked at elsewhere
-    if explained < SAME and np.trace(measured) > TURNS * np.trace(reference):
-        cause = _cause(windows, table) if table is not None else ''
-        text = cause or 'it turns otherwise than the table; is it the right topic, are these the joints of its table, and do both clocks agree?'
-    elif gain < TURNS:
-        text = 'this IMU does not turn when the table does; is it the right topic?'
-    else:
+    key, cause = 'imu_topic', 'this IMU does not turn when the table does; is it the right topic?'
+    if np.trace(measured) > TURNS * np.trace(reference):
+        cause, key = (_cause(windows, table) if table is not None else ''), None
+    elif gain > TURNS:
         return None
+    if not cause:
+        key, cause = 'imu_topic', 'it turns otherwise than the table; is it the right topic, are these the joints of its table, and do both clocks agree?'
     return CheckFinding('on_table', REFUSE, f'the gyroscope must tell the motion of the joints, they explain {100 * min(explained, 1.0):.0f} % of its rates '
-                        f'at a gain of {gain:.2g}: {text}', key='imu_topic')
+                        f'at a gain of {gain:.2g}: {cause}', key=key)
 
 
 def _cause(windows, table):

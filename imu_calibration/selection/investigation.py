@@ -145,6 +145,8 @@ def _without_clipping(windows, table, model):
     for _ in range(2):
         predicted = predictions(windows, table, model, simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, limits, noise_sd)
+        if len(kept) < LEAST_WINDOWS:
+            return windows, []   # what is always at its limit, or always near it, shows no limit
     predicted = predictions(windows, table, model, simple_fit(kept, table, model))
     found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
     if not found:

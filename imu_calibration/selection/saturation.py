@@ -106,10 +106,9 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     at = int((size >= level * (1 - 1e-12)).sum())
     if at < LEAST_CLIPPED or level == 0:
         return False
-    # A coarse output repeats all its values; those just below the largest show how often.
-    below = np.sort(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)])[-500:]
-    _, repeats = np.unique(below, return_counts=True)
-    return bool(at > 3 * (repeats[-5:].mean() if len(repeats) else 1.0))
+    # A coarse output repeats all its values; those just below the largest show how often, the step that gravity sits on above all.
+    _, repeats = np.unique(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True)
+    return bool(at > 3 * repeats[-5:].max(initial=1))
 
 
 def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, sensor: str) -> Saturation | None:

@@ -1,0 +1,60 @@
+"""A limit that outputs pile up at is told from a coarse output that repeats all its values."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.selection import investigation
+from imu_calibration.selection.saturation import may_be_clipped
+from imu_calibration.use_cases.diagnose import diagnose
+
+from worlds.misfit_worlds import make_pair
+
+STEP = 0.0981
+
+
+def windows_of(force, count=10):
+    """Return moving windows with some specific force, shape (n, 3)."""
+    size = len(force) // count
+    zero = np.zeros((size, 1))
+    return [Window('dynamic', np.arange(size) * 10**7, np.arange(size) * 0.01, force[k * size:(k + 1) * size], np.zeros((size, 3)),
+                   JointMotion(np.arange(size) * 0.01, zero, zero, zero, zero)) for k in range(count)]
+
+
+def upright(noise, step=STEP):
+    force = np.array([0.0, 0.0, 9.81]) + np.random.default_rng(0).normal(0.0, noise, (48_000, 3))
+    return np.round(force / step) * step
+
+
+def test_gravity_on_the_highest_steps_of_a_coarse_output_is_no_limit():
+    assert not may_be_clipped(windows_of(upright(0.03)), 'accelerometer')
+
+
+@pytest.mark.parametrize('step', [1e-6, STEP])
+def test_a_limit_is_seen_in_fine_and_in_coarse_outputs(step):
+    swing = 12.0 * np.sin(np.arange(48_000) * 0.02)[:, None] * np.array([0.1, 0.2, 1.0])
+    force = np.clip(np.round(swing / step) * step, -100 * STEP, 100 * STEP)
+    assert may_be_clipped(windows_of(force), 'accelerometer')
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
+    folder = recordings / 'shaft_yaw_slow_later'
+    found = diagnose(folder, folder / 'table.yaml')
+    assert found.diagnosis.windows >= 8
+
+
+def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
+    pair = make_pair(None, 1, table='shaft', profile='sweeps')
+    table = Table.from_mapping(pair.table)
+    gatherer = MotionGatherer(table)
+    windows = gatherer.push(pair.first.block) + gatherer.finish()
+    monkeypatch.setattr(investigation, 'may_be_clipped', lambda windows, sensor: True)
+    monkeypatch.setattr(investigation, 'without_clipped', lambda *given: [])
+    found = investigation.investigate(windows, table, SensorModel(joint_names=table.joint_names))
+    assert found.used == [window for window in windows if window.kind != 'unused'] and not found.limits
