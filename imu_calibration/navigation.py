@@ -8,9 +8,9 @@ position are left out: over 50 s they are below 1e-3 of the errors that are comp
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
-from imu_calibration.reference.reference_motion import skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +47,6 @@ class Drift:
         return float(np.median(self.velocity)), float(np.median(self.position)), float(np.median(self.attitude))
 
 
-def rotation_from_vector(rotation):
-    """Return matrices of rotation vectors (rad, counter-clockwise seen from the tip), shape (..., 3) to (..., 3, 3)."""
-    rotation = np.asarray(rotation, float)
-    angle = np.linalg.norm(rotation, axis=-1)[..., None, None]
-    cross = skew(rotation)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
-
-
 def integrate_attitude(time, rate_s, mat_ns0=None, earth_rate_n=(0.0, 0.0, 0.0)):
     """
     Integrate the rate against inertial space into the attitude against the level frame, shape (n, 3, 3).
@@ -77,10 +69,10 @@ def integrate_attitude(time, rate_s, mat_ns0=None, earth_rate_n=(0.0, 0.0, 0.0))
     step = np.diff(time)[:, None]
     turns = 0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
     start = np.eye(3) if mat_ns0 is None else np.asarray(mat_ns0, float)
-    mat_is = _running_product(np.concatenate([start[None], rotation_from_vector(turns)]))
+    mat_is = _running_product(np.concatenate([start[None], Rotation.from_rotvec(turns).as_matrix()]))
     if not np.any(earth_rate_n):
         return mat_is
-    return rotation_from_vector(-np.multiply.outer(time - time[0], np.asarray(earth_rate_n, float))) @ mat_is
+    return Rotation.from_rotvec(-np.multiply.outer(time - time[0], np.asarray(earth_rate_n, float))).as_matrix() @ mat_is
 
 
 def dead_reckon(time, force_n, gravity):
@@ -187,7 +179,7 @@ def drift_over(reference, force_s, rate_s, seconds=50.0, earth_rate_n=(0.0, 0.0,
         true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], reference.gravity, start, earth_rate_n)
         ends.append((np.linalg.norm(measured.velocity_n[-1] - true.velocity_n[-1]),
                      np.linalg.norm(measured.position_n[-1] - true.position_n[-1]),
-                     _angle(measured.mat_ns[-1] @ true.mat_ns[-1].T)))
+                     Rotation.from_matrix(measured.mat_ns[-1] @ true.mat_ns[-1].T).magnitude()))
     velocity, position, attitude = np.array(ends).T
     return Drift(reference.time[edges[:-1]], float(seconds), velocity, position, attitude)
 
@@ -212,8 +204,3 @@ def _running_product(matrices):
 def _running_integral(time, values):
     areas = 0.5 * (values[..., 1:, :] + values[..., :-1, :]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros_like(values[..., :1, :]), np.cumsum(areas, axis=-2)], axis=-2)
-
-
-def _angle(matrix):
-    sine = np.linalg.norm([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
-    return float(np.arctan2(sine, (np.trace(matrix) - 1) / 2))

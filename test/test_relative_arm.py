@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.by_hand.imu_pair import clipped
 from imu_calibration.by_hand.modulating_functions import make_windows
-from imu_calibration.by_hand.relative_arm import clipped, estimate_arm
+from imu_calibration.by_hand.relative_arm import RelativeArm, estimate_arm
 from imu_calibration.by_hand.workflow import read_imu
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.reference.reference_motion import lever_matrix
@@ -73,6 +74,13 @@ def test_exact_where_a_central_difference_makes_the_arm_too_long():
     np.testing.assert_allclose(found.arm, ARM, atol=2e-5)
     # sin(x)/x at 4 Hz and 16 ms is 0.973: the tangential half of the equation is that much too small
     assert 1.01 < np.linalg.norm(naive_arm(imu_a, imu_b)) / np.linalg.norm(ARM) < 1.05
+
+
+@pytest.mark.parametrize('turn', [(np.pi, 0, 0), (0, np.pi - 1e-9, 0), (0, 0, np.pi - 1e-4), (np.pi / np.sqrt(2), 0, np.pi / np.sqrt(2)), (0, 0, 0), (0, 0, 1e-5)])
+def test_the_angle_holds_for_imus_mounted_upside_down(turn):
+    found = RelativeArm(ARM, np.eye(3), Rotation.from_rotvec(turn).as_matrix(), 0.0, ('determined',) * 3,
+                        {'windows': 1, 'window': 0.1, 'clipped_share': 0.0, 'signal_rms': 1.0, 'residual_rms': 1.0, 'calibrated': True})
+    assert next(iter(found.lines())).startswith(f'B is turned by {np.degrees(np.linalg.norm(turn)):.2f} deg against A')
 
 
 def test_stamps_rates_and_axes_of_the_two_need_not_agree():

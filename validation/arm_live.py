@@ -9,7 +9,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.relative_arm import clipped, estimate_arm
+from imu_calibration.by_hand.imu_pair import clipped
+from imu_calibration.by_hand.relative_arm import estimate_arm
 from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
 from imu_calibration.compensation.compensate import Transfer, compensate

@@ -3,17 +3,22 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, make_windows
-from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.imu_pair import (
+    ArmSettings,
+    PairedImu,
+    relative_rotation,
+    require_overlap,
+    window_centres,
+    window_length,
+)
+from imu_calibration.by_hand.modulating_functions import make_windows
 from imu_calibration.by_hand.relative_arm_fit import ArmRows, fit_arm, jackknife_covariance, lever_rows, response
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import linear_names
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.reference_motion import skew
-from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.settings import setting
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
 """Differences of the accelerometers' biases and stamps, and the gyroscopes' lateness against the accelerometers."""
@@ -27,19 +32,6 @@ DELAY_ROUNDS = 5
 """The delay shifts the windows of the rates until nothing is left of it."""
 WINDOWS_LEAST = 40
 """Fewer say little about eight numbers and their scatter."""
-
-
-@dataclass(frozen=True)
-class ArmSettings:
-    """Numbers for the estimate of a relative arm."""
-
-    window: float = setting(0.12, 's', 'length of the windows over which the motion is integrated; never below eight samples', (0.004, 5.0),
-                            'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
-    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
-                                  (0.0, 0.9), 'too small: resting windows rule the noise estimate')
-    cluster: float = setting(2.0, 's', 'errors are taken as independent between stretches of this length', (0.1, 100.0),
-                             'too small: sd too small')
-    gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +59,7 @@ class RelativeArm:
     def lines(self):
         """Return the remarks for a person to read."""
         d = self.diagnostics
-        turn = np.degrees(np.linalg.norm(_rotation_vector(self.mat_ab)))
+        turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
         yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
         yield (f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
                f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
@@ -108,10 +100,10 @@ def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY,
         When the motion does not show the arm; the message names the component.
 
     """
-    _require_overlap(imu_a, imu_b)
+    require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
-    a, b = (_Stream.make(imu, start, gravity, given, settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
-    rotation = _relative_rotation(a, b, settings)
+    a, b = (PairedImu.make(imu, start, gravity, given, settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
+    rotation = relative_rotation(a, b, settings)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
         rows = _build_rows(a, b, rotation, delay, settings)
@@ -122,137 +114,10 @@ def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY,
     return _result(rows, fit, delay, rotation, (a, b), settings)
 
 
-@dataclass(frozen=True, eq=False)
-class _Stream:
-    """One IMU, compensated."""
-
-    time: np.ndarray
-    force: np.ndarray
-    rate: np.ndarray
-    flagged: np.ndarray
-    calibration: object
-    poses: object
-    period: float
-
-    @classmethod
-    def make(cls, imu, start_ns, gravity, calibration, settings):
-        time = 1e-9 * (imu.stamp_ns - start_ns)
-        keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps carry no new moment
-        imu, time = imu.select(keep), time[keep]
-        period = float(np.median(np.diff(time)))
-        made_here = calibration is None
-        calibration = _calibrate(imu, gravity) if made_here else calibration
-        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
-        poses = calibration.poses if made_here and calibration is not None else None
-        return cls(time, *_compensated(imu, calibration), flagged, calibration, poses, period)
-
-
-def clipped(values):
-    """
-    Return which samples touch the end of the range, shape (n,).
-
-    The end of the range shows as the largest reading of one sign, over all axes, coming up again and again; a largest reading
-    that came twice or less is the motion's own. The two ends may differ by one count.
-    """
-    flagged = np.zeros(len(values), bool)
-    for signed in (values, -values):
-        at_end = signed >= signed.max() - 1e-9 * np.abs(signed).max()
-        if np.sum(at_end) > 2:
-            flagged |= np.any(at_end, axis=1)
-    return flagged
-
-
-def _calibrate(imu, gravity):
-    try:
-        return calibrate_by_hand(imu, HandOptions(gravity), find_still(imu))
-    except NotObservableError:
-        return None
-
-
-def _compensated(imu, calibration):
-    if calibration is not None:
-        return calibration.compensate(imu.force_s, imu.rate_s)
-    still = find_still(imu)
-    bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
-    return imu.force_s, imu.rate_s - bias
-
-
-def _require_overlap(imu_a, imu_b):
-    if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
-        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics')
-    overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
-    if overlap <= 0:
-        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; '
-                         'check the clocks')
-
-
-def _length(a, b, settings):
-    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
-
-
-def _centres(a, b, offset, length):
-    """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
-    step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
-    begin = max(a.time[0], b.time[0] - offset) + margin
-    end = min(a.time[-1], b.time[-1] - offset) - margin
-    if end - begin < step:
-        raise InputError(f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer')
-    first = a.time[np.searchsorted(a.time, begin)]
-    return first + step * np.arange(int((end - first) / step) + 1)
-
-
-@dataclass(frozen=True, eq=False)
-class _Rotation:
-    """How B's axes and clock lie against A's."""
-
-    mat_ab: np.ndarray
-    cov: np.ndarray
-    offset: float
-
-
-def _relative_rotation(a, b, settings, rounds=4):
-    """Return the rotation from the directions at rest where both were calibrated, else from the rates; the offset from the rates."""
-    offset, length = 0.0, _length(a, b, settings)
-    for _ in range(rounds):
-        centres = _centres(a, b, offset, length)
-        over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
-        free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
-        over_a, over_b = over_a.select(free), over_b.select(free)
-        rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
-        mat_ab = _align(rate_a, rate_b)
-        offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
-    at_rest = _directions_at_rest(a, b, offset)
-    pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
-    mat_ab = _align(*pairs)
-    residual = pairs[0] - pairs[1] @ mat_ab.T
-    cross = skew(pairs[0])
-    information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
-    return _Rotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
-
-
-def _align(vectors_a, vectors_b):
-    """Return the rotation closest to ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
-    left, _, right = np.linalg.svd(vectors_a.T @ vectors_b)
-    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-
-
-def _directions_at_rest(a, b, offset):
-    """Return mean forces of both over the times when both rest, or None when there are too few directions."""
-    if a.poses is None or b.calibration is None:
-        return None
-    pairs = []
-    for first, last in zip(a.poses.start, a.poses.stop):
-        begin, end = a.time[first], a.time[last - 1]
-        in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
-        if in_b.stop - in_b.start >= 2:
-            pairs.append((a.force[first:last].mean(0), b.force[in_b].mean(0)))
-    return tuple(np.array(pairs).swapaxes(0, 1)) if len(pairs) >= 4 else None
-
-
 def _build_rows(a, b, rotation, delay, settings):
     """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
-    length, offset = _length(a, b, settings), rotation.offset
-    centres = _centres(a, b, offset, length)
+    length, offset = window_length(a, b, settings), rotation.offset
+    centres = window_centres(a, b, offset, length)
     force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
     rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
     free = ~(force_a.touches(a.flagged) | force_b.touches(b.flagged) | rate_a.touches(a.flagged) | rate_b.touches(b.flagged))
@@ -333,9 +198,3 @@ def _require_seen(seen, sd):
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
         raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
                                  f'it shows is not noise and the sd is {np.max(sd):.2g} m; twist fast about the axes other than {"xyz"[worst]} too')
-
-
-def _rotation_vector(matrix):
-    angle = np.arccos(np.clip((np.trace(matrix) - 1) / 2, -1, 1))
-    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    return axis / 2 if angle < 1e-6 else axis * angle / (2 * np.sin(angle))

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
-from imu_calibration.navigation import rotation_from_vector
 from imu_calibration.reference.reference_motion import lever_matrix
 
 DESIGNS = ('Z0', 'Z60', 'O', 'M')
@@ -94,7 +94,7 @@ def design_runs(name: str, sample_sd: float = 1e-3 * STANDARD_GRAVITY, n_samples
 
 def skewed_axes(skew_deg: float) -> np.ndarray:
     """Return three orthonormal spin axes, one per row, for a fixture turned by `skew_deg` about the body diagonal (1, 1, 1)."""
-    return rotation_from_vector(np.deg2rad(skew_deg) * np.ones(3) / np.sqrt(3)).T
+    return Rotation.from_rotvec(np.deg2rad(skew_deg) * np.ones(3) / np.sqrt(3)).as_matrix().T
 
 
 def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings: int = 4) -> Run:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration import navigation
 from imu_calibration.constants import STANDARD_GRAVITY
@@ -93,7 +94,7 @@ def spin_growth(cosines: np.ndarray, arms: np.ndarray, axis: tuple[float, float,
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
     rate = np.tile(np.deg2rad(rate_deg_s) * axis, (len(time), 1))
     error = size_effect_error(cosines, arms, rate, alpha=np.zeros_like(rate))
-    mat_ns = navigation.rotation_from_vector(rate * time[:, None])
+    mat_ns = Rotation.from_rotvec(rate * time[:, None]).as_matrix()
     return {'time': time, 'level': navigation.error_growth(time, error, mat_ns), 'body': navigation.error_growth(time, error),
             'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY}
 

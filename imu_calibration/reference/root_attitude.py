@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
 
@@ -40,5 +41,4 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
 
 def _matrix(quaternion):
     """Return the rotation matrix of a quaternion x, y, z, w of any length, shape (3, 3)."""
-    from scipy.spatial.transform import Rotation
     return Rotation.from_quat(quaternion).as_matrix()

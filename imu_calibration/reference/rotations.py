@@ -1,23 +1,19 @@
 """Rotation matrices: from a rotation vector, from roll, pitch and yaw, and the smallest one that turns a direction upwards."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.reference.reference_motion import skew
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:
-    """Return ``exp(vector x)``, shape (3, 3): the turn by a rotation vector, rad (Rodrigues)."""
-    vector = np.asarray(vector, float)
-    cross = skew(vector)
-    angle = np.linalg.norm(vector)
-    # numpy's sinc is sin(pi x) / (pi x); it has no trouble at zero.
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+    """Return ``exp(vector x)``, shape (3, 3): the turn by a rotation vector, rad."""
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def rotation_from_rpy(rpy: np.ndarray) -> np.ndarray:
     """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad."""
-    roll, pitch, yaw = rpy
-    return rotation([0, 0, yaw]) @ rotation([0, pitch, 0]) @ rotation([roll, 0, 0])
+    return Rotation.from_euler('xyz', rpy).as_matrix()
 
 
 def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
