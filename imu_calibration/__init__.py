@@ -35,7 +35,8 @@ In a notebook
     import imu_calibration as imu
     found = imu.calibrate('session.bag', 'table.yaml')      # without a table: by hand
 
-`load`, `calibrate`, `compensate`, `diagnose` and `simulate` are all that is needed; what they return prints, draws and saves itself.
+`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` are all that is needed; what they return prints, draws and
+saves itself.
 
 Contents
 --------
@@ -68,9 +69,9 @@ From the ground up; each package imports only what stands above it. The words ar
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.notebook import calibrate, compensate, diagnose, load, simulate
+    from imu_calibration.use_cases.notebook import calibrate, check, compensate, diagnose, load, simulate
 
-__all__ = ['calibrate', 'compensate', 'diagnose', 'load', 'simulate']
+__all__ = ['calibrate', 'check', 'compensate', 'diagnose', 'load', 'simulate']
 __version__ = '0.1.0'
 
 

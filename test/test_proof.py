@@ -36,7 +36,7 @@ def late():
 
 def test_a_good_calibration_is_proven_in_every_motion(clean):
     found = clean.calibration.proof
-    assert set(found) == set(SENSORS) and not disproved(clean.calibration) and clean.verdict.word != 'bad'
+    assert set(found) == set(SENSORS) and not disproved(clean.calibration.proof) and clean.verdict.word != 'bad'
     for entry in found.values():
         assert entry['windows'] == sum(clean.calibration.statistics['windows'].values())
         assert set(entry['regimes']) >= {Regime.REST, Regime.FAST, Regime.ACCELERATING}
@@ -51,7 +51,7 @@ def test_a_gain_that_a_lag_has_spoiled_is_refused_with_its_cause(late, tmp_path)
     assert abs(gain - true) > 2 * abs(1.0 - true)   # what has to be noticed
     assert late.verdict.word == 'bad' and late.exit_code == 3
     assert late.calibration.proof['gyroscope']['delay_s'] == pytest.approx(0.012, abs=2e-3)
-    line = disproved(late.calibration)[0]
+    line = disproved(late.calibration.proof)[0]
     assert 'gyroscope' in line and 'ms too late' in line and '\n' not in line
     with pytest.raises(DocumentError, match='took no part'):
         compensate(make_pair('driver_lag', 1, table='shaft', profile='sweeps').second.imu, late.calibration)

@@ -18,6 +18,7 @@ from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.reference.table import Table
 
 RESAMPLES = 1000
 """Of whole blocks, for an interval."""
@@ -63,9 +64,9 @@ def prove_calibration(held_out: HeldOut, model: SensorModel, calibration: Calibr
     """Return the proof of any calibration on a recording that was gathered with `model`, which has its effects (`model_for`)."""
     values = nominal_values(model)
     for effect in calibration.model.effects:
-        if effect.key in model.slices and not effect.in_reference:
+        if effect.key in model.slices:
             values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
-    return prove(held_out, model, [values], nominal_values(model))
+    return prove(held_out, model, [values], values)
 
 
 def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], reference: np.ndarray) -> dict:
@@ -80,7 +81,8 @@ def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], re
     folds : sequence of array
         Parameters for the blocks of each fold, in turn.
     reference : array, shape (n_params,)
-        Parameters whose table and clock a nominal sensor may be compared with, where that suits it better than the table as described.
+        Parameters of table and clock: each side may be compared with the table as it was estimated or as it was described, whichever suits it
+        better.
 
     """
     folds = [_as_compensated(model, values) for values in folds]
@@ -90,9 +92,10 @@ def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], re
         return {}
     proof = {}
     for sensor in SENSORS:
-        after = _errors(held_out, model, sensor, folds, regimes)
-        nominal = [_errors(held_out, model, sensor, [values], regimes) for values in (nominal_values(model), _with_reference(model, reference))]
-        before = min(nominal, key=lambda errors: errors.squares.sum())
+        described = [_with_reference(model, values, nominal_values(model)) for values in folds]
+        after = min((_errors(held_out, model, sensor, each, regimes) for each in (folds, described)), key=_total)
+        nominal = [nominal_values(model), _with_reference(model, nominal_values(model), reference)]
+        before = min((_errors(held_out, model, sensor, [values], regimes) for values in nominal), key=_total)
         entry = _compared(before.squares.sum(axis=1), after.squares.sum(axis=1), counts.sum(axis=1))
         moving = {str(name): _compared(before.squares[:, k], after.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
                   if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
@@ -103,16 +106,20 @@ def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], re
 
 def nominal_values(model: SensorModel) -> np.ndarray:
     """Return the parameters of a sensor as its data sheet has it on a table as described."""
-    values = model.start()
+    values = model.prior()[0]
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def model_for(calibration: Calibration, model: SensorModel) -> SensorModel:
-    """Return the model of a recording's table with the effects of a calibration that act on the sensors."""
-    for effect in calibration.model.effects:
-        if not effect.in_reference and effect.key not in model.slices:
-            model = model.with_effect(effect.sensor, effect.name)
-    return model
+def model_for(calibration: Calibration, table: Table) -> SensorModel:
+    """Return the model with which a recording on a table is gathered to prove a calibration on it."""
+    known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
+    sensors = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor and (same_joints or not effect.in_reference))
+               for sensor in SENSORS}
+    model = SensorModel(**sensors, reference=known.reference if same_joints else (), joint_names=table.joint_names,
+                        temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)
+    model = model.at(np.concatenate([calibration.values[known.slices[effect.key]] for effect in model.effects]))
+    # Where the sensor sits on the table is nobody's error, and each side gets what suits it.
+    return model if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None else model.with_role('accelerometer', Role.ARM)
 
 
 def _as_compensated(model, values):
@@ -124,12 +131,17 @@ def _as_compensated(model, values):
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def _with_reference(model, reference):
-    values = nominal_values(model)
+def _with_reference(model, values, reference):
+    """Return the values with the table and the clock of others."""
+    values = values.copy()
     for effect in model.effects:
         if _of_reference(effect):
             values[model.slices[effect.key]] = reference[model.slices[effect.key]]
     return values
+
+
+def _total(errors):
+    return errors.squares.sum()
 
 
 def _of_reference(effect: Effect) -> bool:

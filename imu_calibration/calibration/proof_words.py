@@ -6,14 +6,16 @@ HARM = 1.05
 """A regime is harmed when its error grows by this factor, and the interval says that it does grow."""
 LATE = 1e-3
 """Delays from this size on are named as a cause, s."""
+AT_REST = 0.7
+"""An error at rest of this share of the whole comes from the bias."""
 DELAY_SHARE = 0.1
 """They must explain this share of what is left."""
 
 
-def disproved(calibration):
+def disproved(proof):
     """Return a line for each sensor whose error on held-out data is not shown to be smaller with the calibration, or grows in some motion."""
     lines = []
-    for sensor, found in calibration.proof.items():
+    for sensor, found in proof.items():
         if sensor not in SENSORS:
             continue
         if not (found['windows'] and found['after'] < found['before'] and found['ci95'][1] < 1.0):
@@ -48,6 +50,8 @@ def _cause(found):
     if abs(late) > LATE and share > DELAY_SHARE:
         return f'; the likely cause is that the readings come {abs(late) * 1e3:.0f} ms too {"late" if late > 0 else "early"}, which the model leaves out'
     regimes = found.get('regimes') or {}
+    if 'rest' in harmed(found) or regimes.get('rest', {'after': 0.0})['after'] > AT_REST * found['after'] > 0.0:
+        return '; most likely the bias has moved'
     if regimes and set(harmed(found)) == {'angular acceleration'}:
         return '; the likely cause goes with angular acceleration: a lever arm, a lag that changes, a mount that gives way'
     if found['after'] < HARM * found['before']:

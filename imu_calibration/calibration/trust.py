@@ -16,7 +16,7 @@ def objections(calibration):
     """
     reasons = calibration.verdict_reasons[:1]
     bad = [': '.join(['its verdict is bad', *reasons])] if calibration.verdict == BAD else []
-    return list(dict.fromkeys([*bad, *implausible(calibration), *disproved(calibration)]))
+    return list(dict.fromkeys([*bad, *implausible(calibration), *disproved(calibration.proof)]))
 
 
 def caveats(calibration):
@@ -35,7 +35,7 @@ def missing(calibration):
 
 def standing(calibration):
     """Return in a few words how well a calibration is known, for one line in a log."""
-    proof = 'proven on held-out data' if calibration.proof and not disproved(calibration) else 'no proof on held-out data'
+    proof = 'proven on held-out data' if calibration.proof and not disproved(calibration.proof) else 'no proof on held-out data'
     return f'{calibration.verdict or "no verdict"}, {proof}'
 
 

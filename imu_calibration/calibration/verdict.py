@@ -104,7 +104,7 @@ def judged(calibration, tolerances):
 
 
 def _disproved(calibration):
-    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause") for line in disproved(calibration)]
+    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause") for line in disproved(calibration.proof)]
 
 
 def _implausible(calibration):
@@ -199,7 +199,7 @@ def _notes(calibration, tolerances):
 
 
 def _proven(calibration):
-    return [] if disproved(calibration) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
+    return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
 
 
 def _loose(calibration):

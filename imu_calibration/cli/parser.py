@@ -6,7 +6,7 @@ from importlib import import_module
 
 import imu_calibration
 
-VERBS = ('inspect', 'calibrate', 'compensate', 'diagnose', 'simulate', 'compare', 'arm', 'fleet', 'noise', 'export', 'import')
+VERBS = ('inspect', 'calibrate', 'compensate', 'check', 'diagnose', 'simulate', 'compare', 'arm', 'fleet', 'noise', 'export', 'import')
 """Each is a module of this package with NAME, HELP, `add_arguments` and `run`."""
 
 

@@ -10,6 +10,7 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.use_cases.calibrate import calibrate as _calibrate
+from imu_calibration.use_cases.check import check as _check
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.compensate import compensate as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
@@ -48,6 +49,7 @@ def load(path: str | PathLike) -> Calibration:
 
 
 calibrate = _for_notebooks(_calibrate)
+check = _for_notebooks(_check)
 compensate = _for_notebooks(_compensate)
 diagnose = _for_notebooks(_diagnose)
 simulate = _for_notebooks(_simulate)

@@ -1,0 +1,38 @@
+"""``imu_calibration check``: is a calibration still good on this recording?"""
+
+from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
+from imu_calibration.cli.show import console, warn
+from imu_calibration.preflight.checks import warnings
+from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.choices import Choices
+
+NAME = 'check'
+HELP = 'Say whether a calibration helps on a recording: errors before and after, by sensor and by what the IMU does.'
+
+
+def add_arguments(parser):
+    """Declare the arguments."""
+    parser.add_argument('bag', metavar='BAG', help='a recording of the IMU that was calibrated')
+    parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    add_stand_arguments(parser, 'the reference of this recording')
+    add_topic_arguments(parser)
+
+
+def run(options):
+    """Print errors before and after with their interval and the answer; return 0 when it helps, 3 when it does not or cannot be told."""
+    from rich.table import Table
+    chosen = {name: value for name, value in vars(options).items() if name in Choices.__annotations__}
+    found = check(options.bag, options.calibration, stand_of(options), **chosen)
+    warn([finding.to_mapping() for finding in warnings(found.result.findings)])
+    out, table = console(), Table(box=None, pad_edge=False)
+    for heading in ('sensor', 'motion', 'seconds', 'before', 'after', 'unit', 'after / before', '95 %'):
+        table.add_column(heading, justify='left' if heading in ('sensor', 'motion', 'unit') else 'right')
+    for sensor, entry in found.proof.items():
+        for motion, part in (('all', entry), *entry['regimes'].items()):
+            low, high = part['ci95']
+            table.add_row(sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}', entry['unit'],
+                          f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}')
+    out.print(table)
+    for line in str(found).splitlines():
+        out.print(line, soft_wrap=True, markup=False)
+    return found.exit_code

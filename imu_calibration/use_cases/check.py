@@ -1,0 +1,85 @@
+"""From a recording and a calibration to the answer whether it helps there."""
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import Unpack
+
+from imu_calibration import files
+from imu_calibration.calibration.check import CheckResult, check_on_table
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.errors import InputError
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
+from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
+from imu_calibration.use_cases.stand import Stand, table_of
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """What checking gave: prints the answer."""
+
+    result: CheckResult
+    """The proof."""
+    notes: tuple[str, ...] = ()
+    """What should be known beside it."""
+
+    @property
+    def proof(self) -> dict:
+        """Sensor -> error before and after, interval of their ratio, on how much, by what the IMU does."""
+        return self.result.proof
+
+    @property
+    def helps(self) -> bool:
+        """Whether the recording shows that the calibration helps, and harms in no motion."""
+        return self.result.helps
+
+    @property
+    def exit_code(self) -> int:
+        """0 it helps, 3 it does not or cannot be told."""
+        return 0 if self.helps else 3
+
+    def __str__(self):
+        answer = 'it helps' if self.helps else 'it is not shown to help'
+        return '\n'.join([answer, *(f'  {line}' for line in (*self.result.lines, *self.notes))])
+
+    __repr__ = __str__
+
+
+def check(recording: str | PathLike | SampleBlock, calibration: Calibration | str | PathLike, table: Stand | None = None,
+          **choices: Unpack[Choices]) -> Checked:
+    """
+    Say whether a calibration helps on a recording: the error before and after, by sensor and by what the IMU does.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+        A bag, or samples in memory, of the IMU that was calibrated.
+    calibration : Calibration or path-like
+    table : path-like, Table or Arm, optional
+        The reference of this recording; it need not be the one of the calibration.
+    choices
+        See `Choices`; those of topics and windows count.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When the recording cannot be used, or is of an IMU that is not on the table.
+
+    """
+    check_names(choices)
+    calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    options, topics = calibration_options(choices), topics_of(choices)
+    if table is None:
+        raise InputError('a calibration must be checked against a reference, none came; give the description of the table', key='table')
+    if not isinstance(recording, SampleBlock):
+        open_bag(recording, topics, want_joints=True).close()
+    table = table_of(table, [recording], topics, choices.get('gravity'))
+    source = source_of(recording, topics, table.joint_names)
+    return Checked(check_on_table([source], table, calibration, options, names=[name_of(recording)]), _notes(recording, calibration))
+
+
+def _notes(recording, calibration):
+    """Return a note when the calibration was made from this very recording."""
+    made_from = {bag.get('sha256') for bag in calibration.provenance.get('bags') or () if isinstance(bag, dict)}
+    here = provenance_of([recording], {})['bags'][0]['sha256']
+    return ('it was made from this very recording: what helps here need not help elsewhere',) if here in made_from else ()

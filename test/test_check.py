@@ -1,0 +1,71 @@
+"""``imu_calibration check``: does this file help on that recording?"""
+
+from dataclasses import replace
+
+import pytest
+
+from imu_calibration.calibration.check import CheckResult
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.cli.main import main
+from imu_calibration.documents import to_text
+from imu_calibration.reference.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.check import check
+
+from worlds.misfit_worlds import make_pair
+from worlds.physics import write_bag
+
+
+@pytest.fixture(scope='module')
+def pair():
+    return make_pair(None, 1)
+
+
+@pytest.fixture(scope='module')
+def calibrated(pair):
+    return calibrate(pair.first.block, Table.from_mapping(pair.table))
+
+
+def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
+    found = check(pair.second.block, calibrated.calibration, Table.from_mapping(pair.table))
+    assert found.helps and found.exit_code == 0 and str(found).startswith('it helps\n')
+    assert all(part['after'] < 0.6 * part['before'] for entry in found.proof.values() for part in entry['regimes'].values())
+
+
+def test_a_file_of_another_imu_does_not_help(pair, calibrated):
+    other = make_pair(None, 4)
+    found = check(other.second.block, calibrated.calibration, Table.from_mapping(other.table))
+    assert not found.helps and found.exit_code == 3 and str(found).startswith('it is not shown to help\n')
+
+
+def test_a_bias_that_moved_is_named(pair, calibrated):
+    imu = pair.second.imu
+    moved = replace(pair.second.block, imu=replace(imu, rate_s=imu.rate_s + 0.02))
+    found = check(moved, calibrated.calibration, Table.from_mapping(pair.table))
+    assert not found.helps and 'most likely the bias has moved' in found.result.lines[0]
+
+
+def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
+    table = Table.from_mapping(pair.table)
+    assert check(pair.first.block, calibrated.calibration, table).notes and not check(pair.second.block, calibrated.calibration, table).notes
+
+
+def test_nothing_to_judge_on_is_no_proof():
+    assert not CheckResult({}).helps and 'cannot be told' in CheckResult({}).lines[0]
+
+
+def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path, pair, calibrated):
+    bag, table, file = (str(tmp_path / name) for name in ('bag', 'table.yaml', 'calibration.yaml'))
+    write_bag(pair.second, bag)
+    (tmp_path / 'table.yaml').write_text(to_text(pair.table))
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibrated.calibration))
+    assert main(['check', bag, '--calibration', file, '--table', table]) == 0
+    out = capsys.readouterr().out
+    assert 'fast turns' in out and 'it helps' in out
+    spoiled = calibrated.calibration.values.copy()
+    spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.05
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(replace(calibrated.calibration, values=spoiled)))
+    assert main(['check', bag, '--calibration', file, '--table', table]) == 3
+    assert 'it is not shown to help' in capsys.readouterr().out
+    assert main(['check', bag, '--calibration', file]) == 1
+    assert '--table' in capsys.readouterr().err
