@@ -8,6 +8,7 @@ import numpy as np
 import rclpy
 from rclpy.node import Node
 
+from imu_calibration import files
 from imu_calibration.errors import InputError
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
@@ -50,19 +51,23 @@ class BagPlayerNode(Node):
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
         self._playback = Playback(self, self._players, self._batches(first), pace, first, self._players, self._ended)
+        self.failed = self._is_over = False
         self._playback.start()
+        self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: {", ".join(self._topics)}')
 
     def close(self):
         """Stop publishing and close the files."""
         self._playback.end()
         self._bag.close()
+        if not self._is_over:
+            self.get_logger().info(f'stopped after {self._playback.n_published} messages')
 
     def _open(self):
         path = self.settings.bag
         if not path:
             raise InputError("parameter 'bag' must name a rosbag2 recording, none was given; start with --ros-args -p bag:=/path/to/bag")
         try:
-            return Rosbag2(path)
+            return Rosbag2(files.user_path(path))
         except Exception as error:   # rosbag2 files raise many kinds
             raise InputError(f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())}; check the path') from error
 
@@ -106,7 +111,8 @@ class BagPlayerNode(Node):
                 return
 
     def _ended(self, error):
-        if error is not None and rclpy.ok():
+        self._is_over, self.failed = True, error is not None and rclpy.ok()
+        if self.failed:
             self.get_logger().error(f'stopped playing: {type(error).__name__}: {error}')
         elif error is None:
             self.get_logger().info(f'played {self._playback.n_published} messages')

@@ -24,7 +24,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     Parameters
     ----------
     make_node : callable
-        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed.
+        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed;
+        an attribute `failed` says whether it ended because it could not go on, and has said so.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
     spin : callable, optional
@@ -66,7 +67,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
             return _failed(f'the node cannot go on: {shortened(f"{type(error).__name__}: {error}", 300)}')
     finally:
         _end(node)
-    return 0
+    return int(getattr(node, 'failed', False))
 
 
 def _failed(line: str) -> int:

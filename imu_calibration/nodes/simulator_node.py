@@ -74,6 +74,10 @@ class SimulatorSettings:
                                         (0, 100), 'the first messages are missed')
 
 
+NO_PROFILE = ('', 'none')
+"""Values of `profile` that leave the table at rest."""
+
+
 class SimulatorNode(Node):
     """Publishes what a LiveSimulation makes."""
 
@@ -94,16 +98,21 @@ class SimulatorNode(Node):
         pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
         self._playback = Playback(self, publishers, self._batches(), pace, start_ns, publishers[:1], self._ended)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._follow, 10)
+        self.failed = self._is_over = False
         self._playback.start()
+        moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
+        self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, {settings.time_factor:g} times as fast as real time')
 
     def close(self):
         """Stop publishing."""
         self._playback.end()
+        if not self._is_over:
+            self.get_logger().info(f'stopped after {self._playback.n_published} messages')
 
     def _make_table(self):
         settings = self.settings
         table = files.read_table(Path(settings.table_file or config_file('table_three_axis.yaml')).expanduser())
-        if settings.profile in ('', 'none'):
+        if settings.profile in NO_PROFILE:
             return table, TableMotion(None, len(table.joint_names))
         profile = make_profile(settings.profile, settings.seed, table)
         if profile.table is not None:
@@ -182,7 +191,8 @@ class SimulatorNode(Node):
             self.get_logger().warning(f'{error}; the trajectory is not followed')
 
     def _ended(self, error):
-        if error is not None and rclpy.ok():
+        self._is_over, self.failed = True, error is not None and rclpy.ok()
+        if self.failed:
             self.get_logger().error(f'stopped publishing: {type(error).__name__}: {error}')
         elif error is None:
             self.get_logger().info(f'the profile has ended, {self._playback.n_published} messages were published')

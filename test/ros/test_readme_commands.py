@@ -1,0 +1,148 @@
+"""Every `ros2` command of the README, as it is printed, from where the README puts the user: ~/ws with the package built in it."""
+
+import os
+import re
+import signal
+import subprocess
+import time
+
+import pytest
+
+from imu_calibration.calibration.document import calibration_to_text
+
+from worlds.compensation_cases import random_calibration
+
+pytest.importorskip('rclpy')
+from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
+from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.dds]
+PATIENCE = 90.0
+ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'started anew',
+           'param describe': 'Fixed|settling', 'param set': 'Set parameter successful', 'topic echo /diagnostics': 'name: .*calibration_node: streams'}
+"""Beginnings of questions -> what stands in the answer."""
+
+
+def commands():
+    """Every command of the README's fenced blocks that calls ros2, its lines joined, without comments."""
+    blocks = re.findall(r'^```\w*\n(.*?)^```', (ROOT / 'README.md').read_text(), re.DOTALL | re.MULTILINE)
+    lines = '\n'.join(blocks).replace('\\\n', ' ').splitlines()
+    return [re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line]
+
+
+def starts(command):
+    """Whether a command runs until it is ended."""
+    return command.startswith(('ros2 run', 'ros2 launch'))
+
+
+def nodes_of(command):
+    """Names of the nodes that a command starts."""
+    which = command.split()[3].removesuffix('.launch.py')
+    return {'demo': ['simulator_node', 'calibration_node', 'compensator_node'], 'calibrate': ['calibration_node'],
+            'compensate': ['compensator_node']}.get(which, [which])
+
+
+@pytest.fixture(scope='module')
+def home(tmp_path_factory):
+    """(A home folder with ws in it, the environment of its shells)."""
+    folder = tmp_path_factory.mktemp('home')
+    environment = with_ros2(tmp_path_factory.mktemp('ros2')) | STAY_LOCAL | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    build(folder / 'ws')
+    (folder / 'ws' / 'calibration.yaml').write_text(calibration_to_text(random_calibration(1)))
+    return folder, environment
+
+
+class Terminal:
+    """A shell that runs one command; leaving it is Ctrl-C."""
+
+    def __init__(self, home, command, domain_id):
+        folder, environment = home
+        self.command, self.log = command, folder / f'terminal_{time.monotonic_ns()}.txt'
+        with open(self.log, 'wb') as stream:
+            self.process = subprocess.Popen(sourced(folder / 'ws', command), cwd=folder / 'ws', stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
+                                            env=environment | {'ROS_DOMAIN_ID': str(domain_id)}, start_new_session=True)
+
+    def shown(self):
+        """What stands on it."""
+        return self.log.read_text(errors='replace')
+
+    def wait(self, *patterns, patience=PATIENCE):
+        """Wait until all patterns stand on it."""
+        end = time.monotonic() + patience
+        while missing := [pattern for pattern in patterns if not re.search(pattern, self.shown())]:
+            assert self.process.poll() is None and time.monotonic() < end, f'{self.command}\nshows no {missing}, but\n{self.shown()}'
+            time.sleep(0.1)
+
+    def interrupt(self):
+        """Press Ctrl-C; return the exit code."""
+        try:
+            os.killpg(self.process.pid, signal.SIGINT)
+            return self.process.wait(30)
+        except (subprocess.TimeoutExpired, ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+            return self.process.wait()
+
+
+@pytest.fixture
+def terminals(home):
+    """Opens terminals of one domain."""
+    domain_id, lock = free_domain()
+    opened = []
+
+    def open_one(command):
+        opened.append(Terminal(home, command, domain_id))
+        return opened[-1]
+    yield open_one
+    for terminal in opened:
+        if terminal.process.poll() is None:
+            terminal.interrupt()
+    subprocess.run(sourced(home[0] / 'ws', 'ros2 daemon stop'), cwd=home[0], env=home[1] | {'ROS_DOMAIN_ID': str(domain_id)}, capture_output=True, timeout=60)
+    lock.close()
+
+
+STARTING = [command for command in commands() if starts(command)]
+THREE = STARTING[:3]
+
+
+def test_the_readme_has_commands_and_asks_of_each_kind():
+    assert len(STARTING) >= 10 and [nodes_of(command)[0] for command in THREE] == ['simulator_node', 'calibration_node', 'compensator_node']
+    asked = [command for command in commands() if not starts(command)]
+    assert asked and all(any(key in command for key in ANSWERS) for command in asked), asked
+
+
+def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
+    simulator, calibrator, compensator = map(terminals, THREE)
+    calibrator.wait('Imu messages come on /imu/data_raw from /simulator_node', 'JointState messages come', 'first window gathered')
+    for command in commands():
+        if starts(command):
+            continue
+        asked = terminals(command)
+        pattern = next(pattern for key, pattern in ANSWERS.items() if key in command)
+        if 'echo' in command:
+            asked.wait(pattern)
+            asked.interrupt()
+        else:
+            assert asked.process.wait(PATIENCE) == 0, asked.shown()
+            assert re.search(pattern, asked.shown()), f'{command}\n{asked.shown()}'
+    compensator.wait('calibration [0-9a-f]{12} from topic /imu/calibration|was refused')
+    assert 'verdict: ' in (home[0] / 'ws' / 'calibration.yaml').read_text()
+    for terminal in (simulator, calibrator, compensator):
+        assert terminal.interrupt() == 0, terminal.shown()
+        assert 'Traceback' not in terminal.shown(), terminal.shown()
+
+
+@pytest.mark.parametrize('command', STARTING[3:])
+def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
+    terminal = terminals(command)
+    terminal.wait(*(rf'\[{name}\]: ' for name in nodes_of(command)))
+    if 'none' in command or 'gravity' in command:
+        terminal.wait('calibrates by hand')
+    elif 'calibration_node --' in command:
+        terminal.wait('calibrates on the table /.*/table_three_axis.yaml with the joints outer, middle, inner')
+    elif 'calibration.yaml' in command:
+        terminal.wait('calibration [0-9a-f]{12} from .*taken over')
+    elif 'bag_player' in command:
+        terminal.wait('plays /.*/sample_session at 10 times its speed: .*/imu/data_raw')
+    code = terminal.interrupt()
+    assert code == 0, f'{code}\n{terminal.shown()}'
+    assert 'Traceback' not in terminal.shown() and 'unknown and ignored' not in terminal.shown(), terminal.shown()
