@@ -5,6 +5,7 @@ import os
 import zlib
 from contextlib import contextmanager, suppress
 from errno import EISDIR
+from itertools import count
 from pathlib import Path
 from stat import S_ISDIR
 
@@ -186,6 +187,25 @@ def try_place(path):
         with suppress(FileNotFoundError):
             if S_ISDIR(os.stat(path).st_mode):
                 raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+
+
+def put_aside(path):
+    """
+    Rename a file to the first of NAME.1, NAME.2, ... that is free, and return that.
+
+    Raises
+    ------
+    InputError
+        When it cannot be renamed.
+
+    """
+    path = Path(path)
+    free = next(path.with_name(f'{path.name}.{number}') for number in count(1) if not path.with_name(f'{path.name}.{number}').exists())
+    try:
+        os.rename(path, free)
+    except OSError as error:
+        raise InputError(f'{path} must be movable to {free.name}: {_why(error)}; move it away') from error
+    return free
 
 
 @contextmanager

@@ -62,3 +62,5 @@ def test_other_programs_keep_their_interrupt(monkeypatch):
     assert done.returncode == 0 and not is_node_process()
     monkeypatch.setattr(sys, 'argv', ['/opt/ros/lib/imu_calibration/calibration_node', '--ros-args'])
     assert is_node_process()
+    monkeypatch.setattr(sys, 'argv', ['/home/me/ws/install/mine/lib/mine/my_node'])
+    assert not is_node_process()

@@ -112,6 +112,11 @@ class LiveByHand:
         return len(self.found.rests)
 
     @property
+    def stamping(self):
+        """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
+        return self._check.line
+
+    @property
     def counts(self):
         """Samples that could not be used, by reason."""
         counts = dict(self._drops)

@@ -99,6 +99,11 @@ class LiveCalibration:
         return dict(self._collector.gathered.counts)
 
     @property
+    def stamping(self):
+        """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
+        return self._collector and self._collector.gatherer.cleaner.stamping
+
+    @property
     def needs_temperature(self):
         """Whether an effect that was asked for depends on temperature."""
         return self._asked.needs_temperature

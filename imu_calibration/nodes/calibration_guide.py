@@ -7,6 +7,7 @@ from imu_calibration.diagnosis import live as diagnosis
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.complaints import INFO, WARNING
 from imu_calibration.nodes.inputs import MatchedInput
+from imu_calibration.segmentation.stamping import COUNTED, REGULAR
 
 PATIENCE = 5.0
 """Seconds between two pieces of advice; what helps most may change with every solution."""
@@ -33,6 +34,7 @@ class CalibrationGuide:
     def __init__(self, inputs: Mapping[str, MatchedInput], save_command: str, noun: str, clock: Callable[[], float] = time.monotonic):
         self._inputs, self._save_command, self._noun, self._clock = inputs, save_command, noun, clock
         self._coming: set[str] = set()
+        self._stamping = ''
         self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = 0, '', '', float('-inf'), ''
 
     def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
@@ -50,6 +52,11 @@ class CalibrationGuide:
         for name in sorted(coming - self._coming):
             yield INFO, f'{KINDS[name]} messages come on {self._inputs[name].source()}'
         self._coming = coming
+        line = None if state.streams is None else state.streams.stamping
+        if line is not None and line.word != self._stamping:
+            if line.word == COUNTED or (line.word == REGULAR and self._stamping):
+                yield INFO, f'Imu: {line}'
+            self._stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         if state.verdict == self._verdict:

@@ -20,6 +20,7 @@ from imu_calibration import files
 from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, Listeners
@@ -81,8 +82,8 @@ class CalibrationNodeSettings:
 class CalibrationNode(Node):
     """Listens, and tells what the worker finds."""
 
-    def __init__(self) -> None:
-        super().__init__('calibration_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('calibration_node', **options)
         self.settings = declare_parameters(self, CalibrationNodeSettings)
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
@@ -137,7 +138,12 @@ class CalibrationNode(Node):
         return LiveCalibration(self._table, self._options, self._live_settings, saved)
 
     def _resumed(self, place: SessionFiles) -> LiveCalibration | LiveByHand:
-        live = self._make_live(place.earlier())
+        try:
+            live = self._make_live(place.earlier())
+        except ImuCalibrationError as error:
+            kept = place.put_aside()   # a save would write over it
+            say(self.get_logger(), ERROR, f'cannot go on where it was saved: {error}; starts anew, the earlier motion is kept in {kept}')
+            return self._make_live()
         self.get_logger().info(f'goes on with {live.n_windows} {"poses" if self._table is None else "windows"} from {place.accumulator}'
                                if live.n_windows else f'nothing to go on with in {place.accumulator}: starts anew')
         return live
@@ -189,7 +195,7 @@ class CalibrationNode(Node):
         """Return the diagnostics, and say on the terminal what has changed."""
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
-        silent = [] if state.streams is None else [self._inputs[name].silence() for name in state.streams.silent]
+        silent = [] if state.streams is None else [self._inputs[name].silence(state.streams.unusable.get(name, '')) for name in state.streams.silent]
         if self._table is None and self.count_publishers(self.resolve_topic_name('joint_states')):
             about_topics.append("joint states are published and not listened to: to calibrate on a table give 'table_file'")
         trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []

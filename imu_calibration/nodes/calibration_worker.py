@@ -263,6 +263,7 @@ class CalibrationWorker(threading.Thread):
     def _tell(self) -> None:
         now, counts = time.monotonic(), self.live.counts
         self._watch.note_counts(counts, now)
+        self._watch.note_stamping(self.live.stamping)
         result = self.live.result
         verdict, lines = ('', []) if result is None else summary(result, self.hints)
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),

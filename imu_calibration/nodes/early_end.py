@@ -4,6 +4,9 @@ import os
 import signal
 import sys
 
+NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+"""Executables of this package; the nodes of other packages that import it keep their own interrupt."""
+
 
 def end_quietly_while_importing():
     """Let SIGINT end the process with exit code 0 until `lifecycle.run_node` takes over; does nothing in other programs."""
@@ -16,4 +19,4 @@ def is_node_process():
     """Return whether this process was started to run one of the nodes, by its executable or by ``python -m``."""
     if sys.argv[:1] == ['-m']:
         return any(argument.startswith('imu_calibration.nodes.') for argument in sys.orig_argv)
-    return bool(sys.argv) and os.path.basename(sys.argv[0]).endswith('_node')
+    return bool(sys.argv) and os.path.basename(sys.argv[0]) in NAMES

@@ -111,8 +111,10 @@ class MatchedInput:
         return f'{self.topic_name} from {", ".join(sorted(set(self.names()))) or "an unknown node"}, ' + (
             'reliable' if self.reliable else 'best effort')
 
-    def silence(self) -> str:
-        """Return why nothing may come on the topic, and which other topic there is."""
+    def silence(self, unusable: str = '') -> str:
+        """Return why nothing may come on the topic, and which other topic there is; `unusable` says what was dropped of what does come."""
+        if unusable:
+            return f'nothing on {self.topic_name} can be used: {unusable}'
         what = f'nothing comes on {self.topic_name} ({self.type_name})'
         if self.publishers:
             return f'{what}: {", ".join(sorted(set(self.names())))} publishes it and sends nothing'

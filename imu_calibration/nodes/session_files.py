@@ -1,5 +1,6 @@
 """Where a live session is kept: the calibration, and beside it the accumulator with which it can go on."""
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +52,19 @@ class SessionFiles:
             When there is one that cannot be read.
 
         """
-        return files.read_bytes(self.accumulator, 'accumulator') if self.accumulator.is_file() else None
+        return files.read_bytes(self.accumulator, 'accumulator') if os.path.isfile(self.accumulator) else None
+
+    def put_aside(self) -> Path:
+        """
+        Give the accumulator of an earlier session another name, so that nothing is written over it; return that.
+
+        Raises
+        ------
+        InputError
+            When that cannot be done.
+
+        """
+        return files.put_aside(self.accumulator)
 
     def unsaved(self, live: Any) -> int:
         """Return how many windows or poses of a session are in no file yet."""
@@ -75,7 +88,7 @@ class SessionFiles:
         wanted: list[tuple[Path, Callable[[], bytes]]] = [] if text is None else [(self.calibration, text.encode)]
         done, failed = [], []
         for path, make in [*wanted, (self.accumulator, lambda: live.saved(pending=True))]:
-            existed = path.exists()
+            existed = os.path.exists(path)   # False where the path cannot even be
             try:
                 files.write_whole(path, make())
                 done.append(str(path))

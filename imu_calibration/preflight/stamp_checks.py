@@ -1,9 +1,9 @@
 """Checks of the stamps: what was dropped, gaps, rates, clocks."""
 
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
+from imu_calibration.segmentation.block_cleaning import MESSAGES as NAMES
+from imu_calibration.segmentation.stamping import IRREGULAR
 
-NAMES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
-"""Stream -> what people call it."""
 FAST = ('imu', 'joints')
 WHOLE_MS = 1_000_000
 ADVICE = {
@@ -32,6 +32,9 @@ def stamps(evidence):
             yield CheckFinding('stamps', REFUSE, f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
                           f'({reasons}); correct the driver and record again')
             continue
+        if found.unstamped:
+            yield CheckFinding('stamps', WARNING, f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero, the driver sets none: the time of arrival '
+                               'is taken; let the driver stamp each sample when it is measured')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
             yield CheckFinding('stamps', severity, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
@@ -79,6 +82,9 @@ def jitter(evidence):
     for name in FAST:
         if name in evidence.streams:
             stream = evidence.streams[name]
+            if (line := stream.statistics.stamping) is not None:
+                yield CheckFinding('jitter', WARNING if line.word == IRREGULAR else NOTE, f"{NAMES[name]}: {line}; stamps by the sensor's own clock "
+                                   'would be better')
             period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
             whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0 and step_ns < 0.5e9 * period
             if not whole_ms and stream.irregular <= IRREGULAR_SHARE:

@@ -1,8 +1,10 @@
 """How the streams of a live session are doing, by header stamps: rates, silence, what is being dropped."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
+from imu_calibration.segmentation.block_cleaning import MESSAGES
+from imu_calibration.segmentation.stamping import IRREGULAR, StampLine
 from imu_calibration.segmentation.window_cutter import dropped
 
 SILENT_AFTER = 2.0
@@ -11,7 +13,6 @@ RECENT = 10.0
 """Seconds for which a loss is called recent."""
 COLD_AFTER = 10.0
 """The same for temperatures, of which one per second is usual."""
-_MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 
 
 class StreamHealth(StrEnum):
@@ -41,6 +42,10 @@ class StreamState:
     """Streams that are needed and do not come: 'imu', 'joints', 'temperature'."""
     coming: tuple = ()
     """Streams that come."""
+    unusable: dict = field(default_factory=dict)
+    """Why nothing of a silent stream can be used although messages come: stream -> what was dropped."""
+    stamping: StampLine | None = None
+    """How the stamps of the IMU are; None while that is not known."""
 
 
 class StreamWatch:
@@ -61,6 +66,7 @@ class StreamWatch:
         self._arrived = {}
         self._period = {}
         self._lost, self._lost_at, self._recent, self._apart_since = {}, None, {}, None
+        self._stamping, self._unstamped_at, self._notes = None, None, {}
 
     @property
     def last_arrival(self):
@@ -74,6 +80,8 @@ class StreamWatch:
 
     def note(self, block, now):
         """Take a SampleBlock that arrived at `now`, s of a steady clock."""
+        for reason, count in (block.notes or {}).items():
+            self._notes[reason], self._unstamped_at = self._notes.get(reason, 0) + count, now
         for name in self._count:
             samples = getattr(block, name)
             if samples is None or not len(samples):
@@ -92,6 +100,10 @@ class StreamWatch:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
+    def note_stamping(self, line):
+        """Take how the stamps of the IMU are (a StampLine), or None."""
+        self._stamping = line
+
     def _apart_for(self, lead, now):
         """Return for how long the stamps of the streams have been apart, s; a fast replay sets them apart for moments."""
         if abs(lead) <= SILENT_AFTER:
@@ -105,19 +117,32 @@ class StreamWatch:
         values = {f'{name} messages': count for name, count in self._count.items()}
         values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
+        values |= self._notes | ({'imu stamps': str(self._stamping)} if self._stamping else {})
         silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
         coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
-        return StreamState(*self._word(silent, now), values, silent, coming)
+        unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
+        return StreamState(*self._word(silent, now), values, silent, coming, {name: what for name, what in unusable.items() if what},
+                           self._stamping)
+
+    def _recently(self, now, beginning=''):
+        """Return what was dropped lately, of the reasons with that beginning; '' for nothing."""
+        if self._lost_at is None or now - self._lost_at >= RECENT:
+            return ''
+        return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
 
     def _word(self, silent, now):
         """Return the word and the line that say how the streams are."""
         if silent:
             none = len(silent) == len(self._needed)
-            return SILENT if none else TROUBLE, f'no {" and no ".join(_MESSAGES[name] for name in silent)} messages come' + (
+            return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages come' + (
                 '' if none else ', nothing can be used meanwhile')
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
         if self._apart_for(lead, now) > SILENT_AFTER:
             return TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; bring the clocks together'
-        if self._lost_at is not None and now - self._lost_at < RECENT:
-            return TROUBLE, 'dropped lately: ' + ', '.join(f'{count} {reason}' for reason, count in self._recent.items())
-        return GOOD, f'{" and ".join(_MESSAGES[name] for name in self._needed)} messages come'
+        if self._stamping is not None and self._stamping.word == IRREGULAR:
+            return TROUBLE, f"{self._stamping}: when each sample was taken cannot be told; let the driver stamp by the sensor's clock"
+        if self._unstamped_at is not None and now - self._unstamped_at < RECENT:
+            return TROUBLE, f'{", ".join(f"{count} {reason}" for reason, count in self._notes.items())}: the driver sets none, the time of arrival is taken'
+        if recently := self._recently(now):
+            return TROUBLE, f'dropped lately: {recently}'
+        return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

@@ -1,14 +1,17 @@
 """Blocks of a recording or of live topics, cleaned once for everybody who looks at them: checks, windows, statistics of the streams."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.segmentation.stamping import StampLine
 from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStatistics
 
 STREAMS = ('imu', 'joints', 'temperature')
+MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
+"""Stream -> what people call its messages; reasons for which one was lost begin with that."""
 BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
 _KINDS: dict[str, type[ImuSamples | JointSamples | TemperatureSamples]] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
@@ -61,6 +64,8 @@ class BlockCleaner:
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: dict[str, int] = {}
         """Messages that could not be turned into samples: reason -> count."""
+        self.notes: dict[str, int] = {}
+        """Messages that were used in another way than they came: reason -> count."""
 
     @property
     def n_buffered(self) -> int:
@@ -80,7 +85,12 @@ class BlockCleaner:
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
         """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
         self._clean()
-        return {name: check.statistics(gap) for name, check in self._checks.items()}
+        return {name: replace(check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0)) for name, check in self._checks.items()}
+
+    @property
+    def stamping(self) -> StampLine | None:
+        """How the stamps of the IMU are; None while too few came to tell."""
+        return self._checks['imu'].line
 
     def push(self, block: SampleBlock) -> CleanedBlock:
         """
@@ -92,8 +102,9 @@ class BlockCleaner:
             When the joints of the block are not those that were asked for.
 
         """
-        for reason, count in (block.dropped or {}).items():
-            self.lost[reason] = self.lost.get(reason, 0) + count
+        for found, total in ((block.dropped, self.lost), (block.notes, self.notes)):
+            for reason, count in (found or {}).items():
+                total[reason] = total.get(reason, 0) + count
         for name in STREAMS:
             samples = getattr(block, name)
             if samples is not None and len(samples):

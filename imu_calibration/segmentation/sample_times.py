@@ -5,8 +5,19 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.counted_clock import BLOCK, CountedClock
-from imu_calibration.segmentation.stamping import COUNTED, EARLY, IRREGULAR_SHARE, LAG, LATE, LEAST, StampLine, describe_stamps
+from imu_calibration.segmentation.counted_clock import BLOCK, FOLLOW, CountedClock
+from imu_calibration.segmentation.stamping import (
+    COUNTED,
+    EARLY,
+    IRREGULAR,
+    IRREGULAR_SHARE,
+    LAG,
+    LATE,
+    LEAST,
+    Stamping,
+    StampLine,
+    describe_stamps,
+)
 
 RARE = 4
 """Stamps that are counted are looked at again after so many blocks."""
@@ -25,8 +36,9 @@ class SampleTimes:
     def __init__(self) -> None:
         self.line: StampLine | None = None
         """How the stamps are, as far as that is known."""
-        self.n_rebuilt = self.n_repeated = 0
-        """Samples with a time of their own; repeated messages."""
+        self.n_rebuilt = self.n_irregular = self.n_repeated = 0
+        """Samples with a time of their own; samples whose stamps follow no clock; repeated messages."""
+        self._odd_lines: dict[Stamping, StampLine] = {}
         self._last: Any = None
         self._begin()
 
@@ -101,6 +113,7 @@ class SampleTimes:
         """Hand on what is held and a further part, as they are or through the clock."""
         if self._clock is None:
             held, self._held = self._held, None
+            self.n_irregular += len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
             return [held, part]
         if part is not None:
             self._clock.push(part.stamp_ns)
@@ -116,6 +129,11 @@ class SampleTimes:
         self.n_rebuilt += len(times)
         return [ImuSamples(times, timed.force_s, timed.rate_s, timed.frame_id)]
 
+    def odd_line(self, count: int) -> StampLine | None:
+        """Return how the stamps were where they were not regular, when that concerns more than a few of `count` samples."""
+        number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
+        return self._odd_lines.get(word) if number > IRREGULAR_SHARE * count else None
+
     def _odd(self) -> bool:
         """Return whether the steps of the last block are not those of the clock that is known."""
         if self.line is None:
@@ -128,16 +146,20 @@ class SampleTimes:
         """Count from now on, or no longer, as the stamps are; return what becomes ready by that."""
         if line is None:
             return []
-        counting, self.line = self._clock is not None, line
-        if (line.word == COUNTED) == counting:
+        before, self.line = self.line, line
+        self._odd_lines[line.word] = line
+        changed = before is not None and abs(line.period_ns - before.period_ns) > FOLLOW * before.period_ns
+        if (line.word == COUNTED) == (self._clock is not None) and not (changed and self._clock is not None):
             return []
-        if counting:
+        ready = []
+        if self._clock is not None:
             ready, self._clock = self._counted(final=True), None
-            return ready
+            if line.word != COUNTED:
+                return ready
         self._clock = CountedClock(line)
         if self._held is not None:
             self._clock.push(self._held.stamp_ns)
-        return []
+        return ready
 
 
 def _joined(parts: list) -> ImuSamples | None:

@@ -100,8 +100,9 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     period = float(step.mean())
     apart = (stamp_ns[LAG:] - stamp_ns[:-LAG]).astype(float)
     apart = apart[np.abs(apart - LAG * period) <= PAUSE_NS]
+    apart = _without_losses(apart, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
     if period > 0 and len(apart) and apart.var() <= DRIFTING * step.var():
-        line = _line(stamp_ns, step, apart / LAG, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
+        line = _line(stamp_ns, step, float(apart.mean()) / LAG)
         if line.period_ns >= 1.0:
             return line
     # Where more than half of the samples are lost the usual step is two periods.
@@ -126,11 +127,14 @@ def regular_share(step: np.ndarray, period: float) -> float:
     return 0.0 if lost > MOST_LOST * len(step) else float(good.mean())
 
 
-def _line(stamp_ns: np.ndarray, step: np.ndarray, apart: np.ndarray, resolution: float) -> StampLine:
+def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
+    """Return the distances across `LAG` steps but for those that hold lost samples or a pause."""
+    off = np.abs(apart - np.median(apart)) if len(apart) else apart
+    return apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution] if len(apart) else apart
+
+
+def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     """Return the line of stamps that stay near one: through the earliest of them when they are times of arrival, else through their middle."""
-    off = np.abs(apart - np.median(apart))
-    usual = off <= 3 * np.median(off) + (0.5 * np.median(apart) + resolution) / LAG   # without lost samples and pauses
-    period = float(apart[usual].mean())
     number = np.arange(len(stamp_ns))
     residual = (stamp_ns - stamp_ns[0]) - period * number
     residual = residual - np.polynomial.Polynomial.fit(number, residual, 1)(number)

@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.segmentation.sample_times import SampleTimes
 from imu_calibration.segmentation.spike_filter import SpikeFilter
+from imu_calibration.segmentation.stamping import StampLine
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -68,7 +69,8 @@ class StreamCheck:
         """
         period = self._steps.median()
         return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, period, self._steps.common_step_ns,
-                                *self._steps.longer_than(max(gap, 5 * period)))
+                                *self._steps.longer_than(max(gap, 5 * period)),
+                                None if self._times is None else self._times.odd_line(self._n_accepted))
 
     def _without_spikes(self, accepted, ended=False):
         """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
@@ -199,6 +201,10 @@ class StreamStatistics:
     """Their total length, s."""
     longest_step: float
     """Longest step between stamps, a gap or not, s."""
+    stamping: StampLine | None = None
+    """How the stamps of an IMU came; None where they are regular, and for other streams."""
+    unstamped: int = 0
+    """Samples whose stamp was zero, so that the time of arrival was taken."""
 
     @property
     def rate(self):

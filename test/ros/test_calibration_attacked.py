@@ -1,0 +1,186 @@
+"""calibration_node against bad places, bad streams and bad luck: it says what is wrong, answers, and keeps what was gathered."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.document import calibration_from_text
+from msg_adapters.encode import encode_imu, encode_joints, rows
+
+from worlds.live_sessions import make_session
+
+pytest.importorskip('rclpy')
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import Imu, JointState  # noqa: E402
+
+from imu_calibration.nodes import calibration_node  # noqa: E402
+from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
+from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
+
+from ros.live_station import TABLE  # noqa: E402
+from ros.one_process import OneProcess  # noqa: E402
+
+pytestmark = pytest.mark.dds
+OK, WARN, ERROR = range(3)
+CALIBRATION, STREAMS = 'calibration_node: calibration', 'calibration_node: streams'
+
+
+@pytest.fixture(scope='module')
+def session():
+    """IMU and joints of half a minute at 50 Hz: enough for a few windows."""
+    return make_session(3, 50.0, seconds=30.0)[:2]
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Nodes in this process."""
+    monkeypatch.setattr(calibration_node, 'PATIENCE', 0.5)
+    made = OneProcess(monkeypatch)
+    yield made
+    made.close()
+
+
+def start(bench, folder, **parameters):
+    """A node on the table that saves into `folder`."""
+    return bench.start(CalibrationNode, {'table_file': str(TABLE), 'save_file': str(folder / 'calibration.yaml'), 'diagnosis_period': 0.0} | parameters)
+
+
+def send(bench, imu, joints, topics=('imu/data_raw', 'joint_states')):
+    """Publish samples in the order of their stamps."""
+    qos = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
+    to = [bench.node.create_publisher(kind, topic, qos) for kind, topic in zip((Imu, JointState), topics)]
+    bench.until(lambda: all(publisher.get_subscription_count() for publisher in to), 'subscriptions')
+    queue = [(k / len(samples), publisher, bytes(message)) for publisher, samples, encode in zip(to, (imu, joints), (encode_imu, encode_joints))
+             for k, message in enumerate(rows(encode(samples)))]
+    for k, (_, publisher, message) in enumerate(sorted(queue, key=lambda entry: entry[0])):
+        publisher.publish(message)
+        if k % 100 == 0:
+            bench.executor.spin_once(timeout_sec=0.005)
+    return to
+
+
+def gathered(bench, node):
+    """Wait for windows."""
+    bench.until(lambda: node.worker.state.gathered, 'windows')
+
+
+def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
+    node = start(bench, tmp_path)
+    bench.until(lambda: bench.heard('next: rest in'), 'what is missing next')
+    send(bench, *session)
+    gathered(bench, node)
+    answer = bench.call('/calibration_node/solve')
+    assert answer.success and answer.message.startswith('good (')
+    bench.until(lambda: bench.heard('verdict: good; save it with `ros2 service call /calibration_node/save std_srvs/srv/Trigger`'), 'the verdict')
+    saved = bench.call('/calibration_node/save')
+    assert saved.success and saved.message.startswith('good: every parameter is determined')
+    assert f'written: {tmp_path}/calibration.yaml and {tmp_path}/calibration.accumulator.npz' in saved.message
+    assert calibration_from_text((tmp_path / 'calibration.yaml').read_text()).verdict == saved.message.partition(':')[0]
+    assert bench.heard(f'calibrates on the table {TABLE} with the joints outer, middle, inner; ~/save writes {tmp_path}/calibration.yaml') == 1
+    for words in ('Imu messages come on /imu/data_raw from /tester, reliable', 'JointState messages come on /joint_states from /tester, reliable',
+                  'first window gathered', '~/save: '):
+        assert bench.heard(words) == 1, (words, bench.said)
+    assert bench.status[CALIBRATION].values and not bench.heard('Traceback')
+    assert bench.heard('--', 'info') == 0   # nobody at a node has options of the command line
+
+
+def test_topics_that_are_mistyped_are_told_with_the_nearest_of_the_type(bench, session, tmp_path):
+    node = start(bench, tmp_path)
+    imu, joints = ((kind, bench.node.create_publisher(kind, topic, 10)) for kind, topic in ((Imu, '/imu/data_rwa'), (JointState, '/table/joint_states')))
+    bench.until(lambda: bench.heard('nothing comes on /imu/data_raw (sensor_msgs/msg/Imu): there is /imu/data_rwa; listen to it with '
+                                    '-r imu/data_raw:=/imu/data_rwa', 'warning'), 'the nearest Imu topic')
+    bench.until(lambda: bench.heard('there is /table/joint_states', 'warning'), 'the nearest JointState topic')
+    bench.until(lambda: bench.lines().get(STREAMS, (0, ''))[0] == ERROR, 'the same on /diagnostics')
+    assert imu and joints and not node.worker.state.gathered
+
+
+@pytest.mark.parametrize('kind', ('a file as parent', 'a name too long'))
+def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(bench, session, tmp_path, kind):
+    (tmp_path / 'file').write_text('here already')
+    place = {'a file as parent': tmp_path / 'file' / 'calibration.yaml', 'a name too long': tmp_path / ('x' * 300 + '.yaml')}[kind]
+    node = start(bench, tmp_path, save_file=str(place), autosave_period=0.2)
+    bench.until(lambda: bench.heard('nothing could be saved now', 'error'), 'the place')
+    send(bench, *session)
+    gathered(bench, node)
+    answer = bench.call('/calibration_node/save')
+    assert not answer.success and 'not written: ' in answer.message and str(place) in answer.message and '\n' not in answer.message
+    bench.until(lambda: bench.lines().get(CALIBRATION, (0, ''))[0] == ERROR, 'an error on /diagnostics')
+    refused = node.set_parameters([Parameter('save_file', value=str(tmp_path / 'file' / 'again.yaml'))])[0]
+    assert not refused.successful and 'must be writable' in refused.reason
+    assert node.set_parameters([Parameter('save_file', value=str(tmp_path / 'new' / 'calibration.yaml'))])[0].successful
+    answer = bench.call('/calibration_node/save')
+    assert answer.success and (tmp_path / 'new' / 'calibration.yaml').is_file(), answer.message
+    assert (tmp_path / 'file').read_text() == 'here already'
+
+
+def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost_where_not(bench, session, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kept, lost = start(bench, tmp_path), bench.start(CalibrationNode, {'table_file': str(TABLE)}, namespace='/other')
+    send(bench, *session)
+    send(bench, *session, ('/other/imu/data_raw', '/other/joint_states'))
+    for node in (kept, lost):
+        gathered(bench, node)
+        node.close()
+    assert bench.heard(f'windows were in no file: they are kept in {tmp_path}/calibration.accumulator.npz; resume:=true goes on with them', 'warning') == 1
+    assert bench.heard("windows were in no file and are lost: call ~/save, or give parameter 'save_file'", 'warning') == 1
+    again = start(bench, tmp_path, resume=True)
+    assert again.worker.live.n_windows >= kept.worker.live.n_windows > 0   # those that were still open count as well
+    assert bench.heard(f'goes on with {again.worker.live.n_windows} windows from {tmp_path}/calibration.accumulator.npz') == 1
+    kept.close = lost.close = lambda: None
+
+
+def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_begins(bench, session, tmp_path):
+    first = start(bench, tmp_path)
+    send(bench, *session)
+    gathered(bench, first)
+    first.close()
+    first.close = lambda: None
+    other = start(bench, tmp_path, resume=True, accelerometer_model='bias+matrix+accel_quadratic')
+    assert other.worker.live.n_windows == 0 and (tmp_path / 'calibration.accumulator.npz.1').is_file()
+    assert bench.heard('must hold the columns of the model that is asked for', 'error') == 1 and bench.heard('the earlier motion is kept in', 'error') == 1
+    (tmp_path / 'calibration.accumulator.npz').write_bytes(b'damaged')
+    assert start(bench, tmp_path, resume=True).worker.live.n_windows == 0
+    assert (tmp_path / 'calibration.accumulator.npz.2').read_bytes() == b'damaged'
+
+
+def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, tmp_path):
+    node = start(bench, tmp_path)
+    live = node.worker.live
+    whole, live.push = live.push, lambda block: 1 / 0
+    send(bench, *session)
+    bench.until(lambda: bench.heard('take failed and is left out: ZeroDivisionError', 'error'), 'the fault')
+    answer = bench.call('/calibration_node/save')
+    assert not answer.success and 'nothing written' in answer.message
+    live.push = whole
+    bench.until(lambda: not node.worker.state.faults, 'that it is over')
+    send(bench, *session)
+    gathered(bench, node)
+    assert bench.call('/calibration_node/save').success
+
+
+def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
+    node = start(bench, tmp_path, setling=1.0)
+    assert "'setling' is unknown and ignored; did you mean 'settling'?" in unknown_parameters(node)[0]
+    assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
+    assert node._options.windows.settling == 2.0
+    for name, value, words in (('table_file', 'other.yaml', 'belongs to the table'), ('accelerometer_model', 'bias', 'gathered for the model')):
+        answer = node.set_parameters([Parameter(name, value=value)])[0]
+        assert not answer.successful and 'cannot be changed while the node runs' in answer.reason and words in answer.reason
+
+
+def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session, tmp_path):
+    start(bench, tmp_path)
+    imu = session[0].select(slice(0, 400))
+    silent = bench.node.create_publisher(JointState, 'joint_states', 100)
+    bench.until(silent.get_subscription_count, 'a subscription')
+    for _ in range(20):
+        silent.publish(JointState(name=['outer', 'middle', 'inner']))
+    bench.until(lambda: bench.heard('nothing on /joint_states can be used: 20 JointState without a position for every name'), 'the empty position')
+    assert not bench.heard('must name outer, middle, inner')
+    to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
+    bench.until(to.get_subscription_count, 'a subscription')
+    for message in rows(encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))):
+        to.publish(bytes(message))
+    bench.until(lambda: bench.figure(STREAMS, 'Imu zero stamp') == '400', 'the same on /diagnostics')

@@ -1,0 +1,208 @@
+"""compensator_node against bad calibrations, bad documents, bad streams: it refuses, says so, and keeps what it had."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.documents import version_of
+from imu_calibration.samples import ImuSamples
+from msg_adapters.encode import encode_imu
+
+from worlds.compensation_cases import random_calibration
+
+pytest.importorskip('rclpy')
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import Imu, Temperature  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from imu_calibration.nodes import compensator_diagnostics, inputs, relay_loop  # noqa: E402
+from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
+from imu_calibration.nodes.compensator_settings import CompensatorSettings  # noqa: E402
+from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
+from imu_calibration.nodes.qos import latched_qos  # noqa: E402
+
+from ros.one_process import OneProcess  # noqa: E402
+
+pytestmark = pytest.mark.dds
+OK, WARN, ERROR = range(3)
+PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
+GOOD, OTHER = (random_calibration(seed, verdict='good', proof=PROOF) for seed in (1, 2))
+GOOD_TEXT, OTHER_TEXT = map(calibration_to_text, (GOOD, OTHER))
+WORSE = {sensor: part | {'after': 0.2, 'ci95': [1.5, 2.5]} for sensor, part in PROOF.items()}
+MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
+STATUS = 'compensator_node: compensation'
+
+
+class Sender(Node):
+    """Another node that publishes."""
+
+    def __init__(self, **options):
+        super().__init__('sender', **options)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Nodes in this process."""
+    monkeypatch.setattr(relay_loop, 'available', lambda: False)   # the executor of the test moves everything
+    made = OneProcess(monkeypatch)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A file with a good calibration."""
+    (tmp_path / 'good.yaml').write_text(GOOD_TEXT)
+    return tmp_path / 'good.yaml'
+
+
+def damaged(before, after):
+    """The text of the other calibration with a piece replaced."""
+    assert before in OTHER_TEXT
+    return OTHER_TEXT.replace(before, after)
+
+
+REFUSED = {
+    'bad': (calibration_to_text(replace(OTHER, verdict='bad', verdict_reasons=('residuals in motion are 40 times the noise',))), 'its verdict is bad: residuals'),
+    'disproved': (calibration_to_text(replace(OTHER, proof=WORSE)), 'that it helps is not shown'),
+    'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'noise_sd'),
+    'brackets': ('[' * 200_000, 'YAML|levels'),
+    'aliases': ('a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]', 'aliases'),
+    'another sensor': (damaged('frame_id: imu_link', 'frame_id: other_link'), 'must be for the same sensor'),
+    'huge': ('a: ' + 'x' * 3_000_000, 'more than'),
+}
+
+
+def test_nothing_bad_displaces_what_is_in_force(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': str(place), 'adopt': 'topic'})
+    publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    bench.until(publisher.get_subscription_count, 'a subscription')
+    expected = [node.convert(data, {'source_timestamp': 1}) for data in MESSAGES]
+    for name, (text, words) in REFUSED.items():
+        bench.status.clear()
+        publisher.publish(String(data=text))
+        bench.until(lambda: any(word in bench.lines().get(STATUS, (0, ''))[1] for word in words.split('|')), f'the refusal of {name}')
+        level, line = bench.lines()[STATUS]
+        assert level == ERROR and f'{version_of(GOOD_TEXT)} stays' in line and '\n' not in line
+        assert bench.heard('was refused', 'error')
+        assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
+    publisher.publish(String(data=OTHER_TEXT))
+    bench.until(lambda: bench.lines()[STATUS][1].endswith('(good, proven on held-out data)'), 'the good one')
+    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (good, proven on held-out data) taken over') == 1
+    publisher.publish(String(data=OTHER_TEXT + '\n'))   # another document that says the same
+    bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT + '\n'), 'the same again')
+    assert bench.heard('taken over') == 2   # the file's and the other one's
+    assert node.set_parameters([Parameter('anyway', value=True)])[0].successful
+    publisher.publish(String(data=REFUSED['bad'][0]))
+    bench.until(lambda: node.adopted.version == version_of(REFUSED['bad'][0]), 'the bad one, since somebody insists')
+    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'its verdict is bad' in bench.lines()[STATUS][1], 'a warning all the same')
+    answer = bench.call('/compensator_node/reload')
+    assert answer.success and version_of(GOOD_TEXT) in answer.message
+
+
+def test_a_file_that_was_named_is_not_displaced_unless_asked(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': str(place)})
+    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=OTHER_TEXT))
+    bench.until(lambda: bench.heard("is not taken: parameter 'adopt' is 'file_then_topic'"), 'a word about it')
+    assert node.adopted.version == version_of(GOOD_TEXT)
+    assert node.set_parameters([Parameter('adopt', value='topic')])[0].successful
+    assert node.adopted.version == version_of(OTHER_TEXT)   # what was heard meanwhile
+    assert [CompensatorSettings(calibration_file=name, adopt=adopt).takes_topic for adopt in ('file', 'topic', 'file_then_topic')
+            for name in ('', 'a.yaml')] == [False, False, True, True, True, False]
+
+
+def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
+    (tmp_path / 'other.yaml').write_text(OTHER_TEXT)
+    (tmp_path / 'broken.yaml').write_text('frame_id: [')
+    node = bench.start(CompensatorNode, {'calibration_file': str(place)})
+
+    def change(**values):
+        return node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+    assert change(calibration_file=str(tmp_path / 'other.yaml')).successful and node.adopted.version == version_of(OTHER_TEXT)
+    for values, words in (({'calibration_file': str(tmp_path / 'broken.yaml')}, 'must be YAML'), ({'calibration_file': str(tmp_path)}, 'readable'),
+                          ({'adopt': 'nobody'}, 'must be file, topic, file_then_topic'), ({'public_executor': True}, 'cannot be changed while the node runs'),
+                          ({'target_xyz': [1.0, 0.0, 0.0]}, 'target frame')):
+        answer = change(**values)
+        assert not answer.successful and words in answer.reason and '\n' not in answer.reason
+        assert node.adopted.version == version_of(OTHER_TEXT)
+    assert change(target_frame='base_link', target_xyz=[1.0, 0.0, 0.0]).successful
+    assert node.compensation.transfer.frame_id == 'base_link'
+
+
+def test_a_misspelt_parameter_is_told(bench):
+    node = bench.start(CompensatorNode, {'calibration_fiel': 'a.yaml', 'reliable': True, 'covariance_rate': 2.0})
+    lines = unknown_parameters(node)
+    assert len(lines) == 2 and "'calibration_fiel' is unknown and ignored; did you mean 'calibration_file'?" in lines[0]
+    assert "'reliable' is not needed any more" in lines[1]
+
+
+def test_whatever_a_message_does_the_stream_goes_on(bench, place, monkeypatch):
+    node = bench.start(CompensatorNode, {'calibration_file': str(place)})
+    node.convert(MESSAGES[0], {'source_timestamp': 1})
+    monkeypatch.setattr(node.compensation, 'correct', lambda *arguments: 1 / 0)
+    assert node.convert(MESSAGES[1], {'source_timestamp': 1}) is None
+    monkeypatch.undo()
+    bench.until(lambda: 'failed with ZeroDivisionError' in bench.lines().get(STATUS, (0, ''))[1], 'a word about it')
+    assert bench.lines()[STATUS][0] == ERROR and node.convert(MESSAGES[2], {'source_timestamp': 1}) is not None
+
+
+def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(compensator_diagnostics, 'COLD', 1.5)
+    warm = random_calibration(3, ('accel_thermal_bias',), verdict='good', proof=PROOF)
+    (tmp_path / 'warm.yaml').write_text(calibration_to_text(warm))
+    node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'warm.yaml')})
+    publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)
+    bench.until(publisher.get_subscription_count, 'a subscription')
+    node.convert(MESSAGES[0], {'source_timestamp': 1})
+    bench.until(lambda: 'no temperature came yet' in bench.lines().get(STATUS, (0, ''))[1], 'that it waits')
+    publisher.publish(Temperature(temperature=float('nan')))
+    bench.until(lambda: 'temperatures on /imu/temperature are not finite' in bench.lines()[STATUS][1], 'NaN')
+    publisher.publish(Temperature(temperature=28.0))
+    bench.until(lambda: node.compensation.dt is not None, 'the temperature')
+    bench.until(lambda: 'the last one, 28.0 C, stays in use' in bench.lines()[STATUS][1], 'that it stopped')
+    assert 'publishes it and sends nothing' in bench.lines()[STATUS][1]
+
+
+def test_any_publisher_connects_and_two_are_told(bench, place, monkeypatch):
+    monkeypatch.setattr(inputs, 'SEVERAL_AFTER', 0.5)
+    node = bench.start(CompensatorNode, {'calibration_file': str(place)})
+    reliable = bench.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE))
+    bench.until(reliable.get_subscription_count, 'a subscription')
+    bench.until(lambda: 'reliable' in node.imu.source() and node.imu.publishers, 'the publisher')
+    assert node.imu.reliable
+    other = bench.start(Sender)
+    best_effort = other.create_publisher(Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT))
+    bench.until(best_effort.get_subscription_count, 'its subscription')
+    assert not node.imu.reliable
+    bench.until(lambda: '2 publishers on /imu/data_raw (/sender, /tester)' in bench.lines().get(STATUS, (0, ''))[1], 'that there are two')
+    other.destroy_publisher(best_effort)
+    bench.until(lambda: node.imu.reliable and 'publishers on' not in bench.lines()[STATUS][1], 'that it is over')
+
+
+def test_a_topic_that_is_mistyped_is_told_with_the_nearest(bench, place):
+    bench.node.create_publisher(Imu, '/imu/data_rwa', 10)
+    bench.start(CompensatorNode, {'calibration_file': str(place)})
+    bench.until(lambda: '-r imu/data_raw:=/imu/data_rwa' in bench.lines().get(STATUS, (0, ''))[1], 'the nearest topic')
+    bench.until(lambda: bench.heard('there is /imu/data_rwa', 'warning'), 'the same on the terminal')
+
+
+def test_a_new_calibration_is_no_error(bench, place):
+    """The counts of the one before belong to the past; an ERROR came after each new calibration."""
+    node = bench.start(CompensatorNode, {'calibration_file': str(place), 'adopt': 'topic'})
+    publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    foreign = encode_imu(ImuSamples(np.array([10**18]), np.ones((1, 3)), np.ones((1, 3)), 'foreign'))[0].tobytes()
+    node.convert(foreign, {'source_timestamp': 1})
+    bench.until(lambda: bench.lines().get(STATUS, (0, ''))[0] == ERROR, 'the foreign frame')
+    bench.until(lambda: bench.lines()[STATUS][0] != ERROR, 'that it is over')
+    publisher.publish(String(data=OTHER_TEXT))
+    bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT), 'the new one')
+    for data in MESSAGES:
+        node.convert(data, {'source_timestamp': 1})
+    for _ in range(2):
+        bench.status.clear()
+        bench.until(lambda: STATUS in bench.status, 'diagnostics')
+        assert bench.lines()[STATUS][0] != ERROR

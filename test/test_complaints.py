@@ -1,0 +1,80 @@
+"""What is wrong is said when it begins, now and then while it lasts, and when it is over; each thing by a clock of its own."""
+
+import pytest
+
+pytest.importorskip('rclpy')
+from imu_calibration.diagnosis.live import DiagnosisState  # noqa: E402
+from imu_calibration.nodes.calibration_guide import PATIENCE, CalibrationGuide  # noqa: E402
+from imu_calibration.nodes.calibration_state import WorkerState  # noqa: E402
+from imu_calibration.nodes.complaints import MOST_KINDS, REMINDER, Complaints  # noqa: E402
+from imu_calibration.preflight.stream_watch import StreamState  # noqa: E402
+from imu_calibration.segmentation.stamping import COUNTED, StampLine  # noqa: E402
+
+
+class Heard(list):
+    """Stands for a logger."""
+
+    def __getattr__(self, level):
+        return lambda line: self.append(f'{level}: {line}')
+
+
+@pytest.fixture
+def now():
+    """Seconds of the clock, in a list."""
+    return [1000.0]
+
+
+def test_each_complaint_has_a_clock_of_its_own(now):
+    heard = Heard()
+    complaints = Complaints(heard, lambda: now[0])
+    for second in range(130):
+        now[0] = 1000.0 + second
+        complaints.now('node', [f'{second} samples lost'] + ['two publishers'] * (second >= 5), ['no disk'] * (5 <= second < 50))
+    assert sum('lost' in line for line in heard) == 1 + 129 // int(REMINDER) and sum('two publishers' in line for line in heard) == 3
+    assert [line for line in heard if 'no disk' in line] == ['error: no disk', 'info: over: no disk']
+
+
+def test_what_comes_and_goes_is_not_said_each_time(now):
+    heard = Heard()
+    complaints = Complaints(heard, lambda: now[0])
+    for second in range(20):
+        now[0] = 1000.0 + second
+        complaints.now('node', ['flicker'] if second % 2 else [])
+    assert sum(line == 'warning: flicker' for line in heard) == 2
+
+
+def test_memory_stays_bounded_whatever_is_wrong(now):
+    complaints = Complaints(Heard(), lambda: now[0])
+    for number in range(3 * MOST_KINDS):
+        complaints.event(f'trouble {chr(65 + number % 26)}{"x" * number}')
+    assert len(complaints._said) <= MOST_KINDS
+
+
+class Topic:
+    """Stands for an input."""
+
+    def source(self):
+        """Return where it comes from."""
+        return '/imu from /driver, reliable'
+
+
+def test_the_guide_says_every_change_once(now):
+    guide = CalibrationGuide({'imu': Topic(), 'joints': Topic()}, 'the command that saves', 'window', lambda: now[0])
+    counted = StreamState('good', 'Imu messages come', {}, (), ('imu', 'joints'), stamping=StampLine(COUNTED, 5e6, 0.0, 3.5e7, 8.0))
+    states = [WorkerState(), WorkerState(streams=StreamState('good', '', {}, ('joints',), ('imu',))), WorkerState(streams=counted),
+              WorkerState(streams=counted, gathered=3, verdict='weak', lines=('bias: known less well', 'next: turn about x')),
+              WorkerState(streams=counted, gathered=5, verdict='weak', lines=('bias: known less well', 'next: turn about y')),
+              WorkerState(streams=counted, gathered=8, verdict='good', lines=('all is well',)),
+              WorkerState(streams=counted, gathered=8, verdict='good', diagnosis=DiagnosisState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
+              WorkerState(streams=counted, gathered=9, verdict='bad', lines=('residuals are large',))]
+    said = []
+    for state in states:
+        for _ in range(3):
+            now[0] += PATIENCE
+            said += guide.lines(state)
+    assert [line for _, line in said] == [
+        'Imu messages come on /imu from /driver, reliable', 'JointState messages come on /imu from /driver, reliable',
+        'Imu: stamps are those of arrival, about 8 samples at once; regular times at 200 Hz are drawn through them', 'first window gathered',
+        'verdict: weak: bias: known less well', 'next: turn about x', 'next: turn about y', 'verdict: good; save it with `the command that saves`',
+        'diagnosis: the gyroscopes feel gravity', 'verdict: bad: residuals are large']
+    assert said[-1][0] == 'warning'

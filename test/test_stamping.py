@@ -1,0 +1,109 @@
+"""Regular times drawn through the stamps that drivers make, for calibration, streams and checks alike."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_rate_slope import PERIOD_NS, START, stamps_of
+
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from imu_calibration.segmentation.sample_times import SampleTimes
+from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
+
+N = 3000
+TRUE = START + PERIOD_NS * np.arange(N)
+
+
+def samples(stamp_ns, keep=slice(None)):
+    """Samples of a lively motion; reading x of the rate counts them."""
+    number = np.arange(len(stamp_ns), dtype=float)
+    force = np.column_stack([np.sin(number / 30), np.cos(number / 50), np.full(len(number), 9.8)])
+    rate = np.column_stack([number, np.cos(number / 20), np.sin(number / 20)])
+    return ImuSamples(np.asarray(stamp_ns)[keep], force[keep], rate[keep], 'imu_link')
+
+
+def timed(imu, cuts=()):
+    """(numbers of the samples, their times) as SampleTimes gives them."""
+    times, bounds = SampleTimes(), [0, *cuts, len(imu)]
+    parts = [times.push(imu.select(slice(a, b))) for a, b in zip(bounds, bounds[1:]) if b > a] + [times.finish()]
+    whole = ImuSamples.concatenate([part for part in parts if part is not None])
+    return whole.rate_s[:, 0].astype(int), whole.stamp_ns, times
+
+
+@pytest.mark.parametrize(('kind', 'off_ms'), (('regular', 0.0), ('milliseconds', 1.0), ('usb packets', 1.0), ('arrival', 2.5), ('jitter', 2.0)))
+def test_times_are_those_of_the_sampling(kind, off_ms):
+    """Up to a constant, and to a share of the scatter that one block of 64 cannot average out; 8 samples at once are off by 35 ms as they come."""
+    rng = np.random.default_rng(3)
+    number, times, state = timed(samples(stamps_of(kind, TRUE, rng)))
+    assert np.array_equal(number, np.arange(N))
+    off = (times - TRUE).astype(float)[100:]
+    assert np.quantile(np.abs(off - np.median(off)), 0.99) <= 1e6 * off_ms
+    assert state.n_rebuilt > 0.9 * N if kind == 'usb packets' else kind == 'jitter' or not state.n_rebuilt
+
+
+@pytest.mark.parametrize('lost', (8, 16, 80))
+def test_packets_that_are_lost_leave_a_gap_of_their_length(lost):
+    keep = np.delete(np.arange(N), np.arange(1600, 1600 + lost))
+    number, times, _ = timed(samples(stamps_of('usb packets', TRUE, None), keep))
+    assert np.array_equal(number, keep)
+    off = (times - TRUE[keep]).astype(float)[100:]
+    assert np.quantile(np.abs(off - np.median(off)), 0.99) < 0.2 * PERIOD_NS
+
+
+@given(st.sampled_from(('regular', 'usb packets', 'arrival', 'jitter', 'runaway', 'zeros')), st.lists(st.integers(1, 900), max_size=6))
+def test_the_outcome_does_not_depend_on_how_the_stream_is_cut(kind, cuts):
+    imu = samples(stamps_of(kind, TRUE[:900], np.random.default_rng(1)))
+    whole, cut = timed(imu), timed(imu, sorted(cuts))
+    np.testing.assert_array_equal(whole[0], cut[0])
+    np.testing.assert_array_equal(whole[1], cut[1])
+
+
+def test_stamps_that_follow_no_clock_stay_as_they_are():
+    rng = np.random.default_rng(4)
+    stamps = stamps_of('runaway', TRUE, rng)
+    assert describe_stamps(stamps).word == IRREGULAR
+    number, times, _ = timed(samples(stamps))
+    assert np.mean(times == stamps[number]) > 0.75   # by chance 256 of them may look like those of a clock
+
+
+@pytest.mark.parametrize('factor', (0.5, 0.8, 2.0))
+def test_a_rate_that_changes_is_followed(factor):
+    true_ns = START + np.cumsum(np.repeat([PERIOD_NS, round(factor * PERIOD_NS)], N)).astype(np.int64)
+    _, times, _ = timed(samples(stamps_of('usb packets', true_ns, None)))
+    step = np.diff(times)
+    assert np.median(step[:N - 200]) == pytest.approx(PERIOD_NS, rel=0.01) and np.median(step[N + 600:]) == pytest.approx(factor * PERIOD_NS, rel=0.01)
+
+
+def test_lost_repeated_and_swapped_samples_are_no_fault_of_the_stamps():
+    rng = np.random.default_rng(5)
+    keep = np.sort(rng.choice(N, N // 2, replace=False))
+    assert describe_stamps(TRUE[keep]).word == REGULAR and describe_stamps(TRUE[keep]).period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
+    swapped = TRUE.copy()
+    swapped[10:1000:40], swapped[11:1000:40] = TRUE[11:1000:40], TRUE[10:1000:40]
+    assert describe_stamps(swapped).word == REGULAR
+    assert describe_stamps(TRUE[:10]) is None
+
+
+def findings(imu, notes=None):
+    """What the checks before a calibration say of a stream."""
+    check = Preflight(strict=False)
+    cleaner = BlockCleaner(watchers=[check])
+    for start in range(0, len(imu), 500):
+        cleaner.push(SampleBlock(imu.select(slice(start, start + 500)), notes=notes if not start else None))
+    cleaner.finish()
+    return {finding.text: finding.severity for finding in check.findings}
+
+
+def test_inspect_sees_the_same():
+    counted = findings(samples(stamps_of('usb packets', TRUE, None)))
+    assert any('about 8 samples at once; regular times at 200 Hz are drawn through them' in text for text in counted)
+    assert not any('samples were lost' in text for text in counted)
+    irregular = findings(samples(stamps_of('runaway', TRUE, np.random.default_rng(4))))
+    assert any(severity == 'warning' and 'follow no clock' in text for text, severity in irregular.items())
+    assert not any('clock near' in text or 'drawn through' in text for text in findings(samples(TRUE)))
+    zero = findings(samples(TRUE), {'Imu zero stamp': 400})
+    assert zero[f'Imu: 400 of {N} stamps are zero, the driver sets none: the time of arrival is taken; let the driver stamp each sample when it is '
+                'measured'] == 'warning'
+    assert describe_stamps(stamps_of('usb packets', TRUE, None)).word == COUNTED
