@@ -117,7 +117,7 @@ def test_a_store_too_small_is_said_and_still_gives_the_first_pass(tilted):
     live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=100))
     run(live, *tilted)
     result = live.solve(pending=True)
-    assert live.needs_linearising() and not live.store_is_complete
+    assert live.needs_linearising() and not live._collector.store.complete
     tilt = result.calibration.value('reference', 'table_tilt')
     assert np.all(np.abs(tilt - [0.004, -0.003]) < 6 * result.calibration.sd[result.model.slices['reference', 'table_tilt']] + 1e-5)
 

@@ -6,8 +6,9 @@ import pytest
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.segmentation.stream_cleaning import clean_samples
 from imu_calibration.segmentation.window_settings import WindowSettings
+
+from worlds.cleaning import clean_samples
 
 HZ = 100
 

@@ -6,7 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.segmentation.stream_cleaning import StreamCheck, clean_samples
+from imu_calibration.segmentation.stream_cleaning import StreamCheck
+
+from worlds.cleaning import clean_samples
 
 S = 10 ** 9
 START = 1_700_000_000 * S

@@ -1,23 +1,20 @@
 """Calibration while the motion goes on: windows as they complete, a solution after them, the same answer as offline."""
 
-import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import conclude, solve_gathered
-from imu_calibration.calibration.collector import Collector
 from imu_calibration.calibration.effect_states import group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.live_collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import selected_columns
-from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.estimation.window_store import WindowStore
 from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.samples import ImuSamples
@@ -162,7 +159,7 @@ class LiveCalibration:
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = _LiveCollector(self.table, model, self.options, session, store, self._told)
+        self._collector = LiveCollector(self.table, model, self.options, session, store, self._told)
 
     def solve(self, pending=False, provenance=None):
         """
@@ -202,11 +199,6 @@ class LiveCalibration:
         self.result, self._too_far = conclude(solution, total, model, self.table, self.options, provenance), moved is not None
         return self.result
 
-    @property
-    def store_is_complete(self):
-        """Whether effects can be linearised anew."""
-        return self._collector is None or self._collector.store.complete
-
     def needs_linearising(self):
         """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
         return self._too_far
@@ -224,7 +216,7 @@ class LiveCalibration:
     def _with_earlier(self, gathered):
         if self.earlier is None:
             return gathered
-        return merge([_copied(self.earlier), gathered])
+        return merge([copied(self.earlier), gathered])
 
     def residuals(self, windows):
         """
@@ -247,7 +239,7 @@ class LiveCalibration:
         told, designs = self._designs.get(window, (None, None))
         if designs is None or self.result.gathered_model is not gathered_with:   # the solution was linearised elsewhere
             told, gathered_with = self._told(window), model
-            designs = _columns_of(window, model, self.table, told)
+            designs = columns_at(window, model, self.table, told)
         chosen = selected_columns(gathered_with, model)
         parts = [measured[told] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
                  for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
@@ -258,55 +250,3 @@ class LiveCalibration:
         if self.result is None:
             return waiting_groups(self.model) if self.model is not None else []
         return group_states(self.result)
-
-
-def _columns_of(window, model, table, told):
-    """Return sensor -> columns at the samples `told` of a window."""
-    motion, temperature = joined_motion([window])
-    if window.kind != 'static':
-        motion, temperature = motion.select(told), None if temperature is None else temperature[told]
-    return {sensor: columns(model, sensor, table, motion, temperature) for sensor in SENSORS}
-
-
-class _LiveCollector(Collector):
-    """A Collector that hands completed windows on, with their columns at the samples `told`, and keeps a bounded number of them."""
-
-    def __init__(self, table, model, options, session, store, told):
-        super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
-        self.store, self._told, self._completed = store, told, {}
-
-    def _columns(self, window):
-        told, designs = self._told(window), {}
-
-        def kept(model, sensor, *arguments, **options):
-            found = columns(model, sensor, *arguments, **options)
-            designs[sensor] = found if window.kind == 'static' else found[told].copy()
-            return found
-        self._completed[window] = told, designs
-        return kept
-
-    def _store(self, window, reduced):
-        if self.model.relinearised:
-            self.store.add(window, reduced)
-
-    def take_completed(self):
-        """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
-        completed, self._completed = self._completed, {}
-        return completed
-
-    def snapshot(self, pending):
-        """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
-        twin = copy.copy(self)
-        twin.gathered, twin.store, twin._completed = _copied(self.gathered), self.store.copy(), {}
-        if pending:
-            twin.gatherer = copy.deepcopy(self.gatherer)
-            twin.finish()
-        else:
-            twin.update_counts()
-        return twin.gathered, twin.store, list(twin.take_completed())
-
-
-def _copied(gathered):
-    """Return a copy that shares only what nobody changes in place."""
-    copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
-    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))

@@ -15,8 +15,27 @@ MOST_BLOCKS = 48
 """Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there."""
 
 
+class _CentredRows:
+    """What stacks the centred rows of windows in its `within` and `slow`."""
+
+    within: dict
+    slow: dict
+
+    def _stack_window(self, window):
+        for sensor in SENSORS:
+            statistics = window.sensors[sensor]
+            stack(self.within, (sensor, window.kind), statistics.within)
+            if statistics.slow_rows:
+                stack(self.slow, (sensor, window.kind), statistics.slow)
+
+    def _stack_all_of(self, other):
+        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
+            for key, factor in its.items():
+                stack(mine, key, factor)
+
+
 @dataclass(eq=False)
-class WindowBlock:
+class WindowBlock(_CentredRows):
     """The centred rows of consecutive windows: what parts of a recording say by themselves."""
 
     session: int
@@ -32,11 +51,7 @@ class WindowBlock:
 
     def add(self, window: WindowStatistics) -> None:
         """Take the centred rows of one window."""
-        for sensor in SENSORS:
-            statistics = window.sensors[sensor]
-            stack(self.within, (sensor, window.kind), statistics.within)
-            if statistics.slow_rows:
-                stack(self.slow, (sensor, window.kind), statistics.slow)
+        self._stack_window(window)
         self.windows += 1
 
     def copy(self) -> 'WindowBlock':
@@ -47,14 +62,12 @@ class WindowBlock:
         """Return this block and the one after it as one."""
         both = self.copy()
         both.windows += other.windows
-        for mine, its in ((both.within, other.within), (both.slow, other.slow)):
-            for key, factor in its.items():
-                stack(mine, key, factor)
+        both._stack_all_of(other)
         return both
 
 
 @dataclass(eq=False)
-class Accumulator:
+class Accumulator(_CentredRows):
     """
     Everything that least squares needs of any number of windows.
 
@@ -81,12 +94,8 @@ class Accumulator:
 
     def add(self, window: WindowStatistics) -> None:
         """Take one window (WindowStatistics)."""
-        for sensor in SENSORS:
-            statistics = window.sensors[sensor]
-            stack(self.within, (sensor, window.kind), statistics.within)
-            if statistics.slow_rows:
-                stack(self.slow, (sensor, window.kind), statistics.slow)
-        self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + statistics.slow_rows
+        self._stack_window(window)
+        self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + window.sensors[SENSORS[0]].slow_rows
         self._add_to_blocks(window)
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
@@ -100,9 +109,7 @@ class Accumulator:
 
     def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
-        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
-            for key, factor in its.items():
-                stack(mine, key, factor)
+        self._stack_all_of(other)
         for kind, count in other.slow_rows.items():
             self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
         self.rows.extend(other.rows)

@@ -15,7 +15,7 @@ OFF_WHY = "parameter 'diagnosis_period' is 0"
 
 class DiagnosisThread:
     """
-    Answers one `live_diagnosis.Question` at a time.
+    Answers one `DiagnosisQuestion` at a time.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ def find_still(imu, settings=WindowSettings()):
     Parameters
     ----------
     imu : ImuSamples
-        Cleaned samples (`stream_check.clean_samples`): finite, stamps not going backwards.
+        Cleaned samples (`BlockCleaner`): finite, stamps not going backwards.
     settings : WindowSettings
 
     Returns

@@ -212,24 +212,6 @@ class StreamStatistics:
         return 1.0 / self.period if self.period > 0 else 0.0
 
 
-def clean_samples(samples, gap=0.1):
-    """
-    Clean a whole recording of one stream.
-
-    Returns
-    -------
-    list of samples
-        One item per epoch of the clock, in order, without empty ones.
-    StreamStatistics
-        What was dropped and how the stamps look.
-
-    """
-    check = StreamCheck()
-    pieces = check.push(samples) + check.finish()
-    epochs = [type(samples).concatenate([part for number, part in pieces if number == epoch]) for epoch in sorted({n for n, _ in pieces})]
-    return [part for part in epochs if len(part)], check.statistics(gap)
-
-
 _BINS_PER_E = 100
 
 

@@ -6,13 +6,9 @@ from imu_calibration.errors import InputError
 from imu_calibration.samples import JointSamples
 from imu_calibration.segmentation.block_cleaning import STREAMS, BlockCleaner
 from imu_calibration.segmentation.quiet_detector import QuietFloor
-from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT, MotionChunks
-from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_cutter import WindowCutter
 from imu_calibration.segmentation.window_settings import WindowSettings
-
-__all__ = ['MotionGatherer', 'Window', 'find_still']
 
 
 class MotionGatherer:

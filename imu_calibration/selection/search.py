@@ -53,7 +53,6 @@ class Search:
 
     def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], encoder_step: float = 0.0):
         self.evidence, self.baseline, self.questions, self.encoder_step = evidence, tuple(baseline), questions, encoder_step
-        self.n_effects = max(len({q.name for q in questions}), 1)
         self.history = []
 
     def used(self, chosen: Sequence[Question]) -> tuple[int, ...]:

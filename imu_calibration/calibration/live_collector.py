@@ -1,0 +1,61 @@
+"""The collector of a live calibration: what completed windows leave for residuals, a bounded store, and copies to solve while it goes on."""
+
+import copy
+from dataclasses import replace
+
+from imu_calibration.calibration.collector import Collector
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import columns
+from imu_calibration.estimation.window_statistics import joined_motion
+
+
+def columns_at(window, model, table, told):
+    """Return sensor -> columns at the samples `told` of a window."""
+    motion, temperature = joined_motion([window])
+    if window.kind != 'static':
+        motion, temperature = motion.select(told), None if temperature is None else temperature[told]
+    return {sensor: columns(model, sensor, table, motion, temperature) for sensor in SENSORS}
+
+
+class LiveCollector(Collector):
+    """A Collector that hands completed windows on, with their columns at the samples `told`, and keeps a bounded number of them."""
+
+    def __init__(self, table, model, options, session, store, told):
+        super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
+        self.store, self._told, self._completed = store, told, {}
+
+    def _columns(self, window):
+        told, designs = self._told(window), {}
+
+        def kept(model, sensor, *arguments, **options):
+            found = columns(model, sensor, *arguments, **options)
+            designs[sensor] = found if window.kind == 'static' else found[told].copy()
+            return found
+        self._completed[window] = told, designs
+        return kept
+
+    def _store(self, window, reduced):
+        if self.model.relinearised:
+            self.store.add(window, reduced)
+
+    def take_completed(self):
+        """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
+        completed, self._completed = self._completed, {}
+        return completed
+
+    def snapshot(self, pending):
+        """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
+        twin = copy.copy(self)
+        twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
+        if pending:
+            twin.gatherer = copy.deepcopy(self.gatherer)
+            twin.finish()
+        else:
+            twin.update_counts()
+        return twin.gathered, twin.store, list(twin.take_completed())
+
+
+def copied(gathered):
+    """Return a copy that shares only what nobody changes in place."""
+    copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
+    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))
