@@ -5,6 +5,7 @@ from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.gathered import join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.calibration.proof import prove_solution
 from imu_calibration.calibration.status import tolerances_of
@@ -46,6 +47,16 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
         When a recording cannot be used or is of another frame, with its name when there are several.
 
     """
+    return conclude(*solve_recordings(sources, table, options, progress, mapper, names), table, options, provenance)
+
+
+def solve_recordings(sources, table, options=CalibrationOptions(), progress=None, mapper=map, names=None, keep_windows=False):
+    """
+    Return (Solution, Gathered, the SensorModel whose columns were gathered) of recordings; arguments as in `calibrate`.
+
+    keep_windows : bool
+        Whether windows are kept to ask for effects (`by_evidence`).
+    """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model = choose_model(options, table)
     if model.needs_temperature:
@@ -53,13 +64,13 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
     again = model
     for _ in range(PASSES):
         model = again
-        step = GatherStep(table, model, options.windows, options.nominal, names, progress)
+        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress)
         gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
         solution = solve_gathered(gathered, model, options)
         again = linearise_again(model, solution)
         if again is None:
             break
-    return conclude(solution, gathered, model, table, options, provenance)
+    return solution, gathered, model
 
 
 def _first_temperature(sources):
@@ -81,12 +92,12 @@ def solve_gathered(gathered, model, options=CalibrationOptions()):
     return solution
 
 
-def conclude(solution, gathered, model, table, options=CalibrationOptions(), provenance=None):
+def conclude(solution, gathered, model, table, options=CalibrationOptions(), provenance=None, changes=ModelChanges()):
     """Judge a solution of what was gathered with `model`, say which motions it lacks, and return the TableResult."""
     tolerances = tolerances_of(solution.model, options.tolerances)
     needed = motions_needed(solution, tolerances, table)
     proof = prove_solution(gathered.held_out, solution, model)
-    calibration = document(solution, tolerances, table, gathered, needed, provenance, proof)
+    calibration = document(solution, tolerances, table, gathered, needed, provenance, proof, changes)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
 

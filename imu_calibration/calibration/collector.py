@@ -18,8 +18,9 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 class Collector:
     """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
 
-    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=(), windows: list | None = None):
-        self.table, self.model, self.session, self.windows = table, model, session, windows
+    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=(), windows: list | None = None,
+                 spread: bool = False):
+        self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
         self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
         self.gathered = Gathered()
 
@@ -72,6 +73,8 @@ class Collector:
         else:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
         self._store(window, reduced)
+        if self.spread:
+            found.spread.add(window)
         return reduced
 
     def _columns(self, window):
@@ -98,6 +101,8 @@ class GatherStep:
     """For recordings in volts or counts."""
     names: tuple = ()
     """Names of the recordings for messages; with several of them an error names the one at fault."""
+    spread: bool = False
+    """Whether windows are kept to ask for effects."""
     progress: object = None
     """Called with the number of IMU samples read so far."""
 
@@ -116,7 +121,8 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,), windows=windows)
+        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,), windows=windows,
+                              spread=self.spread)
         count = 0
         for block in blocks:
             collector.push(block)

@@ -6,6 +6,7 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.status import statuses
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS, Role
@@ -20,7 +21,7 @@ def motions_needed(solution, tolerances, table):
     return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd)
 
 
-def document(solution, tolerances, table, gathered, needed, provenance=None, proof=None):
+def document(solution, tolerances, table, gathered, needed, provenance=None, proof=None, changes=ModelChanges()):
     """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its proof (`proof`) and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
@@ -33,7 +34,7 @@ def document(solution, tolerances, table, gathered, needed, provenance=None, pro
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
-                              statistics(solution, gathered), conditions(gathered, table.gravity_value),
+                              statistics(solution, gathered) | changes.to_mapping(), conditions(gathered, table.gravity_value),
                               {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {})
     return judged(calibration, tolerances)
 

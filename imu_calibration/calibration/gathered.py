@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_calibration.calibration.held_out import HeldOut
+from imu_calibration.calibration.spread_windows import SpreadWindows
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.window_statistics import WindowStatistics
@@ -26,6 +27,8 @@ class Gathered:
     """The same windows dealt out, so that each part can be predicted from the others."""
     kept: list = field(default_factory=list)
     """Windows with all samples, as far as KEPT_SAMPLES reaches."""
+    spread: SpreadWindows = field(default_factory=SpreadWindows)
+    """Windows to ask for effects, of the recording with most samples; none where nobody asks."""
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
     counts: dict = field(default_factory=dict)
@@ -71,6 +74,7 @@ def merge(parts):
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
         total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
+        total.spread = max(total.spread, part.spread, key=lambda spread: spread.n_samples)
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)

@@ -1,6 +1,8 @@
 """What to estimate and how to judge it, and the model that follows from it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from imu_calibration.allan.bias_processes import bias_processes
 from imu_calibration.allan.figures import NoiseFigures
@@ -34,6 +36,12 @@ class CalibrationOptions:
     """The effects that there are."""
     noise: NoiseFigures | None = None
     """The noise of this IMU at rest; None: the recording says how the biases move."""
+    as_asked: bool = False
+    """Whether the model is exactly what was asked for, whatever the recording says."""
+    added: tuple[tuple[str, str], ...] = ()
+    """(sensor, effect) that a recording demands on top."""
+    point: dict[str, np.ndarray] = field(default_factory=dict)
+    """Effect -> values at which columns are taken first."""
 
     @property
     def bias_processes(self) -> dict[str, tuple[BiasProcess, ...]]:
@@ -52,7 +60,10 @@ def choose_model(options, table):
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
     chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, options.catalogue) for sensor, text in asked.items()}
     model = SensorModel(**chosen, reference=parse_reference(options.reference_model, table), joint_names=names, catalogue=options.catalogue)
-    return with_common_arm(model) if table.mount_xyz is None else model
+    model = with_common_arm(model) if table.mount_xyz is None else model
+    for sensor, name in options.added:
+        model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)
+    return replace(model, point={**model.point, **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
 
 
 def settle_model(model, options, gathered):

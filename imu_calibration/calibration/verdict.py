@@ -195,11 +195,32 @@ def _all_well(calibration, tolerances):
 
 
 def _notes(calibration, tolerances):
-    return _proven(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
+    return _proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
 
 
 def _proven(calibration):
     return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
+
+
+def _adopted(calibration):
+    """Return notes on what the recording did to the model."""
+    added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
+    notes = [Reason(NOTE, f'added to the model, because the recording demands it: {", ".join(_with_size(calibration, name) for name in added)}',
+                    "see 'imu_calibration diagnose' for the evidence; --model-as-asked leaves it out")] if added else []
+    notes += [Reason(NOTE, f'the halves of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
+                     "see 'imu_calibration diagnose'")] if denied else []
+    return notes + [Reason(NOTE, f'{name}: {why}', '') for name, why in (calibration.statistics.get('not_believed') or {}).items()]
+
+
+def _with_size(calibration, name):
+    """Return an effect with its plainest parameter, in units that people use."""
+    effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
+    if effect is None:
+        return name
+    part = calibration.model.slices[effect.key]
+    best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
+    factor, unit = for_people(effect.unit_of(best - part.start))
+    return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
 
 
 def _loose(calibration):

@@ -1,6 +1,6 @@
 """Arguments that every verb on recordings shares, and the choices that they make."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, Namespace, _ArgumentGroup
 from typing import cast
 
 from imu_calibration.segmentation.window_settings import WindowSettings
@@ -36,8 +36,8 @@ def stand_of(options: Namespace) -> Stand | None:
     return Arm(options.urdf, options.imu_link, options.table, options.up)
 
 
-def add_model_arguments(parser: ArgumentParser) -> None:
-    """Add the options that choose what is estimated."""
+def add_model_arguments(parser: ArgumentParser) -> _ArgumentGroup:
+    """Add the options that choose what is estimated; return their group."""
     group = parser.add_argument_group('model')
     group.add_argument('--accelerometer-model', metavar='MODEL', help='a named model or effect names joined by +; default bias+matrix, '
                        'and accel_size_effect when the recording holds rotation that shows it')
@@ -51,6 +51,7 @@ def add_model_arguments(parser: ArgumentParser) -> None:
     group.add_argument('--setting', metavar='NAME=VALUE', action='append', default=[],
                        help='how windows are found; may be repeated: '
                        + ', '.join(f'{d.name} [{d.unit}]' for d in describe(WindowSettings)))
+    return group
 
 
 def choices_of(options: Namespace) -> Choices:

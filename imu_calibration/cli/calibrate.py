@@ -19,7 +19,8 @@ def add_arguments(parser):
     parser.add_argument('--jobs', type=int, help='recordings read side by side, default one per processor')
     add_stand_arguments(parser, 'without any: by hand, gravity as the reference')
     add_topic_arguments(parser)
-    add_model_arguments(parser)
+    add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
+                                             help='add nothing to the model, whatever the recording demands')
 
 
 def run(options):

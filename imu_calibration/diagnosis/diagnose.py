@@ -12,12 +12,13 @@ from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.diagnosis.unexplained import unexplained
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.gain import Gain, heldout_gain
-from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.investigation import Investigation, investigate
 
 
 def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
@@ -51,14 +52,23 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progre
         When there are too few windows to hold any out.
 
     """
-    found = investigate(windows, table, model, progress, bias_processes=bias_processes)
-    result = _assembled(windows, table, found)
+    result = told(windows, table, investigate(windows, table, model, progress, bias_processes=bias_processes))
     if progress:
         progress(1.0)
     return result
 
 
-def _assembled(windows, table, found):
+def told(windows: Sequence[Window], table: Table, found: Investigation, calibrated: Solution | None = None) -> Diagnosis:
+    """
+    Return what an investigation found as a Diagnosis.
+
+    windows, table
+        As in `diagnose`; residuals are drawn over all of these windows.
+    found : Investigation
+    calibrated : Solution, optional
+        Of a model with everything that was found, whose parameters are told; that of the investigation where not given.
+
+    """
     attempt, named, limits = found.attempt, found.named, found.limits
     baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, [])
     solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, named, saturations=limits) if named or limits else baseline
@@ -69,8 +79,9 @@ def _assembled(windows, table, found):
     def motion_of(question, mate):
         return separating_motion(solution, question, mate, table.gravity_value)
 
-    findings = [_clipping(limit, solution) for limit in limits]
-    findings += [finding(attempt.search, named, place, solution, share=found.explained.share, gain_of=gain_of, motion_of=motion_of)
+    told_by = calibrated or solution
+    findings = [_clipping(limit, told_by) for limit in limits]
+    findings += [finding(attempt.search, named, place, told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of)
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named), tuple(found.not_testable),

@@ -1,12 +1,12 @@
 """A diagnosis while the motion goes on: the windows that are kept for it, and its outcome in the words of a status."""
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
-from imu_calibration.calibration.options import choose_model
+from imu_calibration.calibration.by_evidence import baseline_model
 from imu_calibration.diagnosis.diagnose import diagnose
-from imu_calibration.diagnosis.workflow import baseline_options, diagnosis_lines, in_words
+from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.estimation.window_store import owned_window
 from imu_calibration.selection.investigation import LEAST_WINDOWS
@@ -122,23 +122,6 @@ class DiagnosisQuestion:
             return describe(diagnose(self.windows, self.table, self.model, progress=progress), self.forgotten)
         except ImuCalibrationError as error:
             return DiagnosisState(WAITING, str(error), {'windows': len(self.windows)})
-
-
-def baseline_model(options, table, solved):
-    """
-    Return the model that ``imu_calibration diagnose`` starts from with the same options.
-
-    Parameters
-    ----------
-    options : CalibrationOptions
-    table : Table
-    solved : SensorModel
-        The model of the last solution: where its columns were linearised holds for the same effects here.
-
-    """
-    model = choose_model(baseline_options(options), table)
-    names = {effect.name for effect in model.effects}
-    return replace(model, point={name: value for name, value in solved.point.items() if name in names}, temperature_ref_c=solved.temperature_ref_c)
 
 
 def describe(diagnosis, forgotten=0):

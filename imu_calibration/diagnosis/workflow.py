@@ -7,17 +7,16 @@ import numpy as np
 from imu_calibration.by_hand.calibrate import gather_by_hand
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.workflow import hand_result, read_by_hand
-from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
-from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
+from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.units import for_people, significant
 
 
@@ -69,23 +68,18 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     DiagnosisResult
 
     """
-    options = baseline_options(options)
     windows = []
 
     def read(step, numbered):
         return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session, source in numbered]
-    baseline = calibrate([source], table, options, provenance, mapper=read)
-    diagnosis = diagnose(windows, table, baseline.model, progress=_percent(progress) if progress else None,
-                         bias_processes=options.bias_processes)
-    tolerances = tolerances_of(diagnosis.solution.model, options.tolerances)
-    needed = motions_needed(diagnosis.solution, tolerances, table)
-    calibration = document(diagnosis.solution, tolerances, table, baseline.gathered, needed, provenance)
-    return DiagnosisResult(diagnosis, calibration, tolerances, needed, baseline.observations, options)
-
-
-def baseline_options(options):
-    """Return the options of the model that a diagnosis starts from: what was not asked for has to prove itself."""
-    return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
+    report = _percent(progress) if progress else None
+    calibrated = calibrate_by_evidence([source], table, options, provenance, asking=report, mapper=read)
+    if calibrated.found is None:
+        raise too_few_windows(len(calibrated.result.gathered.spread.windows))
+    result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated.result.solution)
+    if report:
+        report(1.0)
+    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options))
 
 
 def diagnose_without_table(source, options=CalibrationOptions(), provenance=None, progress=None):

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Callable, Sequence
 
 import numpy as np
+from scipy.stats import chi2
 
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
@@ -23,6 +24,8 @@ from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
+DISAGREE = 1e-4
+"""Chance that the halves of a recording differ so much on an effect that they both show."""
 BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
@@ -104,6 +107,37 @@ class Attempt:
         losses = [quadratic(self._locked_normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
         return 0.5 * (losses[0] - losses[1])
 
+    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether both halves of the recording show an effect alike, as far as they show it.
+
+        They disagree when what they say differs by more than chance and by more than half of what the whole says. Effects that are smooth in
+        time are different in the halves by nature.
+        """
+        if question.effect.smooth:
+            return True
+        used = self.search.used(chosen)
+        at = [used.index(k) for k in question.parameters]
+        fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, self.space.prior_mean) for normal in self._halves]
+        whole, covariance = self.evidence.fit(used)
+        difference = (fits[0][0] - fits[1][0])[at]
+        apart = _squared(difference, sum(fit[1] for fit in fits)[np.ix_(at, at)])
+        known = np.linalg.inv(covariance[np.ix_(at, at)])
+        return bool(chi2.sf(apart, len(at)) > DISAGREE or difference @ known @ difference < 0.25 * whole[at] @ known @ whole[at])
+
+    @cached_property
+    def _halves(self):
+        """Normal matrices of the windows before and after the middle of those used."""
+        early = np.arange(len(self.recording.windows)) < len(self.recording.windows) // 2
+        return [normal_matrix(self.space, self.noise, half) for half in (early, ~early)]
+
+    def moved_by(self, chosen: Sequence[Question], question: Question) -> dict[str, float]:
+        """Return parameter -> by how much an effect moves it, of the baseline and of the other choices, when it joins them."""
+        others = [q for q in chosen if q is not question]
+        smaller, larger = self.search.used(others), self.search.used([*others, question])
+        moved = self.evidence.fit(larger)[0][:len(smaller)] - self.evidence.fit(smaller)[0]
+        return {self.space.names[k]: float(change) for k, change in zip(smaller, moved)}
+
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
         """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
@@ -146,6 +180,11 @@ class Attempt:
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
+
+
+def _squared(difference, covariance):
+    """Return a difference in squared standard deviations."""
+    return float(difference @ np.linalg.solve(covariance, difference))
 
 
 def encoder_step(windows: Sequence[Window]) -> float:

@@ -1,6 +1,6 @@
 """The search from windows to named effects: clipped samples out, linearise, choose, prove, linearise anew."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Callable, Sequence
 
@@ -48,6 +48,8 @@ class Investigation:
     """Saturations."""
     not_testable: list[dict]
     """Effects that could not be asked about."""
+    denied: list[Question] = field(default_factory=list)
+    """Questions that would have become findings, but the halves of the recording disagree on them."""
 
 
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
@@ -76,8 +78,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
     """
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < LEAST_WINDOWS:
-        raise NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
-                                 f'{len(used)} were found; rest in more poses, or spin and swing the table')
+        raise too_few_windows(len(used))
     report = progress or (lambda share: None)
     model = with_joints_of(model, table)
     used, limits = _without_clipping(used, table, model)
@@ -95,15 +96,28 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
     chosen = [question for question in chosen if '@' not in question.label]
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
-    named = _that_help(attempt, pruned(chosen, explained.share))
+    named, denied = _agreed(attempt, _that_help(attempt, pruned(chosen, explained.share)))
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
         attempt = attempted(point=attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
-        again = [next(q for q in attempt.questions if q.label == question.label) for question in named]
+        again, denied = ([next(q for q in attempt.questions if q.label == question.label) for question in some] for some in (named, denied))
         named = _that_help(attempt, pruned(again, explained.share))
-    return Investigation(used, attempt, explained, named, limits, not_testable)
+    return Investigation(used, attempt, explained, named, limits, not_testable, denied)
+
+
+def too_few_windows(count: int) -> NotObservableError:
+    """Return the error of a recording with so few windows that none can be held out."""
+    return NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
+                              f'{count} were found; rest in more poses, or spin and swing the table')
+
+
+def _agreed(attempt, named):
+    """Return (findings on which both halves of the recording agree, those on which they do not), the worst taken out first."""
+    denied = [question for question in named if not attempt.agrees_in_halves(named, question)]
+    kept = [question for question in named if question not in denied]
+    return _that_help(attempt, kept) if denied else kept, denied
 
 
 def _that_help(attempt, named):

@@ -10,6 +10,7 @@ from typing import Unpack
 
 from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.calibrate import calibrate as calibrate_on_table
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code
@@ -124,4 +125,6 @@ def _side_by_side(sources, table, options, recordings, jobs):
     names = [name if names.count(name) == 1 else str(Path(recording)) for name, recording in zip(names, recordings, strict=True)]
     with progress_bar('recordings', len(recordings) if jobs > 1 else 0, 'recordings') as advance:
         mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-        return calibrate_on_table(sources, table, options, mapper=mapper, names=names)
+        if options.as_asked:
+            return calibrate_on_table(sources, table, options, mapper=mapper, names=names)
+        return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result

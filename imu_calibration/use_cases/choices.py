@@ -35,6 +35,8 @@ class Choices(TypedDict, total=False):
     """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when latitude or azimuth is unknown."""
     gravity: float | None
     """Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity with its uncertainty."""
+    model_as_asked: bool
+    """Whether nothing is added to the model whatever the recording demands; default no."""
     tolerances: str | PathLike | Mapping | None
     """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
     nominal: str | PathLike | NominalScaling | None
@@ -47,7 +49,8 @@ class Choices(TypedDict, total=False):
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
 
 
-IN_DOCUMENT = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'imu_topic', 'joint_topic', 'temperature_topic', 'setting')
+IN_DOCUMENT = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'imu_topic', 'joint_topic',
+               'temperature_topic', 'setting')
 """Choices that a document names where they were made."""
 
 
@@ -70,7 +73,8 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
     return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
                               read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
-                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue, noise_of(choices.get('noise')))
+                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue, noise_of(choices.get('noise')),
+                              as_asked=bool(choices.get('model_as_asked')))
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:

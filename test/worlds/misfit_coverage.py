@@ -12,12 +12,12 @@ import numpy as np
 
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.diagnosis.workflow import collect_windows
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window_finder import MotionGatherer
 
 from worlds.misfit_worlds import CAUSES, make_pair
 
@@ -42,7 +42,8 @@ class Calibrated:
 def calibrated(session, options=OPTIONS):
     """Return a session calibrated with a model that lacks its cause."""
     table = Table.from_mapping(session.table)
-    windows = [window for window in collect_windows(iter([session.block]), table) if window.kind != 'unused']
+    gatherer = MotionGatherer(table)
+    windows = gatherer.push(session.block) + gatherer.finish()
     model = choose_model(options, table)
     for _ in range(PASSES):
         accumulator = Accumulator()

@@ -1,0 +1,107 @@
+"""
+One mind for `calibrate` and `diagnose`: what a recording demands is in the model.
+
+The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
+names joins the model; a choice on which the halves of the recording disagree does not, and widens the standard deviations instead.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration.calibrate import conclude, solve_recordings
+from imu_calibration.calibration.model_changes import ModelChanges
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.named_models import BARE
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.selection.extended_model import extended_solution
+from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation, investigate
+
+
+@dataclass(frozen=True, eq=False)
+class EvidentResult:
+    """A calibration with what was found on the way to its model."""
+
+    result: TableResult
+    """The calibration."""
+    found: Investigation | None
+    """What was asked and answered; None with too few windows."""
+
+
+def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(),
+                          provenance: dict | None = None, progress: Callable | None = None, asking: Callable | None = None,
+                          mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
+    """
+    Calibrate from one or several recordings of the same IMU with what they demand on top of the model that is asked for.
+
+    Parameters
+    ----------
+    sources, table, options, provenance, progress, mapper, names
+        As for `calibrate`.
+    asking : callable, optional
+        Called with the share of the search that is done.
+
+    Raises
+    ------
+    InputError
+        As `calibrate`.
+
+    """
+    first = solve_recordings(sources, table, options, progress, mapper, names, keep_windows=True)
+    solution, gathered, model = first
+    windows = gathered.spread.windows
+    if len(windows) < LEAST_WINDOWS:
+        return EvidentResult(conclude(*first, table, options, provenance), None)
+    found = investigate(windows, table, baseline_model(options, table, solution.model), asking, bias_processes=options.bias_processes)
+    added = [question for question in found.named if (question.sensor, question.name) not in model.slices]
+    if added:
+        options = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
+        solution, gathered, model = solve_recordings(sources, table, options, progress, mapper, names)
+    solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
+    if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
+        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, found.named, saturations=found.limits)
+    clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
+    changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
+    return EvidentResult(conclude(solution, gathered, model, table, options, provenance, changes), found)
+
+
+def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
+    """Return the options of the model from which effects are asked: what was not asked for has to prove itself."""
+    return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
+
+
+def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
+    """
+    Return the model from which effects are asked.
+
+    Parameters
+    ----------
+    options : CalibrationOptions
+    table : Table
+    solved : SensorModel
+        The model of a solution: where its columns were linearised holds for the same effects here.
+
+    """
+    model = choose_model(baseline_options(options), table)
+    names = {effect.name for effect in model.effects}
+    return replace(model, point={name: value for name, value in solved.point.items() if name in names}, temperature_ref_c=solved.temperature_ref_c)
+
+
+def _point(found):
+    """Return effect -> values at which its columns are to be taken, of what was found."""
+    model = found.attempt.recording.model
+    return {question.name: model.point[question.name] for question in found.named if question.name in model.point}
+
+
+def _disagreement(found, names):
+    """Return the covariance of what choices on which the halves disagree would have moved the parameters by."""
+    total = np.zeros((len(names),) * 2)
+    for question in found.denied:
+        moved = found.attempt.moved_by(found.named, question)
+        shift = np.array([moved.get(name, 0.0) for name in names])
+        total += np.outer(shift, shift)
+    return total

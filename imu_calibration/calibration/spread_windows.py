@@ -1,0 +1,31 @@
+"""Windows of a recording with their samples, for a search over effects: all of a short one, evenly spread ones of a long one."""
+
+from imu_calibration.estimation.window_store import owned_window
+from imu_calibration.segmentation.window import Window
+
+MOST_SAMPLES = 100_000
+"""Samples kept; beyond it every second window of each kind goes."""
+
+
+class SpreadWindows:
+    """Every so many-th window of each kind, so that memory and the time of a search are bounded; which ones depends on the recording alone."""
+
+    def __init__(self):
+        self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []
+
+    def add(self, window: Window) -> None:
+        """Take a window in order of time."""
+        number = self._counts[window.kind] = self._counts.get(window.kind, -1) + 1
+        if number % self._stride:
+            return
+        self._kept.append((number, owned_window(window)))
+        self.n_samples += len(window.time)
+        while self.n_samples > MOST_SAMPLES and len(self._kept) > 1:
+            self._stride *= 2
+            self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
+            self.n_samples = sum(len(window.time) for _, window in self._kept)
+
+    @property
+    def windows(self) -> list[Window]:
+        """The windows kept, in order of time."""
+        return [window for _, window in self._kept]

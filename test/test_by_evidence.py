@@ -1,0 +1,103 @@
+"""One mind for two verbs: what a recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imu_calibration as imu
+from imu_calibration.calibration import spread_windows
+from imu_calibration.calibration.by_evidence import _disagreement
+from imu_calibration.calibration.spread_windows import SpreadWindows
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.selection.investigation import investigate
+
+from worlds.misfit_coverage import calibrated
+from worlds.misfit_worlds import make_pair
+from worlds.physics import TABLES
+
+TABLE = Table.from_mapping(TABLES['three_axis'])
+NAMES = tuple(TABLE.joint_names)
+OFFSET = 'reference.time_offset.offset'
+SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
+
+
+@pytest.fixture(scope='module')
+def late():
+    """A session on a shaft whose driver stamps 12 ms late, and the table."""
+    pair = make_pair('driver_lag', 31, **SHAFT)
+    return pair.first, Table.from_mapping(pair.table)
+
+
+@pytest.fixture(scope='module')
+def asked(late):
+    return imu.calibrate(late[0].block, late[1])
+
+
+def test_a_lag_is_taken_into_the_model_and_said_in_one_line(late, asked):
+    session, table = late
+    place, true = asked.calibration.param_names.index('gyroscope.matrix.xx'), session.truth['gyroscope'].matrix[0, 0]
+    assert asked.calibration.statistics['added'][0] == 'time_offset'
+    assert float(asked.calibration.value('reference', 'time_offset')) == pytest.approx(0.012, abs=1e-3)
+    assert abs(asked.calibration.values[place] - true) < 4 * asked.calibration.sd[place] and abs(asked.calibration.values[place] - true) < 2e-3
+    assert len([line for line in asked.verdict.lines() if 'added to the model' in line and 'time_offset (1' in line]) == 1
+    plain = imu.calibrate(session.block, table, model_as_asked=True).calibration
+    assert 'added' not in plain.statistics and OFFSET not in plain.param_names
+    assert abs(plain.values[plain.param_names.index('gyroscope.matrix.xx')] - true) > 5e-3
+
+
+def test_diagnose_hands_over_what_calibrate_does(late, asked):
+    found = imu.diagnose(late[0].block, late[1])
+    assert found.calibration.param_names == asked.calibration.param_names
+    np.testing.assert_array_equal(found.calibration.values, asked.calibration.values)
+    np.testing.assert_array_equal(found.calibration.sd, asked.calibration.sd)
+    value, sd, _ = found.findings[0].parameters[OFFSET]
+    assert (value, sd) == (float(asked.calibration.value('reference', 'time_offset')), asked.calibration.sd[asked.calibration.param_names.index(OFFSET)])
+
+
+def test_a_clean_session_adds_nothing():
+    pair = make_pair(None, 12)
+    found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table))
+    assert not set(found.calibration.statistics) & {'added', 'denied'}
+
+
+def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations():
+    """A g-sensitivity that comes in the middle of the session: the halves disagree, the model stays, its parameters are less certain."""
+    windows, rng = calibrated(make_pair(None, 11).first).windows, np.random.default_rng(5)
+    model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'), joint_names=NAMES)
+
+    def measured(share):
+        made = []
+        for k, window in enumerate(windows):
+            values = model.start()
+            values[model.slices['gyroscope', 'gyro_g_sensitivity']] = 1e-3 if k >= share * len(windows) else 0.0
+            outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out, sd in zip(predict(model, values, TABLE, window.motion), (2e-2, 2e-3))]
+            made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
+        return made
+    bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
+    whole, half = (investigate(measured(share), TABLE, bare) for share in (0.0, 0.5))
+    assert [question.name for question in whole.named] == ['gyro_g_sensitivity'] and not whole.denied
+    assert not half.named
+    question = next(question for question in half.attempt.questions if question.name == 'gyro_g_sensitivity')
+    assert not half.attempt.agrees_in_halves([question], question) and half.attempt.search.score([], question).significant
+    added = _disagreement(replace(half, denied=[question]), bare.param_names)
+    assert np.all(np.linalg.eigvalsh(added) > -1e-18) and np.sqrt(np.diag(added)[bare.slices['gyroscope', 'bias']]).max() > 1e-4
+    assert not _disagreement(whole, bare.param_names).any()
+
+
+def test_windows_for_the_search_are_spread_and_bounded(monkeypatch):
+    """Of a long session every so many-th window of each kind is kept, moving ones and rests alike; of a short one all."""
+    windows = calibrated(make_pair(None, 11).first).windows
+    every = SpreadWindows()
+    for window in windows:
+        every.add(window)
+    assert [w.time[0] for w in every.windows] == [w.time[0] for w in windows]
+    monkeypatch.setattr(spread_windows, 'MOST_SAMPLES', 4000)
+    some = SpreadWindows()
+    for window in windows:
+        some.add(window)
+    assert some.n_samples == sum(len(w.time) for w in some.windows) <= 4000
+    assert {w.kind for w in some.windows} == {w.kind for w in windows}
+    assert some.windows[-1].time[0] > 0.7 * windows[-1].time[0]
