@@ -70,9 +70,9 @@ class AxisFigures:
 
     @property
     def white(self) -> float:
-        """The density of the white noise; where it is held, its bound."""
+        """The density of the white noise; where the curve does without it, its bound."""
         term = self.terms[WHITE.name]
-        return term.interval[1] if term.value is None else term.value
+        return term.value if term.value is not None and term.interval[0] > 0 else term.interval[1]
 
     def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
         """

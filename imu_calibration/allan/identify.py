@@ -15,8 +15,9 @@ from imu_calibration.allan.recording_time import RecordingTimes
 from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, still_parts
 from imu_calibration.allan.survey import Survey, survey
-from imu_calibration.allan.terms import DETERMINED, AxisNoise, identify_axis
+from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, AxisNoise, identify_axis
 from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
+from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.samples import NominalScaling, SampleBlock
 
@@ -91,11 +92,21 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     trends = tuple(search.find(axis) for axis in range(6))
     detrending = Detrending(trends, search.reference, clock.temperature(found))
     curve = read_curve(source(), parts, found.period, detrending, clock.time, nominal)
+    _require_scatter(curve)
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
     moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]))
                     for axis, variance in enumerate(curve.variance.T))
     flat = tuple(part for of_epoch in parts for part in of_epoch)
     return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found)
+
+
+def _require_scatter(curve):
+    """Refuse an axis that says the same all the time: its steps hide the noise."""
+    names = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
+    frozen = [name for name, variance in zip(names, curve.variance.T) if np.sum(variance > 0) < LEAST_SCALES]
+    if frozen:
+        raise InputError(f'every axis must scatter at rest, {" and ".join(frozen)} stays on one step of its readings; '
+                         'record with a finer resolution')
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:

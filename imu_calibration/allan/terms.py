@@ -19,6 +19,8 @@ LEAST_SCALES = 8
 """Averaging times that stay at least."""
 LONGEST_LEFT_OUT = 2.0
 """s; a model that fails beyond is wrong for another reason than a filter in the sensor."""
+WHITE_SHARE = 0.5
+"""Share of the shortest variance that white noise must make for what is shorter to be left out of a curve that nothing explains."""
 MARGIN = 8.0
 """Where a filter shows, averaging times up to so many of the longest that shows it are left out."""
 TIME = 'correlation_time'
@@ -107,7 +109,8 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
     """
     Return the moments without the averaging times at which the sensor filters its noise, and the misfit that stays.
 
-    The shortest ones are left out until one of the richest models explains the rest.
+    The shortest ones are left out until one of the richest models explains the rest. Where none ever does (vibration), those are kept that
+    are explained best, as long as their shortest still shows white noise, else all.
 
     Returns
     -------
@@ -122,11 +125,12 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
     for count in range(max(most, 0) + 1):
         trial = without_finest(moments, count)
         freedom = int(trial.used.sum()) - len(RICHEST[0])
-        misfit = min(fit_names(trial, names).misfit for names in RICHEST)
-        if chdtrc(freedom, misfit) > MISFIT:
+        fit = min((fit_names(trial, names) for names in RICHEST), key=lambda found: found.misfit)
+        if chdtrc(freedom, fit.misfit) > MISFIT:
             return _with_margin(trial, count, most), 1.0
-        if misfit / freedom < least:
-            least, kept = misfit / freedom, trial
+        seen = fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0] > WHITE_SHARE * trial.target[0]
+        if not count or (seen and fit.misfit / freedom < least):
+            least, kept = fit.misfit / freedom, trial
     return kept, max(float(least), 1.0)
 
 

@@ -114,8 +114,8 @@ class TrendSearch:
         return np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum()
 
     def find(self, axis: int) -> tuple[AxisTrend, ...]:
-        """Return the trends of an axis (0 to 5), the temperature first."""
-        if not self.usable:
+        """Return the trends of an axis (0 to 5), the temperature first; none of one that never changes."""
+        if not self.usable or not np.any(np.ptp(self.blocks.mean[:, axis])):
             return ()
         chosen: list[tuple[str, float]] = []
         while True:

@@ -1,6 +1,7 @@
 """Noise of known coefficients, by its physics: steps of a converter, white noise, flicker, a walk, a process that forgets, and grades made of them."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len
@@ -35,15 +36,22 @@ def gauss_markov(n, period, sd, time, rng):
 def flicker(n, period, instability, rng):
     """Means over the periods of noise with the two-sided density instability^2 / (2 pi f), down to an eighth of what the record holds."""
     length = next_fast_len(8 * n)
+    size = _folded_flicker(length, period)
+    drive = (rng.standard_normal(len(size)) + 1j * rng.standard_normal(len(size))) * size
+    return irfft(drive * instability * np.sqrt(length / period), length)[:n]
+
+
+@lru_cache(maxsize=2)
+def _folded_flicker(length, period):
+    """Return the root of half the density of such means for unit instability, with what folds back from higher frequencies; none at zero."""
     frequency = np.arange(length // 2 + 1) / (length * period)
     frequency[0] = frequency[1]
     folded = np.zeros(len(frequency))
     for alias in range(-6, 7):
         seen = np.abs(frequency + alias / period)
         folded += np.sinc(seen * period)**2 / (2 * np.pi * seen)
-    drive = (rng.standard_normal(len(frequency)) + 1j * rng.standard_normal(len(frequency))) * np.sqrt(0.5 * folded)
-    drive[0] = 0.0
-    return irfft(drive * instability * np.sqrt(length / period), length)[:n]
+    folded[0] = 0.0
+    return np.sqrt(0.5 * folded)
 
 
 def quantisation(n, period, coefficient, rng):
