@@ -32,11 +32,11 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config answers bench soak hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, noise-coverage, hide-and-seek, clean'
 
 setup: $(STAMP)
 
@@ -99,6 +99,10 @@ config: $(STAMP)
 # Pages that are written from what runs: the targets of exports.
 answers: $(STAMP)
 	@$(PY) -m imu_calibration.exports.page
+
+# Noise identified on 204 simulated records of ten minutes to three hours: intervals and errors, the tables of docs/noise.md; half an hour.
+noise-coverage: $(STAMP)
+	@$(PY) benchmarks/noise_records.py --write
 
 bench: $(STAMP)
 	@$(PY) benchmarks/run.py

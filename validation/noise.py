@@ -1,0 +1,81 @@
+"""Noise at rest: what one half of a recording says of the other half's Allan curve."""
+
+import numpy as np
+from scipy.special import chdtri
+
+from imu_calibration.allan.identify import identify_noise, read_rest
+from imu_calibration.allan.moment_fit import Whitener
+from imu_calibration.allan.terms import predicted
+from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.errors import InputError
+from imu_calibration.samples import SampleBlock
+from validation.recordings import BOARD, label, load
+from validation.section import Section, text
+
+RESTING = (('shaft_pitch_slow', '/imu_fixed/data_raw'), ('xsens_counts', None), ('mpu9150_0', None), ('mpu9150_3', None),
+           *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD))
+"""Recordings with rest in both halves; the fixed unit stands on the bench of a running motor, the others are held or laid down by hand between turns."""
+INSIDE = 0.90
+"""Share of the averaging times that must lie within their 95 % bands; neighbours on a curve go together, so that few independent ones count."""
+
+
+def halves(imu):
+    """Return the samples before and after the middle of the time at rest."""
+    parts = read_rest(lambda: iter([SampleBlock(imu)])).parts
+    ends = np.cumsum([part.seconds for part in parts])
+    middle = parts[int(np.searchsorted(ends, ends[-1] / 2))].end_ns
+    at = int(np.searchsorted(imu.stamp_ns, middle))
+    return imu.select(slice(0, at)), imu.select(slice(at, len(imu)))
+
+
+def predicted_band(first, second, axis):
+    """
+    Return the 95 % band of an axis' Allan variances in `second` by the noise identified in `first`, shape (2, n_scales).
+
+    The scatter of the measured variance and the uncertainty of the fit together, as a chi-square.
+    """
+    found, moments = first.axes[axis], second.moments[axis]
+    expected, freedom = predicted(moments, found)
+    fit, own = found.fit, first.record.moments[axis]
+    fitted = own.design(fit.processes)[-len(fit.covariance):]
+    seen = fit.coefficients > 0
+    columns = Whitener(found.excess * fit.covariance)(fitted[:, seen])
+    shares = second.moments[axis].scales
+    design = np.column_stack([shares.expectation(process) * moments.kept.of(process, shares.tau) for process in fit.processes])[:, seen]
+    root = np.linalg.solve(np.linalg.cholesky(columns.T @ columns), design.T)
+    freedom = 2.0 / (2.0 / freedom + (root**2).sum(axis=0) / expected**2)
+    return expected * np.array([chdtri(freedom, tail) for tail in (0.975, 0.025)]) / freedom
+
+
+def compare(imu):
+    """Return, for each of the six axes, whether each fitted averaging time of the second half lies inside, and whether a model explains the first."""
+    before, after = (SampleBlock(half) for half in halves(imu))
+    first, second = identify_noise(lambda: iter([before])), read_rest(lambda: iter([after]))
+    found = []
+    for axis in range(6):
+        lower, upper = predicted_band(first, second, axis)
+        measured, tau = second.moments[axis].variance, second.curve.tau
+        fitted = tau >= 0.999 * first.axes[axis].shortest
+        found.append((((lower <= measured) & (measured <= upper))[fitted], first.axes[axis].excess))
+    return found
+
+
+def run(folder, plots):
+    """Return the section."""
+    section, rows, inside, every = Section('Noise at rest: one half predicts the other'), [], 0, 0
+    for name, topic in RESTING:
+        try:
+            found = compare(load(folder, name, topic))
+        except InputError as error:
+            rows.append((label(name, topic), 'refused: ' + str(error).partition(';')[0], ''))
+            continue
+        explained = [points for points, excess in found if excess == 1]
+        inside, every = inside + sum(points.sum() for points in explained), every + sum(map(len, explained))
+        axes = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
+        strange = [f'{axis} ({np.sqrt(excess):.1f} times)' for axis, (_, excess) in zip(axes, found) if excess > 1]
+        rows.append((label(name, topic), ', '.join(f'{points.sum()} of {len(points)}' for points, _ in found), ', '.join(strange)))
+    section.claim('noise fitted to the first half: Allan variances of the second inside their 95 % bands', f'at least {INSIDE:.0%}',
+                  f'{inside} of {every} ({inside / every:.0%})', inside >= INSIDE * every, headline=True)
+    section.say(text('noise'))
+    section.table(('recording', 'inside, force x, y, z, rate x, y, z', 'no model explains the curve, departs by'), rows)
+    return section
