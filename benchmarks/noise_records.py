@@ -11,6 +11,7 @@ spectrum within blocks.
 import argparse
 import sys
 import time
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -201,7 +202,8 @@ def tables(found):
 def write(text, page=ROOT / 'docs/noise.md'):
     """Put the tables between their marks in the document."""
     before, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(before + BEGIN + '\n' + text + '\n' + END + rest.partition(END)[2])
+    head = f'Measured on {date.today().isoformat()} by `make noise-coverage`.'
+    page.write_text(before + BEGIN + '\n' + head + '\n\n' + text + '\n' + END + rest.partition(END)[2])
 
 
 def main():
