@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, LOWER, unpack
+from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, LOWER, HandModel, unpack
 from imu_calibration.by_hand.preintegration import integrate_turn, small_rotation
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.reference.reference_motion import skew
@@ -189,6 +189,12 @@ def _integrated(model, state, data, bias, key, memory):
     turn = integrate_turn(data.time, data.rate, bias, matrix, _further_of_turn(model, state, data, bias))
     memory[key] = ((bias, matrix, further), turn)
     return turn.mat_ji, turn
+
+
+def turned(model: HandModel, values: np.ndarray, data: TurnData) -> np.ndarray:
+    """Return the matrix that carries directions from the beginning to the end of a turn, as these parameters integrate it, shape (3, 3)."""
+    bias, matrix = values[GYRO_BIAS], unpack(values)[3]
+    return integrate_turn(data.time, data.rate, bias, matrix, _further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)).mat_ji
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across):

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import imu_calibration
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.proof import prove_by_hand
 from imu_calibration.by_hand.result import HandResult
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
@@ -100,13 +101,15 @@ def calibrate_without_table(sources, options=CalibrationOptions(), provenance=No
 
 def calibrate_samples_by_hand(recording, options=CalibrationOptions(), provenance=None, *, stills=None, findings=()):
     """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a look at the recording."""
-    hand = calibrate_by_hand(recording.imu, hand_options(options), stills, temperature_c=recording.temperature_c)
-    return hand_result(hand, recording, options, provenance, findings=findings)
+    asked = hand_options(options)
+    data = gather_by_hand(recording.imu, stills, asked.settings, temperature_c=recording.temperature_c)
+    hand = solve_by_hand(data, asked)
+    return hand_result(hand, recording, options, provenance, findings=findings, turns=data.turns)
 
 
-def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, *, findings=()):
+def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, *, findings=(), turns=()):
     """
-    Return a HandCalibration as the result that reports and documents know.
+    Return a HandCalibration as the result that reports and documents know, proven on its poses and `turns` where these are enough.
 
     Raises
     ------
@@ -123,7 +126,8 @@ def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, 
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings)
     calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
-                              conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})})
+                              conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
+                              proof=prove_by_hand(hand, turns, hand_options(options).settings))
     needed = {name: (item['needs'], float('nan')) for item in reversed(hand.advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
                       options=options, hand=hand)

@@ -96,8 +96,8 @@ def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], re
         after = min((_errors(held_out, model, sensor, each, regimes) for each in (folds, described)), key=_total)
         nominal = [nominal_values(model), _with_reference(model, nominal_values(model), reference)]
         before = min((_errors(held_out, model, sensor, [values], regimes) for values in nominal), key=_total)
-        entry = _compared(before.squares.sum(axis=1), after.squares.sum(axis=1), counts.sum(axis=1))
-        moving = {str(name): _compared(before.squares[:, k], after.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
+        entry = _entry(before.squares.sum(axis=1), after.squares.sum(axis=1), counts.sum(axis=1))
+        moving = {str(name): _entry(before.squares[:, k], after.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
                   if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
         late = {'delay_s': after.delay, 'delay_explains': 1.0 - after.squares.sum() / max(after.without_delay, 1e-300)}
         proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': held_out.n_windows} | late | {'regimes': moving}
@@ -195,14 +195,28 @@ class _Correction:
         return np.stack(parts) @ self.inverse.T
 
 
-def _compared(before, after, count):
-    """Return the entry of squares by block: rms per axis before and after, the interval of their ratio over resamples of blocks, and on how much."""
+def _entry(before, after, count):
+    return compared(before, after, count) | {'seconds': float(count.sum() * PIECE_TIME)}
+
+
+def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, components: int = AXES) -> dict:
+    """
+    Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of whole blocks.
+
+    Parameters
+    ----------
+    before, after : array, shape (n_blocks,)
+        Sums of squared errors.
+    count : array, shape (n_blocks,)
+        How many errors each sum holds, per component.
+    components : int
+
+    """
     held = count > 0
     before, after, count = before[held], after[held], count[held]
     draw = np.random.default_rng(1).integers(0, len(count), (RESAMPLES, len(count)))
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
-    total = AXES * count.sum()
-    return {'before': float(np.sqrt(before.sum() / total)), 'after': float(np.sqrt(after.sum() / total)), 'ci95': [float(low), float(high)],
-            'seconds': float(count.sum() * PIECE_TIME)}
+    total = components * count.sum()
+    return {'before': float(np.sqrt(before.sum() / total)), 'after': float(np.sqrt(after.sum() / total)), 'ci95': [float(low), float(high)]}

@@ -105,7 +105,7 @@ def diagnose_without_table(source, options=CalibrationOptions(), provenance=None
     recording = read_by_hand(source(), options.nominal, [preflight])
     data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
-    result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings)
+    result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings, turns=data.turns)
     return DiagnosisResult(found.diagnosis, result.calibration, result.tolerances, result.needed, result.observations, options)
 
 

@@ -1,0 +1,58 @@
+"""A calibration by hand is proven on poses and turns that took no part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.proof import FOLDS, _Rows, prove_by_hand
+from imu_calibration.calibration.proof_words import disproved
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.calibrate import calibrate
+
+from worlds.hand_sessions import GRAVITY, NOMINAL, simulate
+
+OPTIONS = HandOptions(gravity=GRAVITY)
+
+
+@pytest.fixture(scope='module')
+def session():
+    imu, ranges, _ = simulate(3, n_poses=20)
+    return gather_by_hand(imu, ranges)
+
+
+def test_a_good_calibration_is_proven_on_poses_and_turns(session):
+    hand = solve_by_hand(session, OPTIONS)
+    proof = prove_by_hand(hand, session.turns, OPTIONS.settings)
+    assert proof['accelerometer']['windows'] == 20 and proof['gyroscope']['unit'] == 'rad per turn' and not disproved(proof)
+    for entry in proof.values():
+        assert entry['after'] < 0.2 * entry['before'] and entry['ci95'][1] < 0.3
+
+
+def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
+    hand = solve_by_hand(session, OPTIONS)
+    out = np.arange(20) % FOLDS == 3
+    step = _Rows(hand, session.turns).values_without(out)
+    place = np.cumsum(~out) - 1
+    rest = [replace(turn, first=int(place[turn.first]), last=int(place[turn.last])) for turn in session.turns if not (out[turn.first] or out[turn.last])]
+    parts = {name: getattr(session.poses, name)[~out] for name in ('force', 'rate', 'force_sem', 'rate_sem', 'start', 'stop', 'time')}
+    again = solve_by_hand(replace(session, poses=replace(session.poses, **parts), turns=rest), OPTIONS)
+    sd = np.array([hand.sd_of(name) for name in hand.model.param_names])
+    moved = (again.state.values - hand.state.values) / sd
+    assert np.abs(moved).max() > 0.5
+    assert np.abs((step - again.state.values) / sd).max() < 0.35 * np.abs(moved).max()
+
+
+def test_an_imu_without_errors_is_not_helped_and_says_so():
+    imu, _, _ = simulate(5, n_poses=20, truth=NOMINAL.copy(), pose_sd=0.02)
+    found = calibrate(SampleBlock(imu), gravity=GRAVITY)
+    assert found.verdict.word == 'bad' and found.exit_code == 3
+    assert 'that it helps is not shown' in found.verdict.reasons[0].what
+
+
+def test_six_faces_are_too_few_to_leave_any_out():
+    imu, ranges, _ = simulate(4, n_poses=8)
+    few = gather_by_hand(imu, ranges)
+    assert prove_by_hand(solve_by_hand(few, OPTIONS), few.turns, OPTIONS.settings) == {}
