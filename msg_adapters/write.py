@@ -4,14 +4,11 @@ import numpy as np
 
 from msg_adapters.bag import DEFAULT_TOPICS
 from msg_adapters.bag_writer import BagWriter
-from msg_adapters.copying import copy_with_corrected
 from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import UNKNOWN, encode_imu, encode_joints, encode_temperature, rows
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.temperature import TEMPERATURE_TYPE
-
-__all__ = ['BagWriter', 'copy_with_corrected', 'write_session']
 
 BATCH = 65536
 """Messages handed to the storage at once; bounds the memory of a long recording."""

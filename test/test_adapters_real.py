@@ -12,10 +12,10 @@ from test_adapters_bag import make_session
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
+from msg_adapters.copying import copy_with_corrected
 from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.imu import imu_from_rows, imu_row
 from msg_adapters.joint_state import joint_row, joints_from_rows
-from msg_adapters.write import copy_with_corrected
 
 
 def by_rosbags(path, topic, limit=None):

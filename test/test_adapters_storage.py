@@ -13,10 +13,11 @@ from imu_calibration.cli.main import main
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
+from msg_adapters.copying import copy_with_corrected
 from msg_adapters.layout import Packed
 from msg_adapters.storage import StorageFile, Stretch
 from msg_adapters.storages import STORAGES, Storage
-from msg_adapters.write import copy_with_corrected, write_session
+from msg_adapters.write import write_session
 
 
 class LinesWriter:

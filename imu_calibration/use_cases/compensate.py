@@ -96,7 +96,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         if output is None:
             parts = [_corrected(block.imu, correct(block.imu), transfer, late) for block in bag.blocks() if block.imu is not None]
             return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost)
-        from msg_adapters.write import copy_with_corrected
+        from msg_adapters.copying import copy_with_corrected
         lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic, correct, stream.propagate, target_frame or None,
                                    None if transfer is None else transfer.mat_ts, late)
         return _outcome(None, stream, lost)
