@@ -1,20 +1,19 @@
 """The tree builds as a ROS 2 workspace, and every executable starts from it."""
 
 import os
-import shutil
 import signal
 import subprocess
-import sys
 import time
 import uuid
 from pathlib import Path
 
 import pytest
 
+from ros.workspace import build, plain_environment
+
 ROOT = Path(__file__).resolve().parents[1]
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
 EXECUTABLES = ('imu_calibration', *NODES)
-NOT_SOURCE = shutil.ignore_patterns('.git', '.venv*', '.hypothesis', '.pytest_cache', '__pycache__', '*.egg-info', 'build', 'install', 'log', 'demo', 'out')
 
 TABLE = 'table_file:={config}/table_three_axis.yaml'
 PARAMETERS = {'calibration_node': [TABLE], 'simulator_node': [TABLE], 'compensator_node': []}
@@ -28,21 +27,8 @@ pytestmark = pytest.mark.slow
 def workspace(tmp_path_factory):
     """A workspace with this tree built in it."""
     folder = tmp_path_factory.mktemp('workspace')
-    shutil.copytree(ROOT, folder / 'src' / 'imu_calibration', ignore=NOT_SOURCE)
-    done = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, env=plain_environment(), capture_output=True, text=True,
-                          timeout=300)
-    logs = '\n'.join(path.read_text() for path in sorted(folder.glob('log/latest_build/*/std*.log')))
-    assert done.returncode == 0, done.stdout + done.stderr + logs
+    build(folder)
     return folder
-
-
-def plain_environment():
-    """The environment of a shell outside the checkout, with this interpreter first on PATH."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(('PYTEST', 'COLCON', 'PYTHONPATH'))}
-    environment['PATH'] = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
-    if 'ROS_DISTRO' in os.environ and 'PYTHONPATH' in os.environ:
-        environment['PYTHONPATH'] = os.environ['PYTHONPATH']
-    return environment
 
 
 @pytest.fixture(scope='module')

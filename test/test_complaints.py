@@ -3,9 +3,13 @@
 import pytest
 
 pytest.importorskip('rclpy')
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+
+from imu_calibration.calibration.effect_states import GroupState  # noqa: E402
 from imu_calibration.diagnosis.live import DiagnosisState  # noqa: E402
 from imu_calibration.nodes.calibration_guide import PATIENCE, CalibrationGuide  # noqa: E402
 from imu_calibration.nodes.calibration_state import WorkerState  # noqa: E402
+from imu_calibration.nodes.calibration_status import statuses_of  # noqa: E402
 from imu_calibration.nodes.complaints import MOST_KINDS, REMINDER, Complaints  # noqa: E402
 from imu_calibration.preflight.stream_watch import StreamState  # noqa: E402
 from imu_calibration.segmentation.stamping import COUNTED, StampLine  # noqa: E402
@@ -48,6 +52,13 @@ def test_memory_stays_bounded_whatever_is_wrong(now):
     for number in range(3 * MOST_KINDS):
         complaints.event(f'trouble {chr(65 + number % 26)}{"x" * number}')
     assert len(complaints._said) <= MOST_KINDS
+
+
+def test_figures_that_are_not_known_are_left_out_and_no_status_is_stale():
+    group = GroupState('accelerometer', 'bias', 'held', 'accelerometer.bias.x', float('nan'), 0.01, 'm/s^2', 'turn it over')
+    for status in statuses_of(WorkerState(groups=[group], verdict='bad', faults=('no disk',))):
+        assert all(value.value != 'nan' for value in status.values) and 'nan' not in status.message
+        assert status.level != DiagnosticStatus.STALE
 
 
 class Topic:

@@ -1,5 +1,6 @@
 """A node that is interrupted while it is still starting ends quietly, with exit code 0."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from imu_calibration.nodes.early_end import is_node_process
+from imu_calibration.nodes.parameter_files import settings_of
+from imu_calibration.settings import describe
 
 ROOT = Path(__file__).resolve().parents[1]
 SLOW_IMPORT = "import pathlib, time\npathlib.Path({mark!r}).touch()\ntime.sleep(60)\n"
@@ -48,6 +51,38 @@ def test_interrupted_while_importing(node, tmp_path):
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=20)
     assert (process.returncode, out, error) == (0, '', '')
+
+
+ENDS = '''
+import sys
+import rclpy
+from types import SimpleNamespace
+from imu_calibration.nodes.lifecycle import run_node
+def spin(node):
+    {what}
+sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin))
+'''
+
+
+@pytest.mark.parametrize(('what', 'code', 'words'), (
+    ("raise ValueError('nobody foresaw this')", 1, 'error: the node cannot go on: ValueError: nobody foresaw this\n'),
+    ("raise __import__('imu_calibration.errors', fromlist=['x']).InputError('a bag must be there; name one')", 1, 'error: a bag must be there; name one\n'),
+    ('node.failed = True', 1, ''), ('pass', 0, '')), ids=('unforeseen', 'refused', 'failed', 'done'))
+def test_a_node_that_cannot_go_on_says_so_and_ends_with_another_code(what, code, words):
+    pytest.importorskip('rclpy')
+    done = subprocess.run([sys.executable, '-c', ENDS.format(what=what)], env=environment(), capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (code, words)
+
+
+@pytest.mark.parametrize('node', ('calibration_node', 'compensator_node'))
+def test_help_says_what_a_node_does_and_lists_every_parameter(node, capsys):
+    pytest.importorskip('rclpy')
+    module = importlib.import_module(f'imu_calibration.nodes.{node}')
+    assert module.main(['--help']) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f'usage: ros2 run imu_calibration {node} --ros-args') and '/diagnostics' in text
+    assert all(f'\n  {item.name}: ' in text for group in settings_of(node) for item in describe(group))
+    assert module.main(['--calibration', 'a.yaml']) == 1 and "got '--calibration' before it" in capsys.readouterr().err
 
 
 def test_interrupted_while_ros_starts():

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,16 @@ ROSDEP_KEYS = {
     # installed with those that need them; compression is in the standard library from Python 3.14 on
     'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
 }
+NOBLE = {
+    'python3-numpy': 'python3-numpy', 'python3-scipy': 'python3-scipy', 'python3-yaml': 'python3-yaml', 'python3-jinja2': 'python3-jinja2',
+    'python3-matplotlib': 'python3-matplotlib', 'python3-rich': 'python3-rich', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
+    'python3-pytest': 'python3-pytest', 'python3-pytest-xdist': 'python3-pytest-xdist', 'urdfdom_py': 'ros-jazzy-urdfdom-py', 'xacro': 'ros-jazzy-xacro',
+    'ament_index_python': 'ros-jazzy-ament-index-python', 'launch': 'ros-jazzy-launch', 'launch_ros': 'ros-jazzy-launch-ros', 'rclpy': 'ros-jazzy-rclpy',
+    'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
+    'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs', 'sensor_msgs': 'ros-jazzy-sensor-msgs', 'std_msgs': 'ros-jazzy-std-msgs', 'std_srvs': 'ros-jazzy-std-srvs',
+    'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
+}
+"""Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
 EXTRAS = {'dask'}
 """Installed by those who ask for the extra of that name; the code goes without."""
 READ_SETUP = '''
@@ -87,6 +98,19 @@ def test_manifest_set_up_and_module_agree(manifest, installed):
     assert manifest.licenses[0] == installed['license'] == 'Apache-2.0'
     assert (ROOT / manifest.licenses[0].file).is_file()
     assert manifest.get_build_type() == 'ament_python'
+
+
+def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
+    """By the table, and by rosdep itself where it is installed and has its lists."""
+    keys = {dependency.name for dependency in (*manifest.exec_depends, *manifest.test_depends, *manifest.build_depends)}
+    assert keys <= set(NOBLE), keys - set(NOBLE)
+    rosdep = shutil.which('rosdep')
+    known = rosdep and subprocess.run([rosdep, 'resolve', 'python3-numpy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
+    if not known or known.returncode:
+        return
+    for key in sorted(keys):
+        done = subprocess.run([rosdep, 'resolve', key, '--rosdistro=jazzy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0 and NOBLE[key] in done.stdout.split(), (key, done.stdout, done.stderr)
 
 
 OPTIONAL = {'dask', 'distributed'}

@@ -56,11 +56,10 @@ class BagPlayerNode(Node):
         self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: {", ".join(self._topics)}')
 
     def close(self):
-        """Stop publishing and close the files."""
+        """Stop publishing and close the files; return what became of it."""
         self._playback.end()
         self._bag.close()
-        if not self._is_over:
-            self.get_logger().info(f'stopped after {self._playback.n_published} messages')
+        return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
 
     def _open(self):
         path = self.settings.bag

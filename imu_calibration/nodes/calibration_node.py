@@ -120,11 +120,9 @@ class CalibrationNode(Node):
         watch_inputs(self, list(self._inputs.values()))
         self.get_logger().info(f'calibrates {on_what}; ~/save writes {self.worker.place.calibration}')
 
-    def close(self) -> None:
-        """End the worker after what it is doing, and say what became of the motion that is in no file."""
-        line = self.worker.end()
-        if line:
-            self.get_logger().warning(f'ends: {line}')
+    def close(self) -> str:
+        """End the worker after what it is doing; return what became of the motion that is in no file."""
+        return self.worker.end()
 
     def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
         settings = self.settings

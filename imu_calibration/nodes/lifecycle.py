@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,6 +15,8 @@ from imu_calibration.nodes.help import help_text
 from imu_calibration.nodes.parameters import unknown_parameters
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+HEARD = 0.1
+"""Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
 
 
 def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, spin: Callable[[Any], None] | None = None,
@@ -24,7 +27,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     Parameters
     ----------
     make_node : callable
-        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed;
+        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, what
+        it returns is printed;
         an attribute `failed` says whether it ended because it could not go on, and has said so.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
@@ -48,6 +52,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     asked_to_end = []
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: asked_to_end.append(number))
+    told = sys.unraisablehook   # what rclpy leaves half made when the context ends is no news either
+    sys.unraisablehook = lambda unraisable: None if asked_to_end else told(unraisable)
     rclpy.init(args=arguments)
     node = None
     try:
@@ -56,13 +62,15 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         node = make_node()
         for line in unknown_parameters(node):
             node.get_logger().warning(line)
-        (spin or rclpy.spin)(node)
+        if not asked_to_end:   # an executor cannot be made any more
+            (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except ImuCalibrationError as error:
         return _failed(error.told(hints or {}))
     except Exception as error:
         # A context that ends while something is being made or published fails in many ways; none of them is news.
+        time.sleep(HEARD)
         if not asked_to_end:
             return _failed(f'the node cannot go on: {shortened(f"{type(error).__name__}: {error}", 300)}')
     finally:
@@ -76,8 +84,16 @@ def _failed(line: str) -> int:
 
 
 def _end(node: Any) -> None:
+    _ignore_signals()   # `ros2 launch` sends every signal twice, and the second must not cut off what is being saved
     if node is not None:
-        if hasattr(node, 'close'):
-            node.close()
+        last_words = node.close() if hasattr(node, 'close') else ''
+        if last_words:   # a logger would also publish, and complain that it cannot any more
+            print(f'[{node.get_name()}]: {last_words}', file=sys.stderr, flush=True)
         node.destroy_node()
     rclpy.try_shutdown()
+    _ignore_signals()   # rclpy has put back what it had found
+
+
+def _ignore_signals() -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)

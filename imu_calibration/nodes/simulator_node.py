@@ -104,10 +104,9 @@ class SimulatorNode(Node):
         self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, {settings.time_factor:g} times as fast as real time')
 
     def close(self):
-        """Stop publishing."""
+        """Stop publishing; return what became of it."""
         self._playback.end()
-        if not self._is_over:
-            self.get_logger().info(f'stopped after {self._playback.n_published} messages')
+        return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
 
     def _make_table(self):
         settings = self.settings

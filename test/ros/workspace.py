@@ -1,5 +1,6 @@
 """This tree built as a ROS 2 workspace, and shells in it; with the `ros2` command line where its wheels are."""
 
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -63,7 +64,8 @@ def with_ros2(folder):
     if not any(wheel.name.startswith('ros2cli-') for wheel in wheels):
         pytest.skip(f'no ros2 command and no wheels of ros2cli; set {VARIABLE} to their folder')
     install = [sys.executable, '-m', 'pip', '--disable-pip-version-check', '--no-input', 'install', '--quiet', '--target', str(folder)]
-    for more in (['--no-deps', '--no-index', *map(str, wheels)], NEEDED):
+    needed = [name for name in NEEDED if importlib.util.find_spec(name.replace('-', '_')) is None]
+    for more in (['--no-compile', '--no-deps', '--no-index', *map(str, wheels)], *[['--no-compile', *needed]] * bool(needed)):
         done = subprocess.run([*install, *more], capture_output=True, text=True, timeout=300)
         if done.returncode:
             pytest.skip(f'ros2cli cannot be installed here: {done.stderr.strip().splitlines()[-1]}')
