@@ -18,7 +18,14 @@ from imu_calibration.segmentation.window_cutter import dropped
 
 def motions_needed(solution, tolerances, table):
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
-    return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd)
+    return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd, _only_axis(table))
+
+
+def _only_axis(table):
+    """Return the axis, in the sensor frame, about which a table with a single joint turns; None for other tables."""
+    if len(table.joints) != 1 or not table.joints[0].turns:
+        return None
+    return table.mat_sl @ np.asarray(table.joints[0].axis)
 
 
 def document(solution, tolerances, table, gathered, needed, provenance=None, proof=None, changes=ModelChanges()):

@@ -97,6 +97,9 @@ def _judge(out, look, hints):
         groups.setdefault(status, []).append(name)
     for status, names in groups.items():
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
+    needs = {}
     for direction in result.calibration.undetermined:
-        out.print(f'needs: {direction["needs"]}  ({", ".join(direction["parameters"])})', soft_wrap=True)
+        needs.setdefault(direction['needs'], {}).update(direction['parameters'])
+    for motion, names in needs.items():
+        out.print(f'needs: {motion}  ({", ".join(names)})', soft_wrap=True)
     return exit_code(result.calibration)

@@ -131,4 +131,5 @@ def where_most(time, residual, noise_sd):
     first = known[int(np.argmin(lengths))]
     if lengths.min() > 0.6 * np.ptp(time):
         return None
-    return f'four fifths of it lie between {time[first]:.0f} s and {time[stop[first] - 1]:.0f} s'
+    start, end = f'{time[first]:.0f}', f'{time[stop[first] - 1]:.0f}'
+    return f'four fifths of it lie between {start} s and {end} s' if start != end else f'four fifths of it lie in one window at {start} s'

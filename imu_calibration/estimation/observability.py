@@ -7,7 +7,7 @@ import scipy.linalg
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.scaled_solve import inverse_normal
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, TABLE_MOTIONS
 
 
 def added_information(model, values, noise, motion, gravity):
@@ -79,12 +79,13 @@ def weak_directions(covariance, tolerances, names, limit=6):
     return found
 
 
-def needed_motions(solution, tolerances, gravity, prior_sd):
+def needed_motions(solution, tolerances, gravity, prior_sd, only_axis=None):
     """
     Return for each parameter that is not determined the standard motion that would serve it best.
 
     Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
-    tolerances.
+    tolerances. A table that turns the sensor about one axis only (`only_axis`, unit vector in the sensor frame) can do few of them: where none
+    of these would help, the IMU has to be mounted anew.
 
     Returns
     -------
@@ -100,7 +101,16 @@ def needed_motions(solution, tolerances, gravity, prior_sd):
     for motion in MOTIONS:
         total = base + added_information(solution.model, solution.values, solution.noise, motion, gravity)
         predicted[motion] = np.sqrt(np.clip(np.diag(inverse_normal(total)), 0, None))
-    return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}
+    if only_axis is None:
+        return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}
+    possible = {motion: sd for motion, sd in predicted.items() if motion.possible_about(only_axis)}
+    return {solution.param_names[k]: _best_on_one_joint(solution, k, possible) for k in lacking}
+
+
+def _best_on_one_joint(solution, index, possible):
+    motion = min(possible, key=lambda m: possible[m][index], default=None)
+    sd = float('nan') if motion is None else float(possible[motion][index])
+    return (motion.text, sd) if sd < 0.7 * solution.sd[index] else (OTHER_MOUNT, float('nan'))
 
 
 def _best(solution, index, predicted):

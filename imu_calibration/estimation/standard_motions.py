@@ -7,6 +7,11 @@ import numpy as np
 from imu_calibration.constants import DEG
 from imu_calibration.reference.reference_motion import Reference
 
+ALONG = 0.98
+"""Cosine of the angle up to which a joint lies along a sensor axis."""
+OTHER_MOUNT = 'mount the IMU at another angle on the joint and record the same motion again, beside this recording'
+"""What helps where one joint has shown what it can."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -18,6 +23,12 @@ class Motion:
     """What to do."""
     make: object
     """Function of gravity that returns pieces of the motion, each a Reference."""
+    axis: tuple | None = None
+    """The one axis of the sensor that it turns about; None: it takes several, or other attitudes."""
+
+    def possible_about(self, axis_s):
+        """Return whether a table can do it that turns the sensor about one axis only, given as a unit vector in the sensor frame."""
+        return self.axis is not None and abs(float(np.dot(self.axis, axis_s))) > ALONG
 
 
 def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None):
@@ -93,15 +104,15 @@ def _fine_poses():
 MOTIONS = (
     Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(EDGES)),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
-    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), (-200, -100, 100, 200))),
-    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), (-200, -100, 100, 200))),
-    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), (-200, -100, 100, 200))),
+    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), (-200, -100, 100, 200)), (1, 0, 0)),
+    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), (-200, -100, 100, 200)), (0, 1, 0)),
+    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), (-200, -100, 100, 200)), (0, 0, 1)),
     Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
         piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
         for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
-    Motion('oscillate_x', "oscillate about the sensor's x axis, 30 deg at 1 Hz", _oscillation((1, 0, 0), 30, 1.0)),
-    Motion('oscillate_y', "oscillate about the sensor's y axis, 30 deg at 1 Hz", _oscillation((0, 1, 0), 30, 1.0)),
-    Motion('oscillate_z', "oscillate about the sensor's z axis, 30 deg at 1 Hz", _oscillation((0, 0, 1), 30, 1.0)),
+    Motion('oscillate_x', "oscillate about the sensor's x axis, 30 deg at 1 Hz", _oscillation((1, 0, 0), 30, 1.0), (1, 0, 0)),
+    Motion('oscillate_y', "oscillate about the sensor's y axis, 30 deg at 1 Hz", _oscillation((0, 1, 0), 30, 1.0), (0, 1, 0)),
+    Motion('oscillate_z', "oscillate about the sensor's z axis, 30 deg at 1 Hz", _oscillation((0, 0, 1), 30, 1.0), (0, 0, 1)),
     Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),

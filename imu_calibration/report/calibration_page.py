@@ -13,6 +13,7 @@ from imu_calibration.report.observability_section import observability_section
 from imu_calibration.report.origin import origin_section, recording_facts
 from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
+from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import UNIT, residual_section
 from imu_calibration.report.worked_sample import worked_sample
@@ -33,7 +34,8 @@ def calibration_report(result: CalibrationResult) -> str:
     at_rest, moving = reading_tables(result, errors)
     navigation = navigation_section(result, errors)
     return render('calibration.html', title='IMU calibration', verdict=result.verdict,
-                  facts=recording_facts(result), tiles=tiles(result, errors, navigation), groups=parameter_groups(result),
+                  facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, errors, navigation),
+                  groups=parameter_groups(result),
                   sample=worked_sample(result), derived=derived_section(result), residuals=residual_section(result, errors),
                   observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
                   moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)

@@ -1,0 +1,20 @@
+"""The proof in numbers: errors on data that took no part, by sensor and by what the IMU does."""
+
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.proof_words import harmed
+from imu_calibration.units import for_people, significant
+
+
+def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:
+    """Return a row for each sensor and motion: 'sensor', 'motion', 'much', 'before', 'after', 'ratio', 'bad'; empty without a proof."""
+    rows = []
+    for sensor, found in calibration.proof.items():
+        worse = harmed(found)
+        for motion, part in (('all', found), *(found.get('regimes') or {}).items()):
+            factor, unit = for_people(found['unit'])
+            before, after = (f'{significant(part[name] * factor)} {unit}' for name in ('before', 'after'))
+            low, high = part['ci95']
+            much = f'{part["seconds"]:.0f} s' if 'seconds' in part else f'{found["windows"]}'
+            rows.append({'sensor': sensor, 'motion': motion, 'much': much, 'before': before, 'after': after,
+                         'ratio': f'{low:.2f} to {high:.2f}', 'bad': motion in worse})
+    return rows

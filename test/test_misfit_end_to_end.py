@@ -1,0 +1,36 @@
+"""In worlds with causes that no catalogue holds a calibration helps in another session and harms in no motion, or says in a sentence that it does not."""
+
+import pytest
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.reference.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.check import check
+
+from worlds.misfit_worlds import make_pair
+
+WORSE = 1.05
+"""No kind of motion may get worse by more."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('cause', 'world'), [
+    ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}), ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
+    ('flexible_mount', {}), ('backlash', {}), ('stamp_bursts', {}),
+], ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'))
+def test_what_is_handed_over_helps_in_another_session(cause, world):
+    pair = make_pair(cause, 21, **world)
+    table = Table.from_mapping(pair.table)
+    try:
+        found = calibrate(pair.first.block, table)
+    except ImuCalibrationError as refused:
+        assert '\n' not in str(refused)
+        return
+    if found.verdict.word == 'bad':
+        assert found.exit_code == 3 and '\n' not in found.verdict.reasons[0].what
+        return
+    proof = check(pair.second.block, found.calibration, table).proof
+    for sensor, entry in proof.items():
+        worst = max(part['after'] / part['before'] for part in entry['regimes'].values())
+        print(f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted below 1, worst motion {worst:.3f} wanted at most {WORSE}')
+        assert entry['after'] < entry['before'] and worst <= WORSE

@@ -1,0 +1,68 @@
+"""Advice and explanations speak of the case at hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.comparison import compare
+from imu_calibration.calibration.from_solution import motions_needed
+from imu_calibration.diagnosis.unexplained import where_most
+from imu_calibration.errors import InputError
+from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT
+from imu_calibration.reference.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.compensate import compensate
+
+from worlds.compensation_cases import random_calibration
+from worlds.misfit_worlds import make_pair
+
+
+def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
+    pair = make_pair(None, 1, table='shaft', profile='sweeps')
+    table = Table.from_mapping(pair.table)
+    result = calibrate(pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True).result
+    needs = {text for text, _ in motions_needed(result.solution, result.tolerances, table).values()}
+    possible = {motion.text for motion in MOTIONS if motion.possible_about((1.0, 0.0, 0.0))}
+    assert OTHER_MOUNT in needs and needs <= {OTHER_MOUNT} | possible
+    assert possible == {motion.text for motion in MOTIONS if motion.name in ('spin_x', 'oscillate_x')}
+
+
+def test_compare_says_that_off_diagonal_terms_include_the_mounting():
+    first = random_calibration(1, gauge={'origin': 'mount', 'axes': 'mount'})
+    values = first.values.copy()
+    values[first.param_names.index('gyroscope.matrix.xy')] += 0.05
+    by_hand = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
+    on_table = compare(first, replace(first, values=values)).lines
+    assert any('how the IMU was mounted' in line for line in on_table)
+    assert not any('how the IMU was mounted' in line for line in compare(*(replace(c, gauge=by_hand) for c in (first, replace(first, values=values)))).lines)
+    assert not any('how the IMU was mounted' in line for line in compare(first, first).lines)
+
+
+def test_a_rest_in_one_window_does_not_lie_between_two_equal_times():
+    time, residual = np.arange(10) * 20.0, np.full((10, 3), 1.0)
+    residual[4] = 50.0
+    assert where_most(time, residual, np.ones(3)) == 'four fifths of it lie in one window at 80 s'
+    residual[7] = 50.0
+    assert where_most(time, residual, np.ones(3)) == 'four fifths of it lie between 80 s and 140 s'
+
+
+def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):
+    rosbags = pytest.importorskip('rosbags.rosbag1')
+    from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS1_NOETIC)
+    imu, header, stamp = (store.types[f'{name}'] for name in ('sensor_msgs/msg/Imu', 'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'))
+    vector, quaternion, cov = store.types['geometry_msgs/msg/Vector3'], store.types['geometry_msgs/msg/Quaternion'], np.zeros(9)
+    with rosbags.Writer(tmp_path / 'old.bag') as writer:
+        connection = writer.add_connection('/imu/data_raw', imu.__msgtype__, typestore=store)
+        message = imu(header(0, stamp(1, 0), 'imu_link'), quaternion(0.0, 0.0, 0.0, 1.0), cov, vector(0.0, 0.0, 0.0), cov, vector(0.0, 0.0, 9.8), cov)
+        writer.write(connection, 10**9, store.serialize_ros1(message, imu.__msgtype__))
+    calibration = random_calibration(1, verdict='good')
+    with pytest.raises(InputError, match='rosbags-convert --src'):
+        compensate(tmp_path / 'old.bag', calibration, output=tmp_path / 'new', anyway=True)
+
+
+def test_the_report_shows_the_proof_by_motion():
+    pair = make_pair(None, 1)
+    found = calibrate(pair.first.block, Table.from_mapping(pair.table), model_as_asked=True)
+    assert 'id="proof"' in found.report and '<td class="k">fast turns</td>' in found.report

@@ -1,0 +1,120 @@
+"""Recordings of hardware predict one another: halves, two parts of one trial, and what must be refused."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.check import check
+from validation.section import Section, text
+from validation.shaft import read
+
+RECORDINGS = ('shaft_pitch_slow', 'shaft_yaw_medium', 'shaft_yaw_slow_later', 'shaft_roll_fast', 'shaft_roll_fast_later')
+ONE_UNIT = (('shaft_roll_fast', 'shaft_roll_fast_later'),)
+"""Two parts of one trial: one unit, one mounting, one motion."""
+WORSE = 1.05
+"""No kind of motion may get worse by more."""
+
+
+@cache
+def recording(folder, name):
+    """Return (Table, SampleBlock) of a whole recording."""
+    table, blocks = read(folder, name)
+    parts = {field: [getattr(block, field) for block in blocks if getattr(block, field) is not None] for field in ('imu', 'joints')}
+    return table, SampleBlock(*(type(part[0]).concatenate(part) for part in parts.values()))
+
+
+def halves(block):
+    """Return the two halves of a recording."""
+    start, end = block.imu.stamp_ns[[0, -1]]
+    middle = start + (end - start) // 2
+    return [SampleBlock(block.imu.select(side(block.imu.stamp_ns, middle)), block.joints.select(side(block.joints.stamp_ns, middle)))
+            for side in (np.less, np.greater_equal)]
+
+
+@cache
+def _calibrated(folder, name, part):
+    table, block = recording(folder, name)
+    return calibrate(block if part is None else halves(block)[part], table)
+
+
+def transfer(folder, made, used, parts=(None, None)):
+    """Return (Calibrated or the refusal, Checked or None): calibrated on one recording or half, checked on another."""
+    table, block = recording(folder, used)
+    try:
+        found = _calibrated(folder, made, parts[0])
+    except ImuCalibrationError as error:
+        return error, None
+    return found, check(block if parts[1] is None else halves(block)[parts[1]], found.calibration, table)
+
+
+def outcome(found, checked):
+    """Return (what happened, whether it is as it must be): it helps and harms in no motion, or it is refused with a sentence."""
+    if checked is None:
+        return f'refused: {found}', True
+    ratios = {sensor: entry['after'] / entry['before'] for sensor, entry in checked.proof.items()}
+    worst = max(part['after'] / part['before'] for entry in checked.proof.values() for part in entry['regimes'].values())
+    words = ', '.join(f'{sensor} {ratio:.2f}' for sensor, ratio in ratios.items()) + f', at most {worst:.2f} in any motion'
+    if found.verdict.word == 'bad':
+        return f'"bad", {found.verdict.reasons[0].what.partition(":")[2].strip() or found.verdict.reasons[0].what} (would be: {words})', True
+    return words, bool(ratios) and max(ratios.values()) < 1.0 and worst <= WORSE
+
+
+def spread(first, second):
+    """Return the rms of differences over combined standard deviations by group of parameters, of what both know."""
+    groups = {}
+    theirs = dict(zip(second.param_names, zip(second.values, second.sd, second.status)))
+    for name, value, sd, status in zip(first.param_names, first.values, first.sd, first.status):
+        other = theirs.get(name)
+        if other and 'held' not in (status, other[2]) and not name.startswith('reference'):
+            groups.setdefault(name.rpartition('.')[0], []).append((value - other[0]) / np.hypot(sd, other[1]))
+    return {group: float(np.sqrt(np.mean(np.square(values)))) for group, values in groups.items()}
+
+
+def must_be_refused(folder):
+    """Yield (what is wrong, what came out, whether it was noticed)."""
+    table, block = recording(folder, 'shaft_yaw_medium')
+    yield 'the IMU on the bench beside the shaft (wrong topic)', *_attempt(folder / 'shaft_yaw_medium', table, imu_topic='/imu_fixed/data_raw')
+    yield 'stamps of the IMU one second late', *_attempt(replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 10**9)), table)
+    turned = replace(block.joints, position=-block.joints.position, velocity=-block.joints.velocity)
+    yield 'the encoder counts the other way round', *_attempt(replace(block, joints=turned), table)
+    rate = block.imu.rate_s.copy()
+    rate[len(rate) // 3:2 * len(rate) // 3] = rate[len(rate) // 3]
+    yield 'the gyroscope is frozen for a third of the time', *_attempt(replace(block, imu=replace(block.imu, rate_s=rate)), table)
+
+
+def _attempt(source, table: Table, **choices):
+    try:
+        found = calibrate(source, table, **choices)
+    except ImuCalibrationError as error:
+        return f'refused: {error}', True
+    warned = [item['text'] for item in found.calibration.statistics['preflight'] if 'frozen' in item['text'] or 'stay' in item['text']]
+    if warned or found.verdict.word == 'bad':
+        return f'"{found.verdict.word}": {(warned or [found.verdict.reasons[0].what])[0]}', True
+    return f'"{found.verdict.word}"', False
+
+
+def run(folder, plots):
+    """Return the section."""
+    section = Section('Recordings of hardware predict one another')
+    for first, second in ONE_UNIT:
+        for made, used in ((first, second), (second, first)):
+            section.claim(f'calibrated on {made}, compensated on {used}: error after / before', 'below 1, in no motion above 1.05, or refused with a sentence',
+                          *outcome(*transfer(folder, made, used)), True)
+        pair = [transfer(folder, name, name)[0] for name in (first, second)]
+        if not any(isinstance(found, Exception) for found in pair):
+            groups = spread(*(found.calibration for found in pair))
+            section.claim(f'{first} and {second}: differences over combined sds, rms by group', 'at most 1.5 in every group',
+                          ', '.join(f'{group} {value:.1f}' for group, value in groups.items()), max(groups.values()) <= 1.5, True)
+    for name in RECORDINGS:
+        for made, used in ((0, 1), (1, 0)):
+            section.claim(f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after / before', 'below 1, in no motion above 1.05, or refused',
+                          *outcome(*transfer(folder, name, name, (made, used))), made == 0)
+    for what, found, noticed in must_be_refused(folder):
+        section.claim(f'shaft_yaw_medium, {what}', 'refused, or said', found, noticed, True)
+    section.say(text('cross'))
+    return section
