@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance  # noqa: E402
-from imu_calibration.allan.forms import PROCESSES, fit_names  # noqa: E402
+from imu_calibration.allan.forms import PROCESSES, fit_form  # noqa: E402
 from imu_calibration.allan.moment_fit import Moments, Whitener  # noqa: E402
 from imu_calibration.allan.processes import gauss_markov, mean_covariance  # noqa: E402
 from imu_calibration.allan.scale_covariance import ScaleCovariance  # noqa: E402
@@ -72,7 +72,7 @@ def judged(truth, moments):
         term = found.alternatives.get(name) or found.terms.get(name)
         figures.append((name, value, *((term.interval[0], term.interval[1], term.status) if term else (None, None, 'not asked'))))
     names = [name for name in ('quantisation', 'white_noise', *truth.form) if name in truth.figures]
-    fit = fit_names(moments, tuple(names))
+    fit = fit_form(moments, truth.form, tuple(name for name in names if name == 'quantisation')).fit
     true, values = coefficients(truth, names), dict(zip(names, fit.coefficients))
     if 'gauss_markov' in names:
         values[TIME] = fit.processes[-1].time

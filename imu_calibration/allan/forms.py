@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import digamma, polygamma
 
 from imu_calibration.allan.moment_fit import MomentFit, Moments, Whitener, fit_processes, fit_with_time
-from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE
+from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, gauss_markov
 from imu_calibration.allan.score_intervals import score_at_zero
 
 GAUSS_MARKOV = 'gauss_markov'
@@ -23,6 +23,8 @@ CLOSE = 6.0
 """Forms whose cost is within this of the least are possible as well."""
 PRICE, PRICE_OF_TIME = 2.0, 7.0
 """Cost of a coefficient, and of a correlation time, for which many are tried."""
+TIME_STEP = 8
+"""Every so many of the correlation times is asked whether it is plainly likelier than the one that fits itself."""
 LEAST_WEIGHT = 0.05
 """Forms less likely than this, against the best, take no part in intervals."""
 INDEPENDENT = 6.0
@@ -109,7 +111,22 @@ def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = ()
     """Fit white noise, `fast` processes and the slow ones of a form."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
+    fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
     return FormFit(tuple(form), fit, log_cost(moments, fit) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
+
+
+def _likeliest(moments, fit):
+    """Return the fit with another correlation time where one is plainly likelier: the weights of a long time can keep it long."""
+    def at(time):
+        found = fit_processes(moments, (*fit.processes[:-1], gauss_markov(time)))
+        return log_cost(moments, found), found
+
+    costs = [at(time)[0] for time in moments.times[::TIME_STEP]]
+    best = int(np.argmin(costs))
+    if costs[best] > log_cost(moments, fit) - CLOSE:
+        return fit
+    near = slice(max((best - 1) * TIME_STEP, 0), (best + 1) * TIME_STEP)
+    return min((at(time) for time in moments.times[near]), key=lambda found: found[0])[1]
 
 
 def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
