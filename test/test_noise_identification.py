@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from imu_calibration.allan.dead_reckoning import position_sd
 from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance
-from imu_calibration.allan.forms import PROCESSES, choose_form, fit_names
+from imu_calibration.allan.forms import PROCESSES, choose_form, fit_form, fit_names, log_cost
 from imu_calibration.allan.moment_fit import Moments
 from imu_calibration.allan.processes import (
     FLATNESS,
@@ -187,6 +187,24 @@ def test_quantisation_is_taken_in_where_it_shows_only():
     with_steps = choose_form(moments_of({'white_noise': 1.0, 'quantisation': 0.1}, 1200.0, 6))
     without = choose_form(moments_of({'white_noise': 1.0}, 1200.0, 6))
     assert 'quantisation' in with_steps.best.fit.names and 'quantisation' not in without.best.fit.names
+
+
+def test_a_vibration_does_not_hide_the_white_noise():
+    """Humps at 0.25 Hz and 7 Hz that no model explains: N is read where it shows, instead of leaving out until nothing of it is seen."""
+    rng, n = np.random.default_rng(5), 20_000
+    time = np.arange(n) * PERIOD
+    hum = 3.5 * np.sin(2 * np.pi * 0.25 * time + 0.25) + 6.0 * np.sin(2 * np.pi * 7.0 * time + 7.0)
+    found = identify_axis(moments_from(rng.standard_normal(n) / np.sqrt(PERIOD) + hum))
+    term = found.terms['white_noise']
+    assert found.excess > 2 and term.value == pytest.approx(1.0, rel=0.2) and term.interval[0] > 0.5
+
+
+def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
+    """Weights made with a time ask for it again; in this record that ends at half the true one, which is plainly less likely."""
+    moments = moments_of({'white_noise': 1.0, 'gauss_markov': 0.9, TIME: 150.0}, 3600.0, 9, period=0.2)
+    first, taken = fit_names(moments, ('white_noise', 'gauss_markov')), fit_form(moments, ('gauss_markov',)).fit
+    assert log_cost(moments, taken) < log_cost(moments, first) - 50 and taken.processes[-1].time == pytest.approx(150.0, rel=0.3)
+    assert np.sqrt(taken.coefficients[-1]) == pytest.approx(0.9, rel=0.3)
 
 
 @pytest.mark.slow

@@ -263,12 +263,3 @@ def test_an_axis_whose_steps_hide_its_noise_is_refused_by_its_name():
     frozen = ImuSamples(imu.stamp_ns, np.where([False, True, False], 0.5, imu.force_s), imu.rate_s, imu.frame_id)
     with pytest.raises(InputError, match='accelerometer y stays on one step'):
         read_rest(source(changed(frozen, slice(0, 6), 3000, knock)))
-
-
-def test_a_vibration_does_not_hide_the_white_noise():
-    """Humps at 0.25 Hz and 4 Hz that no model explains: N is still read where it shows, and never comes out as nothing."""
-    imu = resting(400.0, 12)
-    time = np.arange(len(imu)) * PERIOD
-    shaken = changed(imu, 3, 0, 3.0 * SIZES[3] * np.sin(2 * np.pi * 0.25 * time) + 8.0 * SIZES[3] * np.sin(2 * np.pi * 4.1 * time))
-    axis = figures_of(identify_noise(source(shaken))).gyroscope[0]
-    assert axis.excess > 1 and 0.5 * SIZES[3] < axis.white < 5 * SIZES[3]

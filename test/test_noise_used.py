@@ -174,3 +174,8 @@ def test_the_noise_becomes_metres():
     for seconds, shares in position_budget(figures):
         expected = 2e-3 * np.sqrt(seconds**3 / 3 + seconds**4 / 4 / 60.0)
         assert shares['accelerometer'] == pytest.approx(expected, rel=0.02)
+
+
+def test_white_noise_that_may_be_none_counts_with_its_bound():
+    axis = AxisFigures({'white_noise': Term('white_noise', 0.0, (0.0, 3e-4), 'weak', 'may be none')})
+    assert axis.white == 3e-4
