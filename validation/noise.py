@@ -75,7 +75,7 @@ def run(folder, plots):
         strange = [f'{axis} ({np.sqrt(excess):.1f} times)' for axis, (_, excess) in zip(axes, found) if excess > 1]
         rows.append((label(name, topic), ', '.join(f'{points.sum()} of {len(points)}' for points, _ in found), ', '.join(strange)))
     section.claim('noise fitted to the first half: Allan variances of the second inside their 95 % bands', f'at least {INSIDE:.0%}',
-                  f'{inside} of {every} ({inside / every:.0%})', inside >= INSIDE * every, headline=True)
+                  f'{inside} of {every} ({inside / every:.1%})', inside >= INSIDE * every, headline=True)
     section.say(text('noise'))
     section.table(('recording', 'inside, force x, y, z, rate x, y, z', 'no model explains the curve, departs by'), rows)
     return section
