@@ -31,6 +31,8 @@ from imu_calibration.samples import ImuSamples, SampleBlock
 ROOT = Path(__file__).resolve().parents[1]
 ALSO_WORDS = {'bias', 'matrix'}
 """Names that are plain words too: keys of documents and headings use them."""
+KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'exports': {'time_offset'}}
+"""Package -> words that are keys in its own documents, of noise and of other programs, and speak of no effect there."""
 
 
 def spoken_of(path):
@@ -54,7 +56,8 @@ def spoken_of(path):
 
 def test_no_effect_is_known_by_name_outside_its_package():
     files = [path for path in (ROOT / 'imu_calibration').rglob('*.py') if path.relative_to(ROOT).parts[1] not in ('effects', 'papers')]
-    assert not [line for path in files for line in spoken_of(path)]
+    found = [(path.relative_to(ROOT).parts[1], line) for path in files for line in spoken_of(path)]
+    assert not [line for package, line in found if line.rpartition(': ')[2] not in KEYS_ELSEWHERE.get(package, ())]
     looked_up = re.compile(rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|== '({'|'.join(ALSO_WORDS)})'")
     assert not [f'{path.name}: {found[0]}' for path in files if (found := looked_up.search(path.read_text()))]
 
