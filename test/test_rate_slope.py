@@ -200,7 +200,7 @@ def test_without_stamps_the_time_of_arrival_is_taken_and_told():
     np.testing.assert_allclose(*(parse_imu(m).doubles[FIELDS['force_s']] for m in out), atol=1e-12)
 
 
-@pytest.mark.parametrize('number', (np.nan, np.inf, -0.5))
+@pytest.mark.parametrize('number', (np.nan, np.inf, 1e308, -0.5))
 def test_covariances_that_are_none_are_replaced_and_noted(number):
     calibration, imu, _ = world('regular')
     live, plain = LiveCompensation(calibration), LiveCompensation(calibration)

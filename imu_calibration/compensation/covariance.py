@@ -16,9 +16,13 @@ STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 """Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
 
 
+LARGEST = 1e30
+"""Covariances from here on say nothing; below it no arithmetic overflows."""
+
+
 def is_known(covariance):
-    """Return whether a covariance from a message says something: finite, variances not negative, not all zero."""
-    return bool(np.all(np.isfinite(covariance)) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
+    """Return whether a covariance from a message says something: neither NaN nor huge, variances not negative, not all zero."""
+    return bool(np.all(np.abs(covariance) < LARGEST) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
 
 
 @dataclass(frozen=True, eq=False)
