@@ -8,6 +8,7 @@ from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.documents import to_text
+from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
@@ -69,3 +70,14 @@ def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path,
     assert 'it is not shown to help' in capsys.readouterr().out
     assert main(['check', bag, '--calibration', file]) == 1
     assert '--table' in capsys.readouterr().err
+
+
+def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
+    spoiled = calibrated.calibration.values.copy()
+    spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.05
+    earlier = replace(calibrated.calibration, values=spoiled)
+    found = calibrate(pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier)
+    entry = found.calibration.proof['gyroscope']
+    assert entry['earlier']['after'] > 3 * entry['after'] and 'with the earlier calibration' in str(found)
+    with pytest.raises(InputError, match='must be compared on a table'):
+        calibrate(pair.second.block, earlier=earlier)

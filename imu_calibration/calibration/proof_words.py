@@ -36,7 +36,12 @@ def harmed(found):
 def proven(proof):
     """Return what a proof shows, a line for each sensor."""
     return [f'{sensor} error on data that took no part ({found["windows"]} windows): {found["before"]:.3g} {found["unit"]} without, '
-            f'{found["after"]:.3g} with it ({_ratio(found)})' for sensor, found in proof.items()]
+            f'{found["after"]:.3g} with it ({_ratio(found)}){_earlier(found)}' for sensor, found in proof.items()]
+
+
+def _earlier(found):
+    known = found.get('earlier')
+    return f', {known["after"]:.3g} with the earlier calibration' if known else ''
 
 
 def _ratio(found):

@@ -12,9 +12,11 @@ from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.calibrate import calibrate as calibrate_on_table
+from imu_calibration.calibration.check import check_on_table
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code
-from imu_calibration.calibration.verdict import Verdict
+from imu_calibration.calibration.verdict import Verdict, judged
+from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
@@ -77,7 +79,7 @@ class Calibrated:
 
 
 def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand | None = None, *, jobs: int | None = 1,
-              **choices: Unpack[Choices]) -> Calibrated:
+              earlier: Calibration | str | PathLike | None = None, **choices: Unpack[Choices]) -> Calibrated:
     """
     Calibrate from one or several recordings of the same IMU.
 
@@ -90,6 +92,8 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         held still and the turns between them.
     jobs : int or None
         Recordings that are read side by side, in processes; None: one per processor.
+    earlier : Calibration or path-like, optional
+        A calibration of this IMU from before, proven on the same recordings; needs a table.
     choices
         See `Choices`.
 
@@ -101,6 +105,9 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     """
     check_names(choices)
     options, topics = calibration_options(choices), topics_of(choices)
+    earlier = files.read_calibration(earlier) if isinstance(earlier, (str, PathLike)) else earlier
+    if earlier is not None and table is None:
+        raise InputError('an earlier calibration must be compared on a table, none came; give its description', key='table')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
     table = None if table is None else table_of(table, recordings, topics, choices.get('gravity'))
     for path in recordings:
@@ -115,8 +122,17 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
             result = calibrate_without_table(sources, options)
         else:
             result = _side_by_side(sources, table, options, recordings, jobs)
+            if earlier is not None and result.calibration.proof:
+                result = _beside(result, check_on_table(sources, table, earlier, options).proof)
         calibration = result.calibration
         return Calibrated(replace(result, calibration=replace(calibration, provenance=calibration.provenance | provenance.result())))
+
+
+def _beside(result, proof):
+    """Return the result with what an earlier calibration leaves of the same errors in its proof."""
+    known = {sensor: found | ({'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}} if sensor in proof else {})
+             for sensor, found in result.calibration.proof.items()}
+    return replace(result, calibration=judged(replace(result.calibration, proof=known), result.tolerances))
 
 
 def _side_by_side(sources, table, options, recordings, jobs):
