@@ -96,9 +96,10 @@ config: $(STAMP)
 	@$(PY) -m imu_calibration.nodes.parameter_files
 	@$(PY) -m imu_calibration.effects.tolerance_file
 
-# Pages that are written from what runs: the targets of exports.
+# Pages that are written from what runs: the targets of exports, the answers with their commands and pictures.
 answers: $(STAMP)
 	@$(PY) -m imu_calibration.exports.page
+	@$(PY) examples/answers.py
 
 # Noise identified on 204 simulated records of ten minutes to three hours: intervals and errors, the tables of docs/noise.md; half an hour.
 noise-coverage: $(STAMP)

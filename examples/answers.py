@@ -1,0 +1,93 @@
+"""
+The pages in docs/answers: each command in them is run and its output put behind it (``make answers``).
+
+A page is its own source. Blocks that begin with ``console`` hold lines ``$ command``; what follows a command is replaced by what it
+prints. The pages are worked through in alphabetical order in one folder, so that later ones find the files of earlier ones.
+"""
+
+import argparse
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import tempfile
+from pathlib import Path
+
+from imu_calibration.cli.main import main as imu_calibration
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / 'docs/answers'
+BLOCK = re.compile(r'^```console\n(.*?)^```$', flags=re.M | re.S)
+FILTERS = ('grep', 'head', 'tail', 'cat', 'printf')
+"""Programs beside `imu_calibration` that commands may name."""
+
+
+def run(command: str) -> str:
+    """Return what a command prints on both outputs, in the current folder; stages are joined by ``|``, and ``>`` writes a file."""
+    command, _, target = command.partition(' > ')
+    output = ''
+    for stage in command.split(' | '):
+        name, *arguments = shlex.split(stage)
+        if name == 'imu_calibration':
+            stream = io.StringIO()
+            with contextlib.redirect_stdout(stream), contextlib.redirect_stderr(stream):
+                imu_calibration(arguments)
+            output = stream.getvalue()
+        elif name in FILTERS:
+            output = subprocess.run([name, *arguments], input=output, capture_output=True, text=True, check=False).stdout
+        else:
+            raise ValueError(f'a command of a page must be one of {("imu_calibration", *FILTERS)}, got {name}')
+    if target:
+        Path(target).write_text(output)
+    return '' if target else output
+
+
+def commands(text: str) -> list[str]:
+    """Return the commands of a page."""
+    return [line[2:] for block in BLOCK.findall(text) for line in block.splitlines() if line.startswith('$ ')]
+
+
+def worked_through(text: str) -> str:
+    """Return a page with what its commands print in the current folder."""
+    def block(match):
+        parts = []
+        for command in (line for line in match.group(1).splitlines() if line.startswith('$ ')):
+            printed = '\n'.join(line.rstrip() for line in run(command[2:]).splitlines())
+            parts.append(f'{command}\n{printed}\n' if printed else f'{command}\n')
+        return '```console\n' + ''.join(parts) + '```'
+    return BLOCK.sub(block, text)
+
+
+def pages() -> list[Path]:
+    """Return the pages in the order in which they are worked through."""
+    return sorted(PAGES.glob('[0-9]*.md'))
+
+
+@contextlib.contextmanager
+def inside(folder: Path):
+    """Work in a folder that has the sample session as `session` beside it."""
+    before = Path.cwd()
+    (folder / 'session').symlink_to(ROOT / 'bags/sample_session')
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def main() -> None:
+    """Write all pages and their pictures."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    from answer_pictures import PICTURES
+    with tempfile.TemporaryDirectory() as folder, inside(Path(folder)):
+        for page in pages():
+            page.write_text(worked_through(page.read_text()))
+            print(page.relative_to(ROOT))
+        for name, draw in PICTURES.items():
+            draw(PAGES / f'{name}.png')
+
+
+if __name__ == '__main__':
+    main()
