@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
@@ -15,6 +14,7 @@ from imu_calibration.exports.affine import AffineImu, Placement, affine_of, move
 from imu_calibration.exports.holdings import ARMS, MATRICES
 from imu_calibration.exports.loss import NOTHING, UNIT, Loss, loss_of
 from imu_calibration.exports.motion import TrialMotion, standard_motion
+from imu_calibration.exports.pose import UNNAMED, pose_line
 from imu_calibration.exports.target import Noise, Numbers, Page, Readings, Target
 from imu_calibration.units import significant
 
@@ -118,18 +118,16 @@ def _noise_of(calibration, figures, rate) -> Noise | None:
 
 def _placement_lines(calibration, target, placement) -> list[str]:
     """Say where the numbers stand against our sensor frame."""
-    name = calibration.frame_id or 'the sensor frame'
+    name = calibration.frame_id or UNNAMED
     if target.only_noise:
         return []
     if np.array_equal(placement.mat_readings, np.eye(3)) and np.array_equal(placement.mat_ts, np.eye(3)) and not np.any(placement.origin_s):
         return [f'frame: {name}, axes as in the calibration']
     if not np.array_equal(placement.mat_readings, np.eye(3)):
         return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
-    turn = Rotation.from_matrix(placement.mat_ts.T).as_quat().tolist()
-    pose = {key: f'{value:.12g}' for key, value in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), [*placement.origin_s, *turn])}
-    options = pose | {'frame-id': name, 'child-frame-id': f'{name}_{target.name}'}
-    return [f"frame: {name}_{target.name}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
-            '  static_transform_publisher ' + ' '.join(f'--{key} {value}' for key, value in options.items())]
+    child = f'{name}_{target.name}'
+    return [f"frame: {child}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
+            f'  {pose_line(placement, name, child)}']
 
 
 def _worked_sample(target, numbers, placement, calibration) -> list[str]:

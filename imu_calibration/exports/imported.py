@@ -13,6 +13,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.exports.affine import AffineImu, moved
 from imu_calibration.exports.holdings import MATRICES, OFFSETS, Holding, holding_of
+from imu_calibration.exports.pose import find_pose
 from imu_calibration.exports.target import Read, Target
 
 
@@ -20,7 +21,8 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     """
     Return the calibration in a file of another program.
 
-    Values are those of the file. Standard deviations are those of the priors, since the file has none: a value that stands in the file is
+    Values are those of the file; where it says how its frame stands against the sensor's, as files of an export do, they are turned back.
+    Standard deviations are those of the priors, since the file has none: a value that stands in the file is
     weak, what cannot stand there is held at its prior. The verdict is weak, and there is no proof.
 
     Parameters
@@ -44,11 +46,14 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     if target.whole:
         return from_mapping(found.numbers)
     assert target.imu is not None
-    read = target.imu(found.numbers)
-    return _document(target, found, moved(read, target.back(read)), path, frame_id)
+    read, own = target.imu(found.numbers), find_pose(content)
+    if own is None:
+        return _document(target, found, moved(read, target.back(read)), target.axes, path, frame_id)
+    placement, parent = own
+    return _document(target, found, moved(read, placement.inverse()), 'mount', path, frame_id or parent)
 
 
-def _document(target: Target, found: Read, imu: AffineImu, path: Any, frame_id: str) -> Calibration:
+def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
     holds = tuple(holding for holding in target.holds if holding not in found.lacks)
     names: dict[str, tuple[str, ...]] = {sensor: tuple(_names(sensor, holds, imu)) for sensor in SENSORS}
     model = SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=imu.temperature_ref_c)
@@ -62,10 +67,10 @@ def _document(target: Target, found: Read, imu: AffineImu, path: Any, frame_id: 
             status[part] = np.where(known, WEAK, HELD)
     name = getattr(path, 'name', str(path))
     reasons = (f'imported from {target.title} ({name}), which says no uncertainties and was not proven on a recording',
-               'next: see what it does to a recording, or calibrate')
+               "next: see what it does to a recording: 'imu_calibration check'")
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
     conditions = {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
-    gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN, 'axes': target.axes}
+    gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN, 'axes': axes}
     provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN}
     return check_numbers(Calibration(
         model, values, np.diag(sd**2), tuple(status), frame_id, gauge, statistics=statistics, conditions=conditions, provenance=provenance,
