@@ -475,3 +475,9 @@ def test_a_file_of_ours_brings_the_frame_back_and_none_where_there_was_none():
     for frame in ('imu_link', ''):
         found = back_and_forth('basalt', random_calibration(3, (), frame_id=frame))
         assert (found.frame_id, found.gauge['axes']) == (frame, 'mount')
+
+
+def test_what_speaks_against_a_calibration_travels_along():
+    bad = random_calibration(3, (), verdict='bad', verdict_reasons=('the recording says nothing',))
+    assert 'its verdict is bad: the recording says nothing' in export(bad, find_target('px4')).content.decode()
+    assert not any('of the calibration' in line for line in export(replace(bad, verdict='good'), find_target('px4')).lines)

@@ -8,6 +8,7 @@ import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
+from imu_calibration.calibration.trust import caveats, objections
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import InputError
 from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
@@ -64,7 +65,8 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     motion = motion or standard_motion(calibration)
     loss = loss_of(target, calibration, numbers, placement, motion)
     lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
-             *loss_lines(target, loss), *(f'note: {line}' for line in (*target.ignored(numbers), *unknown, *filter(None, [target.hint])))]
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(calibration), *target.ignored(numbers), *unknown)),
+             *(f'note: {hint}' for hint in [target.hint] if hint)]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
     assert target.write is not None   # `registry.find_target` gives no other
@@ -97,6 +99,11 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
             raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise')
         return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
     return target.noise(found), _walk_lines(found) if target.needs_walk else []
+
+
+def _trust_lines(calibration: Calibration) -> list[str]:
+    """Say what speaks against the calibration, and what should be known about it."""
+    return [f'of the calibration: {line}' for line in objections(calibration) or caveats(calibration)]
 
 
 def _walk_lines(noise: Noise) -> list[str]:
