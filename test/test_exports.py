@@ -27,6 +27,7 @@ from imu_calibration.exports.imported import import_file
 from imu_calibration.exports.motion import motion_of, standard_motion
 from imu_calibration.exports.page import rendered
 from imu_calibration.exports.registry import all_targets, find_reader, find_target
+from imu_calibration.exports.target import Readings
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
 
 from worlds import export_formulas as programs
@@ -200,6 +201,8 @@ def test_the_temperature_stays_in_the_range_that_was_measured():
         found = export(calibration, find_target(name))
         hot = [CORRECTING[name](found.content.decode(), np.ones(3), np.ones(3), t)[0] for t in (30.0, 60.0)]
         np.testing.assert_array_equal(*hot)
+        samples = Readings(np.ones((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), np.array([30.0, 60.0]))
+        np.testing.assert_array_equal(*find_target(name).corrected(found.numbers, samples)[0])
 
 
 def test_what_px4_takes_no_notice_of_is_said():
@@ -314,6 +317,14 @@ def test_every_effect_is_held_or_estimated_or_said_to_be_lost(name):
 def test_an_effect_that_is_zero_is_not_lost():
     calibration = with_values(random_calibration(6, (), ('gyro_g_sensitivity',)), CROSS=None)
     assert export(calibration, find_target('basalt')).loss.nothing
+
+
+def test_an_effect_that_is_lost_is_given_what_it_makes_in_the_readings():
+    calibration = random_calibration(6, (), ('gyro_g_sensitivity',))
+    found = export(calibration, find_target('basalt'), motion=motion(6))
+    lost, = found.loss.effects
+    made = motion(6).reference.force_s @ calibration.of('gyroscope', Role.CROSS).T
+    assert lost.rms == pytest.approx(rms(made), rel=1e-12) and not lost.in_part
 
 
 def test_the_standard_motion_is_that_of_the_conditions():
