@@ -1,6 +1,7 @@
 """Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
 
 from enum import StrEnum
+from typing import Any
 
 from imu_calibration.errors import InputError
 
@@ -16,7 +17,7 @@ DEEPEST = 20
 """Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
 
 
-def to_text(document):
+def to_text(document: dict[str, Any]) -> str:
     """
     Return a mapping as YAML: block style for mappings, lists of numbers on one line each.
 
@@ -44,7 +45,7 @@ def to_text(document):
     return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=100_000, allow_unicode=True)
 
 
-def from_text(text, what='document'):
+def from_text(text: str, what: str = 'document') -> dict[str, Any]:
     """
     Return the mapping in a YAML text.
 
@@ -87,7 +88,7 @@ def _within_limits(number, limit, what, unit):
         raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?')
 
 
-def version_of(text):
+def version_of(text: str) -> str:
     """Return twelve characters that change whenever a document does: the beginning of its SHA-256."""
     from hashlib import sha256
     return sha256(text.encode()).hexdigest()[:12]

@@ -3,22 +3,25 @@
 import hashlib
 import os
 import zlib
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from errno import EISDIR
 from itertools import count
+from os import PathLike
 from pathlib import Path
 from stat import S_ISDIR
+from typing import Any
 
 from imu_calibration import documents
 from imu_calibration.allan.document import noise_from_text
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.calibration.document import calibration_from_text, checked_tolerances
-from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.calibration.document import Calibration, calibration_from_text, checked_tolerances
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 
 
-def user_path(text):
+def user_path(text: str) -> Path:
     """
     Return the absolute path that a user means, with ``~`` for the home folder.
 
@@ -34,7 +37,7 @@ def user_path(text):
         raise InputError(f'{text!r} must be a path: {error}; correct it') from error
 
 
-def read_text(path, what):
+def read_text(path: str | PathLike[str], what: str) -> str:
     """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
     try:
         with open(path, encoding='utf-8') as stream:
@@ -44,7 +47,7 @@ def read_text(path, what):
     return text
 
 
-def read_bytes(path, what):
+def read_bytes(path: str | PathLike[str], what: str) -> bytes:
     """Return the bytes of a file, or refuse in one line."""
     try:
         return Path(path).read_bytes()
@@ -56,7 +59,7 @@ def _why(error):
     return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
-def read_mapping(path, what, checked=dict):
+def read_mapping(path: str | PathLike[str], what: str, checked: Callable | type = dict) -> Any:
     """Return the mapping in a YAML file, as `checked` returns it; an error of either names the file."""
     try:
         return checked(documents.from_text(read_text(path, what), what))
@@ -64,17 +67,17 @@ def read_mapping(path, what, checked=dict):
         raise error.named(str(path)) from error
 
 
-def read_table(path):
+def read_table(path: str | PathLike[str]) -> Table:
     """Return the table that a YAML file describes."""
     return Table.from_mapping(read_mapping(path, 'table description'))
 
 
-def read_tolerances(path, catalogue=CATALOGUE):
+def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:
     """Return the tolerances in a YAML file: {section: {effect: tolerance}}."""
     return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
 
 
-def read_robot_description(path):
+def read_robot_description(path: str | PathLike[str]) -> str:
     """Return the text of a robot description; macros of a .xacro file are expanded."""
     if Path(path).suffix != '.xacro':
         return read_text(path, 'robot description')
@@ -88,7 +91,7 @@ def read_robot_description(path):
                          'yourself to a .urdf') from error
 
 
-def read_calibration(path):
+def read_calibration(path: str | PathLike[str]) -> Calibration:
     """Return the calibration in a file."""
     return calibration_from_text(read_text(path, 'calibration'))
 
@@ -101,7 +104,7 @@ def read_noise(path: str | os.PathLike) -> NoiseFigures:
         raise error.named(str(path)) from error
 
 
-def make_folder(path):
+def make_folder(path: str | PathLike[str]) -> Path:
     """Return the output folder, made and checked for writing before any work is done."""
     folder = Path(path)
     try:
@@ -115,7 +118,7 @@ def make_folder(path):
 
 
 @contextmanager
-def output_folder(path):
+def output_folder(path: str) -> Iterator[Path]:
     """Give the output folder; when the work is refused, folders that were made for it are taken away again."""
     missing = [folder for folder in (Path(path), *Path(path).parents) if not folder.exists()]
     folder = make_folder(path)
@@ -128,12 +131,12 @@ def output_folder(path):
         raise
 
 
-def write_text(path, text):
+def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a text file whole or not at all; raises as `write_whole`."""
     write_whole(path, text.encode(), to_disk=False)
 
 
-def hash_of(path):
+def hash_of(path: str | PathLike[str]) -> str:
     """Return the SHA-256 of a bag: of its data files in order of name, 16 hexadecimal digits."""
     path, digest = Path(path), hashlib.sha256()
     files = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml') if path.is_dir() else [path]
@@ -144,7 +147,7 @@ def hash_of(path):
     return digest.hexdigest()[:16]
 
 
-def write_whole(path, data, to_disk=True):
+def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) -> None:
     """
     Write bytes beside the file and rename.
 
@@ -171,7 +174,7 @@ def write_whole(path, data, to_disk=True):
         os.replace(beside, path)
 
 
-def try_place(path):
+def try_place(path: Path) -> None:
     """
     Try whether `write_whole` could write a file now; nothing is left behind but its folder.
 
@@ -189,7 +192,7 @@ def try_place(path):
                 raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
 
 
-def put_aside(path):
+def put_aside(path: str | PathLike[str]) -> Path:
     """
     Rename a file to the first of NAME.1, NAME.2, ... that is free, and return that.
 

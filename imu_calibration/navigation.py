@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
+from imu_calibration.reference.reference_motion import Reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +43,13 @@ class Drift:
     attitude: np.ndarray
     """Angle of the attitude error at the end, rad, shape (k,)."""
 
-    def median(self):
+    def median(self) -> tuple[float, float, float]:
         """Return the medians over the stretches: velocity (m/s), position (m), attitude (rad)."""
         return float(np.median(self.velocity)), float(np.median(self.position)), float(np.median(self.attitude))
 
 
-def integrate_attitude(time, rate_s, mat_ns0=None, earth_rate_n=(0.0, 0.0, 0.0)):
+def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None, *,
+                       earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """
     Integrate the rate against inertial space into the attitude against the level frame, shape (n, 3, 3).
 
@@ -75,7 +77,7 @@ def integrate_attitude(time, rate_s, mat_ns0=None, earth_rate_n=(0.0, 0.0, 0.0))
     return Rotation.from_rotvec(-np.multiply.outer(time - time[0], np.asarray(earth_rate_n, float))).as_matrix() @ mat_is
 
 
-def dead_reckon(time, force_n, gravity):
+def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[np.ndarray, np.ndarray]:
     """
     Integrate specific force in the level frame (z up) twice by the trapezoid rule.
 
@@ -90,7 +92,8 @@ def dead_reckon(time, force_n, gravity):
     return velocity, _running_integral(time, velocity)
 
 
-def strapdown(time, force_s, rate_s, gravity, mat_ns0=None, earth_rate_n=(0.0, 0.0, 0.0)):
+def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, gravity: float, mat_ns0: np.ndarray | None = None,
+              earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
     """
     Navigate by accelerometers and gyroscopes alone from rest at the origin.
 
@@ -110,12 +113,12 @@ def strapdown(time, force_s, rate_s, gravity, mat_ns0=None, earth_rate_n=(0.0, 0
     Trajectory
 
     """
-    mat_ns = integrate_attitude(time, rate_s, mat_ns0, earth_rate_n)
+    mat_ns = integrate_attitude(time, rate_s, mat_ns0, earth_rate_n=earth_rate_n)
     velocity, position = dead_reckon(time, np.einsum('nij,nj->ni', mat_ns, force_s), gravity)
     return Trajectory(np.asarray(time, float), mat_ns, velocity, position)
 
 
-def error_growth(time, force_error_s, mat_ns=None):
+def error_growth(time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     Return velocity and position errors that a specific-force error causes, attitude being known, each of shape (n, 3).
 
@@ -129,17 +132,18 @@ def error_growth(time, force_error_s, mat_ns=None):
     return dead_reckon(time, force_error, 0.0)
 
 
-def constant_error_growth(force_error, seconds):
+def constant_error_growth(force_error: np.ndarray | float, seconds: float) -> tuple[np.ndarray | float, np.ndarray | float]:
     """Return the velocity and position error, m/s and m, of a constant error in m/s^2 along one axis of a body that does not turn."""
     return force_error * seconds, force_error * seconds**2 / 2
 
 
-def largest(vectors):
+def largest(vectors: np.ndarray) -> np.ndarray | float:
     """Return the largest norm of vectors along the time axis, shape (..., n, 3) to (...)."""
     return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
-def drift_over(reference, force_s, rate_s, seconds=50.0, earth_rate_n=(0.0, 0.0, 0.0)):
+def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0,
+               earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drift:
     """
     Return the dead-reckoning error of measured or compensated samples over stretches of a recording.
 
@@ -175,8 +179,10 @@ def drift_over(reference, force_s, rate_s, seconds=50.0, earth_rate_n=(0.0, 0.0,
     for first, last in zip(edges[:-1], edges[1:] + 1):
         cut = slice(first, last)
         start = reference.mat_sn[first].T
-        measured = strapdown(reference.time[cut], force_s[cut], rate_s[cut], reference.gravity, start, earth_rate_n)
-        true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], reference.gravity, start, earth_rate_n)
+        measured = strapdown(reference.time[cut], force_s[cut], rate_s[cut], gravity=reference.gravity, mat_ns0=start,
+                             earth_rate_n=earth_rate_n)
+        true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], gravity=reference.gravity, mat_ns0=start,
+                         earth_rate_n=earth_rate_n)
         ends.append((np.linalg.norm(measured.velocity_n[-1] - true.velocity_n[-1]),
                      np.linalg.norm(measured.position_n[-1] - true.position_n[-1]),
                      Rotation.from_matrix(measured.mat_ns[-1] @ true.mat_ns[-1].T).magnitude()))

@@ -9,7 +9,7 @@ from imu_calibration.errors import InputError
 PACKAGE = 'imu_calibration'
 
 
-def share_folder():
+def share_folder() -> Path:
     """
     Return the folder that holds `config` and `launch`.
 
@@ -28,7 +28,7 @@ def share_folder():
     raise InputError(f'the config files of {PACKAGE} must be installed with it, none found near {__file__}; reinstall the package')
 
 
-def config_file(name):
+def config_file(name: str) -> Path:
     """
     Return the path of the installed file `name` of the folder config, such as ``'tolerances.yaml'``.
 

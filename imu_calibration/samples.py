@@ -97,7 +97,7 @@ class NominalScaling:
     gyroscope_scale: float = 1.0
     """Reading per rad/s."""
 
-    def apply(self, imu):
+    def apply(self, imu: ImuSamples) -> ImuSamples:
         """Return the samples in SI."""
         return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
                        rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)

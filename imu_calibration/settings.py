@@ -1,5 +1,6 @@
 """Every adjustable number, declared once: YAML files, options and ROS parameters are made from here."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -42,7 +43,7 @@ def describe(group: Any) -> list[Setting]:
     return [Setting(f.name, f.default, **f.metadata) for f in fields(group)]
 
 
-def override(group, values):
+def override(group: Any, values: Mapping[str, Any]) -> Any:
     """
     Return a copy of the settings `group` with `values` (name -> value) set.
 

@@ -21,17 +21,17 @@ SHOWN_OF_NOISE = {
 """The same for the figures of noise, as data sheets print them."""
 
 
-def for_people(unit):
+def for_people(unit: str) -> tuple[float, str]:
     """Return (factor, unit) that turns an SI value into what people read; (1, unit) where SI is what they read."""
     return SHOWN.get(unit, (1.0, unit))
 
 
-def decimals(sd, digits=2):
+def decimals(sd: float, digits: int = 2) -> int:
     """Return the number of decimals that shows `digits` digits of a standard deviation."""
     return int(max(0, min(12, digits - 1 - np.floor(np.log10(sd) + 1e-9))))
 
 
-def with_sd(value, sd):
+def with_sd(value: float, sd: float) -> tuple[str, str]:
     """Return value and standard deviation as text with no more digits than the standard deviation supports."""
     if not np.isfinite(sd) or sd <= 0:
         return f'{value:.6g}', f'{sd:.2g}'
@@ -39,7 +39,7 @@ def with_sd(value, sd):
     return f'{value:.{places}f}', f'{sd:.{places}f}'
 
 
-def significant(value, digits=3):
+def significant(value: float, digits: int = 3) -> str:
     """Return a number as plain text with `digits` significant digits; powers of ten only where zeros would not help."""
     if value == 0 or not np.isfinite(value):
         return f'{value:g}'

@@ -1,6 +1,8 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 from imu_calibration.errors import InputError
@@ -11,7 +13,7 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.ros1_file import Ros1File
 from msg_adapters.rosbag2 import Rosbag2
-from msg_adapters.storages import suffixes
+from msg_adapters.storages import BagSource, suffixes
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
@@ -34,7 +36,9 @@ class Topic:
     """Messages that the recording says it holds."""
 
 
-def open_recording(path, imu_topic=None, joint_topic=None, temperature_topic=None, want_joints=True, want_temperature=True):
+def open_recording(path: str | PathLike[str], imu_topic: str | None = None, joint_topic: str | None = None, *,
+                   temperature_topic: str | None = None, want_joints: bool | str = True,
+                   want_temperature: bool | str = True) -> 'Recording':
     """
     Open a bag and choose its topics: the one that is named, else the default name, else the only one of the type.
 
@@ -72,40 +76,41 @@ def open_recording(path, imu_topic=None, joint_topic=None, temperature_topic=Non
     except BaseException:
         source.close()
         raise
-    return Recording(path, source, topics, imu, joints, temperature)
+    return Recording(path, source, topics, imu_topic=imu, joint_topic=joints, temperature_topic=temperature)
 
 
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 
-    def __init__(self, path, source, topics, imu_topic, joint_topic, temperature_topic):
+    def __init__(self, path: Path, source: BagSource, topics: tuple[Topic, ...], *, imu_topic: str, joint_topic: str | None,
+                 temperature_topic: str | None):
         self.path = path
         self.topics = topics
         self.imu_topic, self.joint_topic, self.temperature_topic = imu_topic, joint_topic, temperature_topic
         self.source = source
 
     @property
-    def message_counts(self):
+    def message_counts(self) -> dict[str, int]:
         """Topic name -> messages that the recording says it holds."""
         return {topic.name: topic.count for topic in self.topics}
 
     @property
-    def n_messages(self):
+    def n_messages(self) -> int:
         """Messages on the chosen topics, as far as the recording says; for progress."""
         counts = self.message_counts
         return sum(counts[name] for name in (self.imu_topic, self.joint_topic, self.temperature_topic) if name)
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """Seconds between the first and the last message by the recorder's clock."""
         return self.source.duration_ns * 1e-9
 
     @property
-    def lost(self):
+    def lost(self) -> dict[str, int]:
         """What could not be read, reason -> count; complete when `blocks` has run to its end."""
         return dict(self.source.lost)
 
-    def blocks(self, joint_names=None, block_samples=BLOCK_SAMPLES):
+    def blocks(self, joint_names: Iterable[str] | None = None, block_samples: int = BLOCK_SAMPLES) -> Generator[SampleBlock, None, None]:
         """
         Read the samples in file order.
 
@@ -163,7 +168,7 @@ class Recording:
             raise InputError(f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
                              f'{" ".join(str(error).split())}; record again with standard messages') from error
 
-    def close(self):
+    def close(self) -> None:
         """Close the files."""
         self.source.close()
 
@@ -193,7 +198,7 @@ def _open_source(path):
                          'check the path, or record again') from error
 
 
-def list_topics(path):
+def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
     """Return the topics of a recording in order of name; raises as `open_recording`."""
     source = _open_source(Path(path))
     try:
@@ -202,7 +207,7 @@ def list_topics(path):
         source.close()
 
 
-def imu_topics(topics):
+def imu_topics(topics: tuple[Topic, ...]) -> list[str]:
     """Return the names of those Topics that carry IMU messages."""
     return [topic.name for topic in topics if topic.type == IMU_TYPE]
 

@@ -3,11 +3,15 @@
 import os
 import shutil
 from collections import Counter
+from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.errors import InputError
+from msg_adapters.definitions import TypeDefinition
 from msg_adapters.storages import STORAGES, identifiers
 
 ROS_DISTRO = 'jazzy'
@@ -29,25 +33,26 @@ class BagWriter:
 
     """
 
-    def __init__(self, path, storage='sqlite3', **options):
+    def __init__(self, path: str | PathLike[str], storage: str = 'sqlite3', **options: str):
         if storage not in identifiers():
             raise InputError(f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these')
         self.path = Path(path)
         self.topics, self.counts = {}, Counter()
-        self.first_ns, self.last_ns = None, None
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
         self.kind = STORAGES[identifiers().index(storage)]
         self.file_name = f'{self.path.name}_0{self.kind.suffix}'
         self.partial = make_partial_folder(self.path)
         self.storage = self.kind.writer(self.partial / self.file_name, ROS_DISTRO, **options)
 
-    def add_topic(self, name, definition, qos=()):
+    def add_topic(self, name: str, definition: TypeDefinition, qos: Sequence[Any] = ()) -> int:
         """Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings); return its id."""
         topic_id = len(self.topics) + 1
         self.topics[topic_id] = (name, definition, list(qos))
-        self.storage.add_topic(topic_id, name, definition, dump_yaml(list(qos)).strip() if qos else '')
+        self.storage.add_topic(topic_id, name, definition, qos=dump_yaml(list(qos)).strip() if qos else '')
         return topic_id
 
-    def write(self, topic_ids, received_ns, messages):
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
         """Append messages in the order of the file: arrays of topic ids and receive times, and a list of byte strings."""
         if not len(messages):
             return
@@ -58,7 +63,7 @@ class BagWriter:
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
         self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
 
-    def close(self):
+    def close(self) -> None:
         """Finish the files and put the folder in its place."""
         information = self._metadata()
         self.storage.close(METADATA_VERSION, dump_yaml(information).strip())
@@ -68,7 +73,7 @@ class BagWriter:
             raise InputError(f'{self.path} must not exist yet; remove it or choose another name')
         os.rename(self.partial, self.path)
 
-    def abort(self):
+    def abort(self) -> None:
         """Throw away what has been written."""
         self.storage.abort()
         shutil.rmtree(self.partial, ignore_errors=True)
@@ -91,7 +96,7 @@ class BagWriter:
         self.close() if kind is None else self.abort()
 
 
-def make_partial_folder(path):
+def make_partial_folder(path: Path) -> Path:
     """Make the folder beside `path` in which it is built (raises InputError when `path` exists or cannot be written)."""
     path = Path(path)
     if path.exists():
@@ -106,7 +111,7 @@ def make_partial_folder(path):
     return partial
 
 
-def dump_yaml(value):
+def dump_yaml(value: Any) -> str:
     """Return YAML text in the order of the mapping."""
     import yaml
     return yaml.safe_dump(value, sort_keys=False, width=1000)

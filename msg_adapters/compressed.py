@@ -3,6 +3,7 @@
 import sys
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 from msg_adapters.mcap_records import McapDamage
 
@@ -10,7 +11,7 @@ PIECE = 1 << 20
 
 
 @cache
-def zstd():
+def zstd() -> ModuleType:
     """Return the zstd module: of the standard library where it has it, else of the package that rosbags brings along."""
     if sys.version_info >= (3, 14):
         from compression import zstd as module
@@ -19,7 +20,7 @@ def zstd():
     return module
 
 
-def decompress_chunk(compression, packed):
+def decompress_chunk(compression: str, packed: memoryview) -> bytes:
     """Return the content of a chunk, or what can be had of it (raises McapDamage)."""
     if compression not in ('zstd', 'lz4'):
         raise McapDamage(f'a chunk with the unknown compression {compression!r}')
@@ -45,12 +46,12 @@ def _errors():
     return zstd().ZstdError, RuntimeError, EOFError
 
 
-def decompress_message(data):
+def decompress_message(data: bytes) -> bytes:
     """Return one message of a bag that is compressed by message."""
     return zstd().decompress(data)
 
 
-def decompress_file(source, target):
+def decompress_file(source: Path, target: Path) -> str | None:
     """
     Decompress a zstd file into another; return the error that ended it early, or None.
 

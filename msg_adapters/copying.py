@@ -1,7 +1,9 @@
 """A copy of a recording with a corrected Imu topic beside the others; everything else stays as it is, to the last bit."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from os import PathLike
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,8 +19,9 @@ from msg_adapters.layout import group_by_layout
 from msg_adapters.stamps import MessageError, from_ns
 
 
-def copy_with_corrected(source, destination, imu_topic, corrected_topic, correct, propagate=None, frame_id=None, mat_ts=None,
-                        late_ns=0, storage=None):
+def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
+                        correct: Callable, propagate: Callable | None = None, frame_id: str | None = None,
+                        mat_ts: np.ndarray | None = None, late_ns: int = 0, storage: str | None = None) -> dict[str, int]:
     """
     Write a bag with all topics of another one and the corrected Imu messages behind the measured ones.
 
@@ -121,7 +124,7 @@ class _Patch:
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
             fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), corrected.marks[place])
-            table = patch_imu_group(layout, group, fields, self.frame_id)
+            table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
                 _set_stamps(table, layout.order, layout.stamp_ns(group) - self.late_ns)
             for k, message in zip(place.tolist(), rows(table), strict=True):

@@ -1,7 +1,9 @@
 """Messages of one topic to samples: whole groups of one layout at once, or object by object."""
 
 from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -31,13 +33,13 @@ class Decoder:
 
     """
 
-    def __init__(self, message_type, deserialize=None):
+    def __init__(self, message_type: str, deserialize: Callable | None = None):
         self.find_layout, self.decode_layout, self.read_row, self.from_rows = _FUNCTIONS[message_type]
         self.name = message_type.rpartition('/')[2]
         self.deserialize = deserialize
         self.dropped, self.notes = Counter(), Counter()
 
-    def decode(self, packed, arrived_ns=None):
+    def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """
         Return the samples of a Packed in its order, or None when there are none; counts in `dropped` what it cannot use.
 
@@ -56,7 +58,7 @@ class Decoder:
         parts += [(rest[k:k + 1], self._decode_alone(packed.message(number))) for k, number in enumerate(rest)]
         return in_order([(index, self._stamped(samples, index, arrived_ns)) for index, samples in parts if samples is not None])
 
-    def decode_objects(self, messages, arrived_ns=None):
+    def decode_objects(self, messages: Iterable, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """Return the samples of message objects, from rclpy or rosbags, or None when there are none; `arrived_ns` as for `decode`."""
         rows = [(k, row) for k, row in enumerate(map(self._row, messages)) if row is not None]
         return self._stamped(self.from_rows([row for _, row in rows]), np.array([k for k, _ in rows]), arrived_ns) if rows else None
@@ -114,26 +116,26 @@ class JointDecoder(Decoder):
 
     """
 
-    def __init__(self, joint_names=None, deserialize=None):
+    def __init__(self, joint_names: Sequence[str] | None = None, deserialize: Callable | None = None):
         super().__init__(JOINT_STATE_TYPE, deserialize)
         self.asked = joint_names is not None
-        self.names = tuple(joint_names) if self.asked else ()
+        self.names = () if joint_names is None else tuple(joint_names)
         self.seen = []
         self.n_messages, self.n_fitting = 0, 0
         self.decode_layout = lambda layout, packed: decode_joints(layout, packed, self._expected(layout.names))
         self.read_row = lambda message: joint_row(message, self._expected(tuple(message.name)))
         self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
-    def decode(self, packed, arrived_ns=None):
+    def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """As for Decoder; raises InputError when the names have not matched those of the table for long."""
         return self._checked(super().decode(packed, arrived_ns), len(packed) if self.deserialize is None else 0)
 
-    def decode_objects(self, messages, arrived_ns=None):
+    def decode_objects(self, messages: Iterable, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """As for Decoder; raises InputError when the names have not matched those of the table for long."""
         messages = list(messages)
         return self._checked(super().decode_objects(messages, arrived_ns), len(messages))
 
-    def check(self):
+    def check(self) -> None:
         """Raise InputError when no message so far has held the joints of the table."""
         if self.asked and self.seen and not self.n_fitting:
             if any(set(self.names) <= set(names) for names in self.seen):
@@ -160,9 +162,9 @@ class JointDecoder(Decoder):
         return self.names
 
 
-def taken_counts(decoders):
+def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
     """Return ({reason: messages dropped}, {reason: messages used in another way than they came}) since the last call; None for none."""
-    totals = Counter(), Counter()
+    totals: tuple[Counter[str], ...] = Counter(), Counter()
     for decoder in decoders:
         for total, own in zip(totals, (decoder.dropped, decoder.notes), strict=True):
             total.update(own)
@@ -170,7 +172,7 @@ def taken_counts(decoders):
     return tuple(dict(total) or None for total in totals)
 
 
-def in_order(parts):
+def in_order(parts: Sequence[Any]) -> Any:
     """Join (index, samples) pairs in the order of the indices; None when there are none."""
     if len(parts) < 2:
         return parts[0][1] if parts else None
@@ -179,7 +181,7 @@ def in_order(parts):
     return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
 
 
-_FUNCTIONS = {
+_FUNCTIONS: dict[str, tuple[Callable, ...]] = {
     IMU_TYPE: (find_imu_layout, decode_imu, imu_row, imu_from_rows),
     JOINT_STATE_TYPE: (find_joint_layout, decode_joints, joint_row, joints_from_rows),
     TEMPERATURE_TYPE: (find_temperature_layout, decode_temperature, temperature_row, temperature_from_rows),

@@ -1,5 +1,6 @@
 """Message definitions: the standard ones, and whether a bag's own definition is the standard one."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from msg_adapters.imu import IMU_TYPE
@@ -42,19 +43,19 @@ class TypeDefinition(NamedTuple):
     """RIHS01 hash; may be empty."""
 
 
-def standard_definition(message_type):
+def standard_definition(message_type: str) -> TypeDefinition:
     """Return the TypeDefinition of Imu, JointState or Temperature."""
     text, parts, digest = _STANDARD[message_type]
     nested = ''.join(f'{SEPARATOR}\nMSG: {part}\n{_PARTS[part]}' for part in parts)
     return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
 
 
-def is_standard_name(message_type):
+def is_standard_name(message_type: str) -> bool:
     """Return whether this package knows the type: Imu, JointState or Temperature."""
     return message_type in _STANDARD
 
 
-def is_standard(message_type, encoding, text):
+def is_standard(message_type: str, encoding: str, text: str) -> bool:
     """Return whether a definition has the fields of the standard one; without a text the standard is taken for granted."""
     if not text:
         return True
@@ -66,7 +67,7 @@ def is_standard(message_type, encoding, text):
         return False
 
 
-def deserializer(message_type, definitions, ros1=False):
+def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros1: bool = False) -> Callable:
     """
     Return a function from message bytes to a message object, by rosbags.
 

@@ -1,9 +1,12 @@
 """Samples to serialized messages of one size each: numpy fills a byte table, one row per message."""
 
 import struct
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from msg_adapters.imu import FIELDS, N_DOUBLES
 from msg_adapters.stamps import from_ns
 
@@ -13,7 +16,8 @@ ABSENT = (-1.0,) + (0.0,) * 8
 """Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity."""
 
 
-def encode_imu(imu, frame_id=None, force_cov=UNKNOWN, rate_cov=UNKNOWN):
+def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLike = UNKNOWN, *,
+               rate_cov: ArrayLike = UNKNOWN) -> np.ndarray:
     """
     Serialize ImuSamples; the orientation is declared absent.
 
@@ -31,14 +35,14 @@ def encode_imu(imu, frame_id=None, force_cov=UNKNOWN, rate_cov=UNKNOWN):
     return _table(imu.stamp_ns, _head(imu.frame_id if frame_id is None else frame_id, 8), [doubles])
 
 
-def encode_joints(joints, frame_id='', with_velocity=True):
+def encode_joints(joints: JointSamples, frame_id: str = '', with_velocity: bool = True) -> np.ndarray:
     """Serialize JointSamples (see `encode_imu`), with an empty sequence of velocities when these are left out."""
     names = b''
     for name in joints.names:
         names = _padded(names, 4) + _string(name)
     head = _head(frame_id, 4) + struct.pack('<I', len(joints.names)) + names
     count = struct.pack('<I', len(joints.names))
-    pieces = [joints.position]
+    pieces: list[Any] = [joints.position]
     if with_velocity and joints.names:
         pieces += [count + bytes(4), joints.velocity]
     else:
@@ -46,16 +50,16 @@ def encode_joints(joints, frame_id='', with_velocity=True):
     return _table(joints.stamp_ns, _padded(_padded(head, 4) + count, 8 if joints.names else 4), [*pieces, bytes(4)])
 
 
-def encode_temperature(temperature, frame_id=''):
+def encode_temperature(temperature: TemperatureSamples, frame_id: str = '') -> np.ndarray:
     """Serialize TemperatureSamples (see `encode_imu`); the variance is unknown, 0."""
     doubles = np.zeros((len(temperature), 2), dtype='<f8')
     doubles[:, 0] = temperature.temperature_c
     return _table(temperature.stamp_ns, _head(frame_id, 8), [doubles])
 
 
-def rows(table):
+def rows(table: np.ndarray) -> list[memoryview]:
     """Return one memoryview per row of a contiguous byte table."""
-    view, size = memoryview(table).cast('B'), table.shape[1]
+    view, size = table.data.cast('B'), table.shape[1]
     return [view[start:start + size] for start in range(0, table.size, size)]
 
 

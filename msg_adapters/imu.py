@@ -1,12 +1,13 @@
 """sensor_msgs/Imu: by attribute, by bytes one at a time, and many at once."""
 
 import struct
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from imu_calibration.samples import ImuSamples
-from msg_adapters.layout import MessageLayout, overlapping
+from msg_adapters.layout import MessageLayout, Packed, overlapping
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -30,7 +31,7 @@ class ImuMessage(NamedTuple):
     """All 37 numbers in the order of the message; `FIELDS` says which is which."""
 
 
-def parse_imu(data):
+def parse_imu(data: bytes) -> ImuMessage:
     """
     Take a serialized Imu message apart.
 
@@ -44,7 +45,7 @@ def parse_imu(data):
     return ImuMessage(header.stamp_ns, header.frame.decode(errors='replace'), _DOUBLES[header.order].unpack_from(data, body))
 
 
-def patch_imu(data, frame_id=None, **fields):
+def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float]) -> bytes:
     """
     Return a copy of a serialized Imu message with some fields replaced.
 
@@ -70,7 +71,7 @@ def patch_imu(data, frame_id=None, **fields):
     return bytes(patched)
 
 
-def find_imu_layout(data):
+def find_imu_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
     header, body = _open_message(data)
     offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
@@ -78,7 +79,7 @@ def find_imu_layout(data):
     return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame.decode(errors='replace'),))
 
 
-def decode_imu(layout, packed):
+def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
     """Return the ImuSamples of messages of one layout; what a message declares absent (covariance -1) comes as NaN."""
     readings = {}
     for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
@@ -90,7 +91,7 @@ def decode_imu(layout, packed):
     return ImuSamples(layout.stamp_ns(packed), frame_id=layout.names[0], **readings)
 
 
-def patch_imu_group(layout, packed, fields, frame_id=None):
+def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.ndarray], *, frame_id: str | None = None) -> np.ndarray:
     """
     Return copies of messages of one layout with some fields replaced (see `patch_imu` for one message).
 
@@ -121,13 +122,13 @@ def patch_imu_group(layout, packed, fields, frame_id=None):
     return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
 
 
-def imu_row(message):
+def imu_row(message: Any) -> tuple[int, tuple[float, float, float], tuple[float, float, float], str]:
     """Return (stamp_ns, force, rate, frame_id) of a message object of rclpy or rosbags; absent readings as NaN."""
     force = _reading(message.linear_acceleration, message.linear_acceleration_covariance)
     return header_stamp_ns(message), force, _reading(message.angular_velocity, message.angular_velocity_covariance), message.header.frame_id
 
 
-def imu_from_rows(rows):
+def imu_from_rows(rows: Sequence[Any]) -> ImuSamples:
     """Return ImuSamples from what `imu_row` gave."""
     stamp_ns, force_s, rate_s, frames = zip(*rows, strict=True)
     return ImuSamples(np.array(stamp_ns, dtype=np.int64), np.array(force_s, dtype=float), np.array(rate_s, dtype=float), frames[0])

@@ -1,6 +1,7 @@
 """Serialized Imu messages of one stream, taken apart and put together again; what repeats is looked at only where its bytes change."""
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,7 +26,7 @@ class ImuStream:
 
     """
 
-    def __init__(self, frame_id=None, late_ns=0):
+    def __init__(self, frame_id: str | None = None, late_ns: int = 0):
         self._frame_out, self._late_ns = frame_id, late_ns
         self._size, self._order, self._head, self._head_end, self._head_out = -1, b'', b'', HEAD_AT, b''
         self._body = self._rate_at = self._force_at = 0
@@ -37,7 +38,7 @@ class ImuStream:
         self._tail = struct.Struct(order + '3d72s3d72s')
         self._nine, self._four = struct.Struct(order + '9d'), struct.Struct(order + '4d')
 
-    def open(self, data):
+    def open(self, data: bytes) -> str:
         """
         Find the places in a message with a new head; return its frame_id.
 
@@ -60,44 +61,45 @@ class ImuStream:
         self._size = len(data)
         return layout.names[0]
 
-    def take(self, data):
+    def take(self, data: bytes) -> tuple[int, tuple[float, ...]] | None:
         """Return (stamp in ns, readings: rate x, y, z, force x, y, z), or None where head or covariances differ from the last."""
         if (len(data) != self._size or data[HEAD_AT:self._head_end] != self._head or data[:2] != self._order
                 or data[self._rate_at + 24:self._rate_at + 96] != self._rate_cov or data[self._force_at + 24:] != self._force_cov):
             return None
         return self.read(data)
 
-    def read(self, data):
+    def read(self, data: bytes) -> tuple[int, tuple[float, ...]]:
         """Return (stamp in ns, readings) of a message whose places are known."""
         seconds, nanoseconds = self._stamp.unpack_from(data, STAMP_AT)
         return seconds * NS + nanoseconds, self._readings.unpack_from(data, self._rate_at)
 
-    def heads(self, data):
+    def heads(self, data: bytes) -> bool:
         """Return whether a message has the head of the one that was opened last, so that everything stands where it stood."""
         return len(data) == self._size and data[HEAD_AT:self._head_end] == self._head and data[:2] == self._order
 
-    def forget(self):
+    def forget(self) -> None:
         """Have the next message opened whatever it is."""
         self._size = -1
 
-    def covariances(self, data):
+    def covariances(self, data: bytes) -> tuple[np.ndarray, ...]:
         """Return the covariances of (force, rate), each (3, 3)."""
         self._rate_cov, self._force_cov = data[self._rate_at + 24:self._rate_at + 96], data[self._force_at + 24:]
         return tuple(np.array(self._nine.unpack_from(raw)).reshape(3, 3) for raw in (self._force_cov, self._rate_cov))
 
-    def orientation(self, data):
+    def orientation(self, data: bytes) -> tuple[tuple[float, ...], bytes]:
         """Return (quaternion x, y, z, w; its covariance as bytes)."""
         return self._four.unpack_from(data, self._body), data[self._body + 32:self._rate_at]
 
-    def unpacked(self, covariance):
+    def unpacked(self, covariance: bytes) -> np.ndarray:
         """Return the matrix in the bytes of a covariance, shape (3, 3)."""
         return np.array(self._nine.unpack(covariance)).reshape(3, 3)
 
-    def packed(self, covariance):
+    def packed(self, covariance: np.ndarray) -> bytes:
         """Return a covariance, (3, 3), as bytes."""
         return self._nine.pack(*covariance.ravel().tolist())
 
-    def rewritten(self, data, stamp_ns, readings, rate_cov, force_cov, orientation=None):
+    def rewritten(self, data: bytes, stamp_ns: int, readings: Sequence[float], *, rate_cov: bytes, force_cov: bytes,
+                  orientation: tuple[Sequence[float], bytes] | None = None) -> bytes:
         """
         Return a message with other readings, the rest as it came.
 

@@ -1,11 +1,13 @@
 """sensor_msgs/JointState: names in any order, velocities that may be missing, more joints than the table has."""
 
 import struct
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.samples import JointSamples
-from msg_adapters.layout import MessageLayout
+from msg_adapters.layout import MessageLayout, Packed
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, header_stamp_ns, open_header
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
@@ -14,7 +16,7 @@ MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
 
 
-def find_joint_layout(data):
+def find_joint_layout(data: bytes) -> MessageLayout:
     """
     Return the MessageLayout of a serialized JointState message; `names` are the joint names.
 
@@ -34,7 +36,7 @@ def find_joint_layout(data):
     return MessageLayout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
 
 
-def decode_joints(layout, packed, joint_names):
+def decode_joints(layout: MessageLayout, packed: Packed, joint_names: Sequence[str]) -> JointSamples:
     """
     Decode messages of one layout, columns in the order of `joint_names`.
 
@@ -53,7 +55,7 @@ def decode_joints(layout, packed, joint_names):
     return JointSamples(layout.stamp_ns(packed), position, velocity, tuple(joint_names))
 
 
-def joint_row(message, joint_names):
+def joint_row(message: Any, joint_names: Sequence[str]) -> tuple[int, list[float], list[float]]:
     """Return (stamp_ns, positions, velocities) of a message object of rclpy or rosbags (raises UnusableMessage)."""
     columns = joint_columns(message.name, len(message.position), joint_names)
     has_velocity = len(message.velocity) == len(message.name)
@@ -61,14 +63,14 @@ def joint_row(message, joint_names):
     return header_stamp_ns(message), [message.position[k] for k in columns], velocity
 
 
-def joints_from_rows(rows, joint_names):
+def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float]]], joint_names: Sequence[str]) -> JointSamples:
     """Return JointSamples from what `joint_row` gave."""
     stamp_ns, position, velocity = zip(*rows, strict=True)
     return JointSamples(np.array(stamp_ns, dtype=np.int64), np.array(position, dtype=float), np.array(velocity, dtype=float),
                         tuple(joint_names))
 
 
-def joint_columns(names, n_positions, joint_names):
+def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
     """Return where in a message that names `names` the joints stand (raises UnusableMessage)."""
     names = list(names)
     if any(name not in names for name in joint_names):

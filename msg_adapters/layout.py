@@ -1,5 +1,6 @@
 """Serialized messages in bulk: where they lie in a buffer, and columns of numbers taken out of many at once."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,25 +22,25 @@ class Packed:
     size: np.ndarray
     """Bytes of each message, int64, shape (n,)."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.start)
 
-    def message(self, index):
+    def message(self, index: int) -> bytes:
         """Return the bytes of one message."""
         start = int(self.start[index])
         return self.buffer[start:start + int(self.size[index])].tobytes()
 
-    def view(self, index):
+    def view(self, index: int) -> memoryview:
         """Return one message without copying it."""
         start = int(self.start[index])
-        return memoryview(self.buffer)[start:start + int(self.size[index])]
+        return self.buffer.data[start:start + int(self.size[index])]
 
-    def select(self, index):
+    def select(self, index: np.ndarray) -> 'Packed':
         """Return some of the messages."""
         return Packed(self.buffer, self.start[index], self.size[index])
 
     @classmethod
-    def join(cls, messages):
+    def join(cls, messages: Sequence[bytes]) -> 'Packed':
         """Pack a list of bytes objects."""
         size = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
         start = np.concatenate([np.zeros(1, np.int64), np.cumsum(size)[:-1]]) if messages else size
@@ -63,7 +64,7 @@ class MessageLayout:
     names: tuple = ()
     """Strings of the message: the frame_id, or the joint names."""
 
-    def matches(self, packed):
+    def matches(self, packed: Packed) -> np.ndarray:
         """Return which messages have this layout, bool, shape (n,)."""
         same = packed.size == self.size
         start = packed.start if same.all() else np.where(same, packed.start, packed.start[np.argmax(same)])
@@ -72,13 +73,13 @@ class MessageLayout:
             same &= (words[start + offset] & mask) == expected
         return same
 
-    def stamp_ns(self, packed):
+    def stamp_ns(self, packed: Packed) -> np.ndarray:
         """Return the header stamps of messages that have this layout, int64, shape (n,)."""
         pairs = overlapping(packed.buffer, 'V8')[packed.start + ENCAPSULATION_SIZE]
         sec, nanosec = pairs.view(self.order + 'i4')[::2], pairs.view(self.order + 'u4')[1::2]
         return sec.astype(np.int64) * NS_PER_S + nanosec
 
-    def column(self, packed, name, count=None):
+    def column(self, packed: Packed, name: str, count: int | None = None) -> np.ndarray:
         """Return the doubles of field `name`, or its first `count`, of messages that have this layout, shape (n, count)."""
         offset, length = self.offsets[name]
         count = length if count is None else count
@@ -89,7 +90,7 @@ class MessageLayout:
         return rows.view(self.order + 'f8').reshape(-1, count).astype(float, copy=False)
 
 
-def group_by_layout(packed, find_layout):
+def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[MessageLayout, np.ndarray, Packed]], np.ndarray]:
     """
     Split messages into groups of one layout each.
 
@@ -125,13 +126,13 @@ def group_by_layout(packed, find_layout):
     return groups, np.sort(np.concatenate([*broken, rest]))
 
 
-def overlapping(buffer, dtype):
+def overlapping(buffer: np.ndarray, dtype: str) -> np.ndarray:
     """View bytes as overlapping, unaligned words: element k is the word that starts at byte k."""
     dtype = np.dtype(dtype)
     return np.ndarray((max(len(buffer) - dtype.itemsize + 1, 0),), dtype, buffer, strides=(1,))
 
 
-def is_any(values, wanted):
+def is_any(values: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
     """Return where an integer array equals one of a few numbers."""
     return np.logical_or.reduce([values == number for number in wanted]) if wanted else np.zeros(len(values), dtype=bool)
 

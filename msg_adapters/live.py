@@ -2,6 +2,8 @@
 
 import threading
 from collections import deque
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -31,27 +33,27 @@ class LiveGatherer:
 
     """
 
-    def __init__(self, joint_names=None, max_messages=1_000_000, frame_id=None):
+    def __init__(self, joint_names: Sequence[str] | None = None, max_messages: int = 1_000_000, frame_id: str | None = None):
         imu = Decoder(IMU_TYPE) if frame_id is None else FrameDecoder(frame_id)
         self._topics = {'imu': _Topic(imu, max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
                         'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
 
-    def add_imu(self, message, sent_ns=0):
+    def add_imu(self, message: bytes, sent_ns: int = 0) -> None:
         """Add an Imu message: bytes or a message object, and when it was sent, ns."""
         self._topics['imu'].add(message, sent_ns)
 
-    def add_joints(self, message, sent_ns=0):
+    def add_joints(self, message: Any, sent_ns: int = 0) -> None:
         """Add a JointState message: bytes or a message object."""
         self._topics['joints'].add(message, sent_ns)
 
-    def add_temperature(self, message, sent_ns=0):
+    def add_temperature(self, message: Any, sent_ns: int = 0) -> None:
         """Add a Temperature message: bytes or a message object."""
         self._topics['temperature'].add(message, sent_ns)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return sum(len(topic.waiting) for topic in self._topics.values())
 
-    def flush(self):
+    def flush(self) -> SampleBlock:
         """
         Return what was added since the last call as a SampleBlock.
 
@@ -77,7 +79,7 @@ class FrameDecoder(Decoder):
 
     """
 
-    def __init__(self, frame_id=''):
+    def __init__(self, frame_id: str = ''):
         super().__init__(IMU_TYPE)
         self.frame_id = frame_id
         decode_layout, read_row = self.decode_layout, self.read_row

@@ -3,9 +3,12 @@
 import os
 import struct
 from collections import Counter
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,12 +58,13 @@ class McapFile(StorageFile):
 
     """
 
-    def __init__(self, path, unpack=None):
+    def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
         self.path, self.unpack = Path(path), unpack
         self.file = open(path, 'rb', buffering=0)
         self.size = os.fstat(self.file.fileno()).st_size
         self.schemas, self.channels, self.lost = {}, {}, {}
-        self.chunk_starts, self.statistics, self.complete = [], None, False
+        self.chunk_starts, self.complete = [], False
+        self.statistics: Any = None
         try:
             if self._read(0, len(MAGIC)) != MAGIC:
                 raise ValueError('the file does not begin as an MCAP file')
@@ -72,7 +76,7 @@ class McapFile(StorageFile):
             raise
 
     @property
-    def types(self):
+    def types(self) -> dict[str, str]:
         """Topic -> message type; other serializations than CDR are named behind the type."""
         types = {}
         for channel in self.channels.values():
@@ -81,11 +85,11 @@ class McapFile(StorageFile):
         return types
 
     @property
-    def definitions(self):
+    def definitions(self) -> dict[str, tuple[str, str]]:
         """Message type -> (language, text)."""
         return {schema.name: (schema.encoding, schema.text) for schema in self.schemas.values()}
 
-    def count(self):
+    def count(self) -> dict[str, int]:
         """Return topic -> messages."""
         counts = Counter({channel.topic: 0 for channel in self.channels.values()})
         for number, count in self.statistics[2].items():
@@ -93,17 +97,17 @@ class McapFile(StorageFile):
                 counts[self.channels[number].topic] += count
         return dict(counts)
 
-    def time_range(self):
+    def time_range(self) -> tuple[int, int] | None:
         """Return (first, last) receive time in ns, or None when the file does not say."""
         first, last, counts = self.statistics
         return (first, last) if any(counts.values()) and last else None
 
-    def close(self):
+    def close(self) -> None:
         """Close the file."""
         self.file.close()
 
     @property
-    def topic_ids(self):
+    def topic_ids(self) -> dict[str, list[int]]:  # type: ignore[override]
         """Topic -> channel ids."""
         ids = {}
         for number, channel in self.channels.items():

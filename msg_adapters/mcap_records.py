@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -57,34 +58,34 @@ class McapDamage(Exception):
     """A record that cannot be as the format says."""
 
 
-def parse_schema(content):
+def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
     """Return (id, Schema) from the content of a Schema record."""
     number, = struct.unpack_from('<H', content)
     (name, encoding, text), _ = _strings(content, 2, 3)
     return number, Schema(name, encoding, text)
 
 
-def parse_channel(content):
+def parse_channel(content: bytes | memoryview) -> tuple[int, Channel]:
     """Return (id, Channel) from the content of a Channel record."""
     number, schema_id = struct.unpack_from('<HH', content)
     (topic, encoding), _ = _strings(content, 4, 2)
     return number, Channel(schema_id, topic, encoding)
 
 
-def parse_message_index(content):
+def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
     """Return (channel id, offsets of its Message records in the chunk) from a MessageIndex record."""
     channel, length = struct.unpack_from('<HI', content)
     entries = np.frombuffer(content, dtype='<u8', count=length // 8, offset=6)
     return channel, entries[1::2].astype(np.int64)
 
 
-def parse_statistics(content):
+def parse_statistics(content: memoryview) -> tuple[int, int, dict[int, int]]:
     """Return (first time, last time, channel id -> messages) from a Statistics record."""
     first, last = struct.unpack_from('<QQ', content, 26)
     return first, last, dict(struct.iter_unpack('<HQ', content[46:46 + struct.unpack_from('<I', content, 42)[0]]))
 
 
-def unpack_chunk(content, decompress):
+def unpack_chunk(content: memoryview, decompress: Callable) -> tuple[bytes | memoryview, bool]:
     """
     Return the records inside a Chunk record (raises McapDamage).
 
@@ -117,7 +118,7 @@ def unpack_chunk(content, decompress):
     return records, whole
 
 
-def indexed_messages(buffer, indexes):
+def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> Messages | None:
     """
     Find the messages of a chunk by its message indexes.
 
@@ -142,7 +143,7 @@ def indexed_messages(buffer, indexes):
     return Messages(channel, offset + MESSAGE_PREFIX, length - 22)
 
 
-def walk(buffer):
+def walk(buffer: np.ndarray) -> tuple[Messages, list[tuple[int, bytes]], int]:
     """
     Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are taken at once.
 
@@ -155,7 +156,7 @@ def walk(buffer):
         Where the next record would start.
 
     """
-    view, offsets, others = memoryview(buffer), [], []
+    view, offsets, others = buffer.data, [], []
     position, previous, run, end = 0, -1, 0, len(buffer)
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
@@ -177,12 +178,12 @@ def walk(buffer):
     return Messages(channel, offset + MESSAGE_PREFIX, length - 22), others, position
 
 
-def log_times(buffer, messages, index):
+def log_times(buffer: np.ndarray, messages: Messages, index: np.ndarray) -> np.ndarray:
     """Return the receive times of some Messages of a buffer, int64."""
     return overlapping(buffer, '<i8')[messages.start[index] - 16]
 
 
-def is_record(opcode):
+def is_record(opcode: int) -> bool:
     """Return whether the format knows the opcode, or leaves it to applications."""
     return 1 <= opcode <= LAST_OPCODE or opcode >= 0x80
 

@@ -3,8 +3,12 @@
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+
+from msg_adapters.definitions import TypeDefinition
 
 MAGIC = b'\x89MCAP0\r\n'
 CHUNK_SIZE = 1 << 20
@@ -13,13 +17,13 @@ MESSAGE_HEADER = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2
 """Everything in front of the data of a Message record, 31 bytes."""
 
 
-def text(value):
+def text(value: bytes | str) -> bytes:
     """A string with its length in front."""
     data = value if isinstance(value, bytes) else value.encode()
     return struct.pack('<I', len(data)) + data
 
 
-def record(opcode, *parts):
+def record(opcode: int, *parts: bytes) -> bytes:
     """One record: opcode, length, content."""
     content = b''.join(parts)
     return struct.pack('<BQ', opcode, len(content)) + content
@@ -28,7 +32,7 @@ def record(opcode, *parts):
 class McapWriter:
     """Writes one new file; `compression` of the chunks is '', 'zstd' or 'lz4'."""
 
-    def __init__(self, path, _ros_distro, compression=''):
+    def __init__(self, path: Path, _ros_distro: str, compression: str = ''):
         self.file = open(path, 'xb')
         self.compression, self.compress = compression, compressor(compression)
         self.file.write(MAGIC + record(0x01, text('ros2'), text('imu_calibration')))
@@ -37,7 +41,7 @@ class McapWriter:
         self.chunk_indexes, self.counts = [], Counter()
         self.first_ns, self.last_ns = None, 0
 
-    def add_topic(self, topic_id, name, definition, qos):
+    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
         if definition.type not in self.schemas:
             schema = record(0x03, struct.pack('<H', len(self.schemas) + 1), text(definition.type), text(definition.encoding),
@@ -49,7 +53,7 @@ class McapWriter:
         self.channels[topic_id] = channel
         self.new_records += channel
 
-    def write(self, topic_ids, received_ns, messages):
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
         """Append messages: arrays of topic ids and receive times, and a list of byte strings."""
         headers = np.zeros(len(messages), dtype=MESSAGE_HEADER)
         size = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
@@ -91,7 +95,7 @@ class McapWriter:
             self.counts[int(channel)] += len(entries)
         return places
 
-    def close(self, _metadata_version, metadata):
+    def close(self, _metadata_version: int, metadata: str) -> None:
         """Write the metadata, the summary and the footer, and close."""
         if self.new_records:
             self.file.write(self.new_records)
@@ -119,12 +123,12 @@ class McapWriter:
                 offsets.append(record(0x0E, struct.pack('<BQQ', opcode, start, self.file.tell() - start)))
         return offsets
 
-    def abort(self):
+    def abort(self) -> None:
         """Close without finishing."""
         self.file.close()
 
 
-def compressor(name):
+def compressor(name: str) -> Callable | type:
     """Return the function that compresses a chunk."""
     if name == 'zstd':
         from msg_adapters.compressed import zstd

@@ -1,5 +1,7 @@
 """Quality-of-service profiles of recorded topics, from any version of the metadata to version 9, which spells them out."""
 
+from collections.abc import Sequence
+
 _NAMES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
@@ -8,7 +10,7 @@ _NAMES = {
 }
 
 
-def spelled_out(profiles):
+def spelled_out(profiles: Sequence) -> list:
     """Return offered_qos_profiles as a list of mappings with names in place of numbers; empty when they make no sense."""
     import yaml
     if isinstance(profiles, str):

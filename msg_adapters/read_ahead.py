@@ -2,6 +2,10 @@
 
 import queue
 import threading
+from collections.abc import Generator
+from typing import Any, TypeVar
+
+T = TypeVar('T')
 
 DEPTH = 2
 """Pieces that wait at most; bounds the memory."""
@@ -9,13 +13,14 @@ DEPTH = 2
 _END = object()
 
 
-def read_ahead(pieces):
+def read_ahead(pieces: Generator[T, None, None]) -> Generator[T, None, None]:
     """
     Run a generator in a thread and yield what it yields, in order; its exceptions are raised here.
 
     The thread ends with the generator, or soon after the consumer has closed this one.
     """
-    waiting, stop = queue.Queue(DEPTH), threading.Event()
+    waiting: queue.Queue[Any] = queue.Queue(DEPTH)
+    stop = threading.Event()
 
     def put(item):
         while not stop.is_set():

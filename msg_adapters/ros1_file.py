@@ -1,6 +1,7 @@
 """ROS 1 bags as far as rosbags reads them, one raw message at a time."""
 
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ class Ros1File:
 
     ros1 = True
 
-    def __init__(self, path):
+    def __init__(self, path: Path):
         from rosbags.rosbag1 import Reader
         self.reader = Reader(Path(path))
         self.reader.open()
@@ -33,11 +34,11 @@ class Ros1File:
             self.definitions[connection.msgtype] = ('ros2msg', connection.msgdef.data)
 
     @property
-    def duration_ns(self):
+    def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
         return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
 
-    def stretches(self, topics):
+    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
         """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
         connections = [c for c in self.reader.connections if c.topic in topics]
         pending, n_pending, n_read = defaultdict(list), 0, 0
@@ -59,7 +60,7 @@ class Ros1File:
         if pending:
             yield _arrived(pending)
 
-    def close(self):
+    def close(self) -> None:
         """Close the file."""
         with suppress(Exception):
             self.reader.close()

@@ -2,8 +2,11 @@
 
 import re
 import shutil
+from collections.abc import Iterator, Sequence
+from os import PathLike
 from pathlib import Path, PurePath
 from tempfile import mkdtemp
+from typing import Any
 
 from msg_adapters.compressed import decompress_file, decompress_message
 from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
@@ -31,7 +34,7 @@ class Rosbag2:
 
     ros1 = False
 
-    def __init__(self, path):
+    def __init__(self, path: str | PathLike[str]):
         self.path, self.folder = Path(path), None
         self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
         self._lost, self.files = {}, []
@@ -48,7 +51,7 @@ class Rosbag2:
             raise
 
     @property
-    def duration_ns(self):
+    def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
         if 'duration' in self.metadata:
             return int(self.metadata['duration']['nanoseconds'])
@@ -56,7 +59,7 @@ class Rosbag2:
         return max(last for _, last in ranges) - min(first for first, _ in ranges) if ranges else 0
 
     @property
-    def lost(self):
+    def lost(self) -> dict[str, int]:
         """What could not be read, reason -> count."""
         lost = dict(self._lost)
         for file in self.files:
@@ -64,11 +67,11 @@ class Rosbag2:
         return lost
 
     @property
-    def storage(self):
+    def storage(self) -> str:
         """What rosbag2 calls the storage of the first file."""
         return next(storage.identifier for storage in STORAGES if isinstance(self.files[0], storage.reader))
 
-    def definition(self, topic):
+    def definition(self, topic: str) -> TypeDefinition:
         """Return the TypeDefinition of a topic; the standard one where the bag has none."""
         message_type = self.types[topic]
         encoding, text = self.definitions.get(message_type, ('', ''))
@@ -77,15 +80,15 @@ class Rosbag2:
         digest = self._entry(topic).get('type_description_hash', '')
         return TypeDefinition(message_type, encoding if text else '', text, digest)
 
-    def qos(self, topic):
+    def qos(self, topic: str) -> list:
         """Return the QoS profiles of a topic's publishers as far as the metadata say."""
         return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
 
-    def stretches(self, topics):
+    def stretches(self, topics: Sequence[str]) -> Iterator:
         """Yield dicts topic -> Arrived in file order."""
         return self._through(topics, lambda file: file.stretches(topics), lambda found: sum(len(part.packed) for part in found.values()))
 
-    def raw_stretches(self, topics):
+    def raw_stretches(self, topics: Sequence[str]) -> Iterator:
         """Yield RawMessages of the topics in file order."""
         return self._through(topics, lambda file: file.raw_stretches(topics), lambda raw: len(raw.topic))
 
@@ -105,7 +108,7 @@ class Rosbag2:
         entries = [entry['topic_metadata'] for entry in self.metadata.get('topics_with_message_count', ())]
         return next((entry for entry in entries if entry['name'] == topic), {})
 
-    def close(self):
+    def close(self) -> None:
         """Close the files and remove what was decompressed."""
         for file in self.files:
             file.close()
@@ -154,7 +157,7 @@ class Rosbag2:
         return {name: sum(counts.get(name, 0) for counts in counted) for name in self.types}
 
 
-def read_metadata(folder):
+def read_metadata(folder: Path) -> dict[str, Any]:
     """Return the content of metadata.yaml; empty when there is none or it is damaged, as after a crash of the recorder."""
     import yaml
     try:

@@ -3,9 +3,11 @@
 import os
 import sqlite3
 from collections import defaultdict
+from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from itertools import islice
+from os import PathLike
 from pathlib import Path
 from urllib.parse import quote
 
@@ -33,7 +35,7 @@ class SqliteFile(StorageFile):
 
     """
 
-    def __init__(self, path, unpack=None):
+    def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
         self.path, self.unpack = Path(path), unpack
         self.lost = {}
         log = Path(f'{path}-wal')
@@ -61,7 +63,7 @@ class SqliteFile(StorageFile):
             rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')
             self.definitions = {name: (encoding, text) for name, encoding, text in rows}
 
-    def count(self):
+    def count(self) -> dict[str, int]:
         """Return topic -> messages by counting them."""
         by_id = defaultdict(int)
         for stretch in self._stretches(list(self.topic_ids)):
@@ -69,7 +71,7 @@ class SqliteFile(StorageFile):
                 by_id[int(topic_id)] += int(count)
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
 
-    def time_range(self):
+    def time_range(self) -> tuple[int, int] | None:
         """Return (first, last) receive time in ns, or None when there are no messages or they cannot be read."""
         with suppress(sqlite3.Error):
             first, = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
@@ -77,7 +79,7 @@ class SqliteFile(StorageFile):
             return None if first is None else (first, last)
         return None
 
-    def close(self):
+    def close(self) -> None:
         """Close the file."""
         self.connection.close()
 

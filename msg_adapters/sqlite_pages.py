@@ -6,6 +6,8 @@ into one page are left to SQL; a damaged page costs its own rows only.
 """
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +45,7 @@ class MessageRows(NamedTuple):
     received_type: np.ndarray
     """Serial type of the receive time, int64, shape (n,)."""
 
-    def received_ns(self, index):
+    def received_ns(self, index: np.ndarray) -> np.ndarray:
         """Return the receive times of some rows, int64."""
         return _integer(self.buffer, self.received_at[index], self.received_type[index])
 
@@ -56,7 +58,7 @@ class PageReader:
     above the first rows of a table often lies far behind them.
     """
 
-    def __init__(self, path, root):
+    def __init__(self, path: Path, root: int):
         self.file = open(path, 'rb', buffering=0)
         header = self.file.read(100)
         size = int.from_bytes(header[16:18], 'big')
@@ -71,11 +73,11 @@ class PageReader:
         if self.scanning:
             self.damaged_pages = max(int.from_bytes(header[28:32], 'big') - self.n_pages, self.damaged_pages)
 
-    def close(self):
+    def close(self) -> None:
         """Close the file."""
         self.file.close()
 
-    def stretches(self):
+    def stretches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield (buffer, starts of the pages in it) over the leaves."""
         if self.scanning:
             for first in range(1, self.n_pages + 1, STRETCH_PAGES):
@@ -91,7 +93,7 @@ class PageReader:
         if waiting:
             yield self._read(np.concatenate(waiting))
 
-    def rows(self, buffer, starts):
+    def rows(self, buffer: np.ndarray, starts: np.ndarray) -> MessageRows:
         """Parse the leaves of a stretch; pages and rows that make no sense are counted and left out."""
         whole = buffer[starts] == LEAF
         if not self.scanning:

@@ -1,6 +1,12 @@
 """A rosbag2 sqlite3 storage file, schema version 4."""
 
 import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from msg_adapters.definitions import TypeDefinition
 
 SCHEMA = (
     'CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)',
@@ -16,7 +22,7 @@ SCHEMA = (
 class SqliteWriter:
     """Writes one new file; nothing else may open it before `close`."""
 
-    def __init__(self, path, ros_distro):
+    def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)
         # The file is made under another name and thrown away on failure: a journal would protect nothing.
         for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
@@ -26,7 +32,7 @@ class SqliteWriter:
             self.connection.execute(statement)
         self.connection.execute('INSERT INTO schema VALUES (4, ?)', (ros_distro,))
 
-    def add_topic(self, topic_id, name, definition, qos):
+    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
         self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
                                 (topic_id, name, definition.type, 'cdr', qos, definition.digest))
@@ -36,18 +42,18 @@ class SqliteWriter:
                 'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
                 'VALUES (?, ?, ?, ?)', (definition.type, definition.encoding, definition.text, definition.digest))
 
-    def write(self, topic_ids, received_ns, messages):
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
         """Append messages: arrays of topic ids and receive times, and a list of byte strings."""
         self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
                                     zip(topic_ids.tolist(), received_ns.tolist(), messages, strict=True))
 
-    def close(self, metadata_version, metadata):
+    def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""
         self.connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
         self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (metadata_version, metadata))
         self.connection.execute('COMMIT')
         self.connection.close()
 
-    def abort(self):
+    def abort(self) -> None:
         """Close without finishing."""
         self.connection.close()

@@ -1,7 +1,9 @@
 """Header stamps and the four bytes in front of every CDR message."""
 
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 NS_PER_S = 1_000_000_000
 
@@ -23,7 +25,7 @@ class UnusableMessage(MessageError):
     """A well-formed message that gives no sample; its text is the reason to count it under."""
 
 
-def byte_order(data):
+def byte_order(data: bytes) -> str:
     """
     Return '<' or '>' from the encapsulation header of a serialized message.
 
@@ -52,7 +54,7 @@ class Header(NamedTuple):
     """First byte behind the frame_id, not yet aligned."""
 
 
-def open_header(data):
+def open_header(data: bytes) -> Header:
     """Return the Header of a serialized message (raises MessageError)."""
     order = byte_order(data)
     if len(data) < FRAME_OFFSET + 4:
@@ -64,22 +66,22 @@ def open_header(data):
     return Header(order, to_ns(sec, nanosec), bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
 
 
-def aligned(position, size):
+def aligned(position: int, size: int) -> int:
     """Return the first position from `position` on that CDR aligns to `size`; positions count from the start of the message."""
     return position + (ENCAPSULATION_SIZE - position) % size
 
 
-def to_ns(sec, nanosec):
+def to_ns(sec: int, nanosec: int) -> int:
     """Return the stamp as integer nanoseconds; works on numbers and on int64 arrays."""
     return sec * NS_PER_S + nanosec
 
 
-def from_ns(stamp_ns):
+def from_ns(stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (sec, nanosec) of an integer stamp; works on numbers and on int64 arrays."""
     return stamp_ns // NS_PER_S, stamp_ns % NS_PER_S
 
 
-def header_stamp_ns(message):
+def header_stamp_ns(message: Any) -> int:
     """Return the header stamp of a message object, from rclpy or from rosbags (ROS 1 messages say nsec)."""
     stamp = message.header.stamp
     return to_ns(int(stamp.sec), int(stamp.nanosec))

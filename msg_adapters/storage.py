@@ -1,7 +1,8 @@
 """What the readers of storage files have in common: from stretches of rows to messages by topic."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -43,10 +44,20 @@ class RawMessages(NamedTuple):
 class StorageFile:
     """Base of the readers: they provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, and count in `lost`."""
 
-    unpack = None
+    topic_ids: dict[str, list[int]]
+    """Topic -> the file's own numbers of it."""
+    path: Path
+    """The file."""
+    lost: dict[str, int]
+    """Reason -> messages that could not be read."""
+    unpack: Callable[[bytes], bytes] | None = None
     """Bytes -> bytes for each message, when the bag is compressed by message."""
 
-    def stretches(self, topics):
+    def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
+        """Yield the Stretches of the file that may hold messages of the topics."""
+        raise NotImplementedError
+
+    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
         """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
         for stretch in self._stretches(topics):
             found = {}
@@ -58,7 +69,7 @@ class StorageFile:
             if found:
                 yield found
 
-    def raw_stretches(self, topics):
+    def raw_stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
         """Yield RawMessages of the topics in file order."""
         for stretch in self._stretches(topics):
             code = np.full(len(stretch.topic_ids), -1)

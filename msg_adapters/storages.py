@@ -1,18 +1,43 @@
 """The storages of rosbag2 that are read and written: to add one, add its entry to `STORAGES`."""
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from msg_adapters.definitions import TypeDefinition
-from msg_adapters.layout import Packed
 from msg_adapters.mcap_file import McapFile
 from msg_adapters.mcap_writer import McapWriter
 from msg_adapters.sqlite_file import SqliteFile
 from msg_adapters.sqlite_writer import SqliteWriter
-from msg_adapters.storage import RawMessages
+from msg_adapters.storage import Arrived, RawMessages
+
+
+class BagSource(Protocol):
+    """The messages of one recording, whatever files they are in: `rosbag2.Rosbag2` or `ros1_file.Ros1File`."""
+
+    ros1: bool
+    """Whether the messages are serialized as in ROS 1."""
+    types: dict[str, str]
+    """Topic -> message type."""
+    definitions: dict[str, tuple[str, str]]
+    """Message type -> (encoding, text) of its definition."""
+    counts: dict[str, int]
+    """Topic -> messages that the recording says it holds."""
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """What could not be read, reason -> count."""
+
+    @property
+    def duration_ns(self) -> int:
+        """Time between the first and the last message by the clock of the recorder."""
+
+    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
+        """Yield dicts topic -> Arrived in file order."""
+
+    def close(self) -> None:
+        """Close the files."""
 
 
 class StorageReader(Protocol):
@@ -29,7 +54,7 @@ class StorageReader(Protocol):
     def definitions(self) -> dict[str, tuple[str, str]]:
         """Message type -> (encoding, text) of its definition."""
 
-    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
+    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
         """Yield dicts topic -> Packed in file order."""
 
     def raw_stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
@@ -48,13 +73,13 @@ class StorageReader(Protocol):
 class StorageWriter(Protocol):
     """One new storage file."""
 
-    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, qos: str) -> None:
+    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic before its messages; `qos` are the profiles of its publishers as YAML."""
 
-    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: list[bytes]) -> None:
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
         """Append messages in the order of the file."""
 
-    def close(self, metadata_version: int, metadata: str) -> None:
+    def close(self, metadata_version: int, metadata: str, /) -> None:
         """Finish the file with the metadata of the bag as YAML, and close."""
 
     def abort(self) -> None:
@@ -68,7 +93,7 @@ class Storage(NamedTuple):
     """What rosbag2 calls it."""
     suffix: str
     """How its files end."""
-    reader: Callable[[Path, Callable[[bytes], bytes] | None], StorageReader]
+    reader: type[StorageReader]
     """Opens (path, what unpacks each message, or None) for reading."""
     writer: Callable[..., StorageWriter]
     """Makes (path, ROS distribution, options by name)."""

@@ -1,7 +1,13 @@
 """Sessions from arrays into new recordings."""
 
-import numpy as np
+from collections.abc import Callable
+from os import PathLike
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from msg_adapters.bag import DEFAULT_TOPICS
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
@@ -14,9 +20,10 @@ BATCH = 65536
 """Messages handed to the storage at once; bounds the memory of a long recording."""
 
 
-def write_session(path, imu, joints=None, temperature=None, *, storage='sqlite3', imu_topic=DEFAULT_TOPICS[IMU_TYPE],
-                  joint_topic=DEFAULT_TOPICS[JOINT_STATE_TYPE], temperature_topic=DEFAULT_TOPICS[TEMPERATURE_TYPE],
-                  force_cov=UNKNOWN, rate_cov=UNKNOWN, **options):
+def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSamples | None = None, *,
+                  temperature: TemperatureSamples | None = None, storage: str = 'sqlite3', imu_topic: str = DEFAULT_TOPICS[IMU_TYPE],
+                  joint_topic: str = DEFAULT_TOPICS[JOINT_STATE_TYPE], temperature_topic: str = DEFAULT_TOPICS[TEMPERATURE_TYPE],
+                  force_cov: ArrayLike = UNKNOWN, rate_cov: ArrayLike = UNKNOWN, **options: Any) -> None:
     """
     Write a session into a new bag; receive times are the header stamps, made monotone per topic.
 
@@ -43,7 +50,8 @@ def write_session(path, imu, joints=None, temperature=None, *, storage='sqlite3'
         When `path` exists already or cannot be written.
 
     """
-    streams = [(imu_topic, IMU_TYPE, imu, lambda part: encode_imu(part, force_cov=force_cov, rate_cov=rate_cov))]
+    streams: list[tuple[str, str, Any, Callable]] = [(imu_topic, IMU_TYPE, imu,
+                                                      lambda part: encode_imu(part, force_cov=force_cov, rate_cov=rate_cov))]
     if joints is not None:
         keep_velocity = not np.isnan(joints.velocity).all()
         streams.append((joint_topic, JOINT_STATE_TYPE, joints, lambda part: encode_joints(part, with_velocity=keep_velocity)))

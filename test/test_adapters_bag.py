@@ -25,7 +25,7 @@ def make_session(n=2000, seed=0, names=('outer', 'middle', 'inner')):
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_a_session_comes_back_to_the_last_bit(tmp_path, storage):
     imu, joints, temperature = make_session()
-    write_session(tmp_path / 'bag', imu, joints, temperature, storage=storage)
+    write_session(tmp_path / 'bag', imu, joints, temperature=temperature, storage=storage)
     with open_recording(tmp_path / 'bag') as recording:
         blocks = list(recording.blocks(('inner', 'outer', 'middle'), block_samples=700))
     assert not recording.lost and all(block.dropped is None for block in blocks)
@@ -54,8 +54,9 @@ def test_rosbags_reads_what_is_written(tmp_path, storage):
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_the_same_session_gives_the_same_bytes(tmp_path, storage):
+    session = make_session()
     for folder in ('a', 'b'):
-        write_session(tmp_path / folder / 'bag', *make_session(), storage=storage)
+        write_session(tmp_path / folder / 'bag', *session[:2], temperature=session[2], storage=storage)
     for path in sorted((tmp_path / 'a' / 'bag').iterdir()):
         assert path.read_bytes() == (tmp_path / 'b' / 'bag' / path.name).read_bytes()
 
@@ -75,7 +76,7 @@ def test_stamps_come_from_the_header_and_keep_their_disorder(tmp_path):
 
 def test_blocks_hold_the_same_stretch_of_every_topic(tmp_path):
     imu, joints, temperature = make_session(40000)
-    write_session(tmp_path / 'bag', imu, joints, temperature, storage='mcap')
+    write_session(tmp_path / 'bag', imu, joints, temperature=temperature, storage='mcap')
     with open_recording(tmp_path / 'bag') as recording:
         blocks = list(recording.blocks(block_samples=5000))
     assert len(blocks) > 2
@@ -86,7 +87,7 @@ def test_blocks_hold_the_same_stretch_of_every_topic(tmp_path):
 
 def test_topics_are_chosen_by_name_then_default_then_type(tmp_path):
     imu, joints, temperature = make_session(20)
-    write_session(tmp_path / 'bag', imu, joints, temperature, imu_topic='/my/imu', joint_topic='/my/joints')
+    write_session(tmp_path / 'bag', imu, joints, temperature=temperature, imu_topic='/my/imu', joint_topic='/my/joints')
     with open_recording(tmp_path / 'bag') as recording:
         assert (recording.imu_topic, recording.joint_topic, recording.temperature_topic) == ('/my/imu', '/my/joints', '/imu/temperature')
         assert [(topic.name, topic.count) for topic in recording.topics] == [('/imu/temperature', 1), ('/my/imu', 20), ('/my/joints', 4)]
@@ -119,7 +120,8 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path, make):
 
 
 def test_reading_may_stop_early_and_start_again(tmp_path):
-    write_session(tmp_path / 'bag', *make_session(5000))
+    session = make_session(5000)
+    write_session(tmp_path / 'bag', *session[:2], temperature=session[2])
     with open_recording(tmp_path / 'bag') as recording:
         for _ in range(3):
             assert next(iter(recording.blocks(block_samples=1))).imu is not None

@@ -25,9 +25,9 @@ def corrected_samples(force, rate):
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_everything_else_is_copied_to_the_last_bit(tmp_path, storage):
     imu, joints, temperature = make_session()
-    write_session(tmp_path / 'a', imu, joints, temperature, storage=storage)
-    lost = copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/imu/data_corrected',
-                               lambda samples: corrected_samples(2.0 * samples.force_s, samples.rate_s - 1.0))
+    write_session(tmp_path / 'a', imu, joints, temperature=temperature, storage=storage)
+    lost = copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', corrected_topic='/imu/data_corrected',
+                               correct=lambda samples: corrected_samples(2.0 * samples.force_s, samples.rate_s - 1.0))
     assert lost == {}
     for topic in ('/imu/data_raw', '/joint_states', '/imu/temperature'):
         assert raw_messages(tmp_path / 'a', topic) == raw_messages(tmp_path / 'b', topic)
@@ -49,7 +49,8 @@ def test_covariances_and_frame_follow_the_message_definition(tmp_path, frame_id)
 
     def propagate(*measured):
         return [noise if cov is None else gain @ cov @ gain.T for cov in measured]
-    copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/c', lambda s: corrected_samples(s.force_s, s.rate_s),
+    copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', corrected_topic='/c',
+                        correct=lambda s: corrected_samples(s.force_s, s.rate_s),
                         propagate=propagate, frame_id=frame_id, mat_ts=turn)
     message = parse_imu(raw_messages(tmp_path / 'b', '/c')[7][1])
     assert message.frame_id == (frame_id or 'imu_link')
@@ -65,10 +66,10 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     def fail(samples):
         raise InputError('no')
     with pytest.raises(InputError):
-        copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/c', fail)
+        copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', corrected_topic='/c', correct=fail)
     assert [path.name for path in tmp_path.iterdir()] == ['a']
     with pytest.raises(InputError, match='must be new'):
-        copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', '/joint_states', fail)
+        copy_with_corrected(tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', corrected_topic='/joint_states', correct=fail)
     with pytest.raises(InputError, match='must not exist yet'):
         write_session(tmp_path / 'a', imu)
 

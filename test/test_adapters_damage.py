@@ -35,7 +35,7 @@ def bags(session, tmp_path_factory):
     """One bag of each kind, and a sqlite3 one compressed as a file."""
     folder = tmp_path_factory.mktemp('bags')
     for kind, options in KINDS.items():
-        write_session(folder / kind, *session, **options)
+        write_session(folder / kind, *session[:2], temperature=session[2], **options)
     shutil.copytree(folder / 'sqlite3', folder / 'sqlite3_zstd')
     plain = folder / 'sqlite3_zstd' / 'sqlite3_0.db3'
     plain.with_suffix('.db3.zstd').write_bytes(zstd().compress(plain.read_bytes()))

@@ -81,4 +81,4 @@ def test_ros1_bags_take_the_general_path(tmp_path):
     np.testing.assert_array_equal(blocks[0].imu.stamp_ns, imu.stamp_ns)
     np.testing.assert_array_equal(blocks[0].joints.velocity, joints.velocity[:, [2, 0, 1]])
     with pytest.raises(InputError, match='convert it first'):
-        copy_with_corrected(path, tmp_path / 'new', '/imu/data_raw', '/c', None)
+        copy_with_corrected(path, tmp_path / 'new', '/imu/data_raw', corrected_topic='/c', correct=None)

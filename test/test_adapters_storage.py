@@ -26,8 +26,9 @@ class LinesWriter:
     def __init__(self, path, _ros_distro):
         self.file = open(path, 'x', encoding='utf-8')
 
-    def add_topic(self, topic_id, name, definition, _qos):
+    def add_topic(self, topic_id, name, definition, *, qos):
         """Declare a topic."""
+        assert isinstance(qos, str)
         print(json.dumps(['topic', topic_id, name, definition.type, definition.encoding, definition.text]), file=self.file)
 
     def write(self, topic_ids, received_ns, messages):
@@ -93,10 +94,12 @@ def test_a_new_storage_is_written_read_and_copied(tmp_path):
     imu, joints = session()
     write_session(tmp_path / 'bag', imu, joints, storage='lines')
     assert (tmp_path / 'bag/bag_0.lines').exists() and is_bag(tmp_path / 'bag')
-    copy_with_corrected(tmp_path / 'bag', tmp_path / 'copy', '/imu/data_raw', '/imu/data_corrected',
-                        lambda part: type('Corrected', (), {'force': part.force_s + 1, 'rate': part.rate_s, 'marks': np.zeros((len(part), 2))}))
+    copy_with_corrected(tmp_path / 'bag', tmp_path / 'copy', '/imu/data_raw', corrected_topic='/imu/data_corrected',
+                        correct=lambda part: type('Corrected', (),
+                                                  {'force': part.force_s + 1, 'rate': part.rate_s, 'marks': np.zeros((len(part), 2))}))
     (tmp_path / 'copy/metadata.yaml').unlink()   # then the files say how many messages there are
-    for path, topic, shift in ((tmp_path / 'bag', None, 0.0), (tmp_path / 'copy', '/imu/data_corrected', 1.0), (tmp_path / 'bag/bag_0.lines', None, 0.0)):
+    for path, topic, shift in ((tmp_path / 'bag', None, 0.0), (tmp_path / 'copy', '/imu/data_corrected', 1.0),
+                               (tmp_path / 'bag/bag_0.lines', None, 0.0)):
         with open_recording(path, imu_topic=topic) as recording:
             block, = recording.blocks()
         np.testing.assert_array_equal(block.imu.force_s, imu.force_s + shift)

@@ -72,7 +72,7 @@ def test_nothing_is_thrown_away_where_the_reference_is_right():
 def test_white_noise_has_the_same_variance_in_both_parts():
     rows = np.random.default_rng(3).normal(0, 2.0, (25000, 3))
     slow = slow_part(rows, 25)
-    found = band_misfit((rows**2).sum(axis=0), len(rows), (slow**2).sum(axis=0), len(slow))
+    found = band_misfit((rows**2).sum(axis=0), len(rows), (slow**2).sum(axis=0), dof_slow=len(slow))
     assert not found.apart.any()
     np.testing.assert_allclose(found.overall, 4.0, rtol=0.05)
     np.testing.assert_allclose(found.slow, 4.0, rtol=0.2)

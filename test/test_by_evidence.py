@@ -54,7 +54,8 @@ def test_diagnose_hands_over_what_calibrate_does(late, asked):
     np.testing.assert_array_equal(found.calibration.values, asked.calibration.values)
     np.testing.assert_array_equal(found.calibration.sd, asked.calibration.sd)
     value, sd, _ = found.findings[0].parameters[OFFSET]
-    assert (value, sd) == (float(asked.calibration.value('reference', 'time_offset')), asked.calibration.sd[asked.calibration.param_names.index(OFFSET)])
+    assert (value, sd) == (float(asked.calibration.value('reference', 'time_offset')),
+                           asked.calibration.sd[asked.calibration.param_names.index(OFFSET)])
 
 
 def test_a_clean_session_adds_nothing():
@@ -73,7 +74,8 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
         for k, window in enumerate(windows):
             values = model.start()
             values[model.slices['gyroscope', 'gyro_g_sensitivity']] = 1e-3 if k >= share * len(windows) else 0.0
-            outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out, sd in zip(predict(model, values, TABLE, window.motion), (2e-2, 2e-3))]
+            outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out,
+                       sd in zip(predict(model, values, TABLE, motion=window.motion), (2e-2, 2e-3))]
             made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
         return made
     bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)

@@ -113,7 +113,8 @@ def test_scatter_is_found_beside_the_noise():
     noise, group = rng.uniform(0.5, 1.5, 4000), np.repeat([0, 1, -1, 0], 1000)
     design = rng.normal(size=(4000, 5))
     error = rng.normal(size=4000) * np.sqrt(noise + np.array([2.0, 0.0, 0.0])[group])
-    found = estimate_group_variances(design, design @ np.ones(5) + error, noise, group, start=np.array([1.0, 1.0]), fallback=np.array([9.0, 9.0]))
+    found = estimate_group_variances(design, design @ np.ones(5) + error, noise, group=group, start=np.array([1.0, 1.0]),
+                                     fallback=np.array([9.0, 9.0]))
     assert abs(found.variance[0] - 2.0) < 4 * 3.0 * np.sqrt(2 / 2000)
     assert found.variance[1] < 0.2
     assert 1900 < found.dof[0] < 2100
@@ -271,7 +272,8 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
                        np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)), rate @ matrix_w.T + bias_w)
     both = ImuSamples.concatenate([imu, extra])
     turn = KnownTurn(len(imu), len(both), (0, 0, 1), 2 * np.pi)
-    before, after = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(both, HandOptions(GRAVITY), ranges, known_turns=[turn])
+    before, after = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(both, HandOptions(GRAVITY), ranges,
+                                                                                            known_turns=[turn])
     name = 'gyroscope.matrix.zz'
     assert before.sd_of(name) > 5 * after.sd_of(name)
     assert abs(after.value(name) - truth[PARAM_NAMES.index(name)]) < 4 * after.sd_of(name)

@@ -40,7 +40,7 @@ def write_case(folder, effects):
     calibration = random_calibration(7, *EFFECTS[effects], sd=1e-5)
     stamps, force, rate, alpha, temperature = true_motion()
     ref = Reference(np.zeros(N), np.broadcast_to(np.eye(3), (N, 3, 3)), force, rate, alpha, 9.8, temperature)
-    readings = [sensor_output(calibration.model, sensor, calibration.values, ref) for sensor in ('accelerometer', 'gyroscope')]
+    readings = [sensor_output(calibration.model, sensor, calibration.values, ref=ref) for sensor in ('accelerometer', 'gyroscope')]
     thermometer = TemperatureSamples(stamps[::100], temperature[::100])
     write_session(folder / 'bag', ImuSamples(stamps, *readings, 'imu_link'), temperature=thermometer)
     folder.joinpath('calibration.yaml').write_text(calibration_to_text(calibration))

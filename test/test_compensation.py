@@ -26,14 +26,14 @@ PERIOD_NS = 5_000_000
 
 def measured(calibration, force, rate, alpha, temperature):
     ref = Reference(np.zeros(len(force)), np.broadcast_to(np.eye(3), (len(force), 3, 3)), force, rate, alpha, 9.8, temperature)
-    return tuple(sensor_output(calibration.model, sensor, calibration.values, ref) for sensor in ('accelerometer', 'gyroscope'))
+    return tuple(sensor_output(calibration.model, sensor, calibration.values, ref=ref) for sensor in ('accelerometer', 'gyroscope'))
 
 
 @pytest.mark.parametrize('effects', [((), ()), *EACH, ALL], ids=lambda e: '+'.join(e[0] + e[1]) if len(e[0] + e[1]) < 2 else 'all')
 def test_compensation_undoes_the_forward_equations(effects):
     calibration = random_calibration(3, *effects)
     force, rate, alpha, temperature = random_motion()
-    corrected = compensate(calibration, *measured(calibration, force, rate, alpha, temperature), alpha, temperature)
+    corrected = compensate(calibration, *measured(calibration, force, rate, alpha, temperature), alpha_s=alpha, temperature_c=temperature)
     np.testing.assert_allclose(corrected.force, force, atol=1e-12 * 30)   # 12 digits of readings up to 30 m/s^2
     np.testing.assert_allclose(corrected.rate, rate, atol=1e-12 * 10)
     assert not corrected.flagged.any()
@@ -45,8 +45,8 @@ def test_the_whole_way_from_a_table_through_prediction_and_back():
     calibration = random_calibration(4, ('accel_size_effect', 'accel_cross_product'), ('gyro_g_sensitivity',))
     motion = make_profile('random_short', 1, table).at(np.linspace(1.0, 160.0, 500))
     reference = reference_motion(table, motion)
-    force, rate = predict(calibration.model, calibration.values, table, motion)
-    corrected = compensate(calibration, force, rate, reference.alpha_s)
+    force, rate = predict(calibration.model, calibration.values, table, motion=motion)
+    corrected = compensate(calibration, force, rate, alpha_s=reference.alpha_s)
     np.testing.assert_allclose(corrected.force, reference.force_s, atol=1e-11)
     np.testing.assert_allclose(corrected.rate, reference.rate_s, atol=1e-11)
 
@@ -63,8 +63,8 @@ def test_transfer_there_and_back_is_the_identity():
     there = Transfer.from_pose('base', (0.3, -0.2, 0.5), (0.2, -0.4, 2.0))
     mat_ts = there.mat_ts
     back = Transfer('imu', mat_ts.T, -mat_ts.T @ there.arm_t)
-    moved = compensate(plain, force, rate, alpha, transfer=there)
-    again = compensate(plain, moved.force, moved.rate, alpha @ mat_ts.T, transfer=back)
+    moved = compensate(plain, force, rate, alpha_s=alpha, transfer=there)
+    again = compensate(plain, moved.force, moved.rate, alpha_s=alpha @ mat_ts.T, transfer=back)
     np.testing.assert_allclose(again.force, force, atol=1e-13 * 100)   # centripetal terms of 30 m/s^2 come and go
     np.testing.assert_allclose(again.rate, rate, atol=1e-14)
 
@@ -74,7 +74,8 @@ def test_transfer_of_a_steady_turn_takes_the_centripetal_force_out():
     plain = Calibration(plain.model, plain.model.start(), plain.covariance, plain.status)
     # The sensor sits 0.5 m ahead of the axis, x outwards; in the target frame it looks backwards (yaw of 180 degrees).
     transfer = Transfer.from_pose('base', (0.5, 0.0, 0.0), (0.0, 0.0, np.pi))
-    moved = compensate(plain, np.array([[2.0**2 * 0.5, 0.0, 9.8]]), np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 3)), transfer=transfer)
+    moved = compensate(plain, np.array([[2.0**2 * 0.5, 0.0, 9.8]]), np.array([[0.0, 0.0, 2.0]]), alpha_s=np.zeros((1, 3)),
+                       transfer=transfer)
     np.testing.assert_allclose(moved.force, [[0.0, 0.0, 9.8]], atol=1e-14)
     np.testing.assert_allclose(moved.rate, [[0.0, 0.0, 2.0]], atol=1e-14)
 
@@ -95,7 +96,7 @@ def test_saturated_readings_are_flagged():
     values[calibration.model.slices['accelerometer', 'accel_saturation']] = 19.6
     calibration = Calibration(calibration.model, values, calibration.covariance, calibration.status)
     force = np.array([[0.0, 0.0, 9.8], [19.6, 0.0, 0.0], [0.0, -19.6, 0.0], [19.5, 0.0, 0.0]])
-    corrected = compensate(calibration, force, np.zeros((4, 3)), np.zeros((4, 3)))
+    corrected = compensate(calibration, force, np.zeros((4, 3)), alpha_s=np.zeros((4, 3)))
     assert corrected.flagged.tolist() == [False, True, True, False]
     np.testing.assert_allclose(corrected.marks, [[0, 0], [19.6**2, 0], [19.6**2, 0], [0, 0]], rtol=1e-5)
 
@@ -106,7 +107,7 @@ def test_readings_beyond_what_can_be_inverted_are_flagged():
     values[calibration.model.slices['accelerometer', 'accel_quadratic']] = 0.05
     calibration = Calibration(calibration.model, values, calibration.covariance, calibration.status)
     force = np.array([[0.0, 0.0, 0.1], [-100.0, 0.0, 0.0]])   # x + 0.05 x^2 never reaches -100
-    corrected = compensate(calibration, force, np.zeros((2, 3)), np.zeros((2, 3)))
+    corrected = compensate(calibration, force, np.zeros((2, 3)), alpha_s=np.zeros((2, 3)))
     assert corrected.flagged.tolist() == [False, True]
     assert np.isfinite(corrected.force[0]).all() and np.isnan(corrected.force[1]).all()
     assert all(np.isnan(x) for x in make_kernel(calibration)(*force[1].tolist(), *[0.0] * 7))
@@ -116,7 +117,7 @@ def test_thermal_effects_ask_for_temperatures():
     calibration = random_calibration(1, ('accel_thermal_bias',))
     force, rate, alpha, _ = random_motion(5)
     with pytest.raises(InputError, match='needs temperatures'):
-        compensate(calibration, force, rate, alpha)
+        compensate(calibration, force, rate, alpha_s=alpha)
     with pytest.raises(InputError, match='record imu/temperature'):
         CompensationStream(calibration)
 

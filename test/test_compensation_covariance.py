@@ -38,7 +38,7 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
     slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
     rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
     out = np.array([kernel(*row) for row in rows.tolist()])
-    sensitivity = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, DT)
+    sensitivity = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT)
     for got, predicted in zip((out[:, :3], out[:, 3:]), sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False)):
         agree(np.cov(got.T), predicted)
 
@@ -51,7 +51,7 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     draws = rng.multivariate_normal(calibration.values, calibration.covariance, 600)
     sample = [*np.concatenate([FORCE, RATE, SLOPE]).tolist(), DT]
     out = np.array([make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws])
-    predicted = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, DT).parameters
+    predicted = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     # 600 draws: 6 %, five times that; the derivative of the inverse gyroscope matrix in the tangential term is left out.
     assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35

@@ -18,7 +18,7 @@ poses = st.none() | st.builds(lambda *n: Transfer.from_pose('base', n[:3], [3 * 
 def both(calibration, transfer, seed=0, n=12):
     force, rate, slope, temperature = random_motion(n, seed)
     alpha = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
-    expected = compensate(calibration, force, rate, alpha, temperature, transfer)
+    expected = compensate(calibration, force, rate, alpha_s=alpha, temperature_c=temperature, transfer=transfer)
     kernel = make_kernel(calibration, transfer)
     dt = temperature - calibration.model.temperature_ref_c
     got = np.array([kernel(*row) for row in np.column_stack([force, rate, slope, dt]).tolist()])
@@ -45,6 +45,6 @@ def test_zero_input_does_not_trip_the_asymmetry():
     calibration = random_calibration(2, ('accel_scale_asymmetry',), ('gyro_scale_asymmetry',))
     kernel = make_kernel(calibration)
     force, rate = (calibration.value(sensor, 'bias')[None] for sensor in ('accelerometer', 'gyroscope'))
-    expected = compensate(calibration, force, rate, np.zeros((1, 3)))
+    expected = compensate(calibration, force, rate, alpha_s=np.zeros((1, 3)))
     got = kernel(*force[0].tolist(), *rate[0].tolist(), 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(got, np.column_stack([expected.force, expected.rate])[0], atol=1e-15)

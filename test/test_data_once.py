@@ -65,7 +65,7 @@ def test_calibration_by_hand_cleans_each_sample_once(seen):
 
 @pytest.mark.parametrize('with_table', [True, False], ids=['table', 'no table'])
 def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, seen, with_table):
-    (look,) = inspect(BAG, [Topics()], table if with_table else None, PLAIN)
+    (look,) = inspect(BAG, [Topics()], table if with_table else None, options=PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
     assert (look.calibrated is not None) == with_table
 

@@ -30,16 +30,16 @@ def test_noise_is_as_predicted(taps):
 
 
 def test_the_window_is_the_shortest_whose_noise_stays_below_a_third():
-    chosen = choose_derivative(0.001, 0.002, 0.05, 0.02)
+    chosen = choose_derivative(0.001, 0.002, 0.05, force_sd=0.02)
     assert chosen.noise_sd(0.002) * 0.05 <= 0.02 / 3
     assert CausalDerivative(chosen.taps - 1, 0.001).noise_sd(0.002) * 0.05 > 0.02 / 3
 
 
 def test_the_window_does_not_grow_beyond_the_largest_delay():
-    assert choose_derivative(0.001, 1.0, 10.0, 1e-3).delay == pytest.approx(0.02)
-    assert choose_derivative(0.01, 1e-3, 0.0, 1e-3).taps == 2
+    assert choose_derivative(0.001, 1.0, 10.0, force_sd=1e-3).delay == pytest.approx(0.02)
+    assert choose_derivative(0.01, 1e-3, 0.0, force_sd=1e-3).taps == 2
 
 
 def test_unknown_noise_gives_half_the_largest_delay():
-    assert choose_derivative(0.001, 0.0, 0.1, 0.02).delay == pytest.approx(0.01)
-    assert choose_derivative(0.001, 0.002, 0.1, 0.0).delay == pytest.approx(0.01)
+    assert choose_derivative(0.001, 0.0, 0.1, force_sd=0.02).delay == pytest.approx(0.01)
+    assert choose_derivative(0.001, 0.002, 0.1, force_sd=0.0).delay == pytest.approx(0.01)

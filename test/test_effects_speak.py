@@ -76,7 +76,8 @@ MILLI_G = 9.80665e-3
 ADDED = {
     'gyro_anisoelasticity': {'sensor': 'gyroscope', 'column': ['f_y * f_z', 'f_z * f_x', 'f_x * f_y'], 'unit': '(rad/s)/(m/s^2)^2',
                              'tolerance': 1e-6, 'largest': 1e-4, 'text': 'The gyroscopes respond to products of specific force.'},
-    'accel_triple_product': {'sensor': 'accelerometer', 'column': 'f_x * f_y * f_z', 'unit': '(m/s^2)^-2', 'tolerance': 2e-5, 'largest': 1e-3,
+    'accel_triple_product': {'sensor': 'accelerometer', 'column': 'f_x * f_y * f_z', 'unit': '(m/s^2)^-2', 'tolerance': 2e-5,
+                             'largest': 1e-3,
                              'text': 'The accelerometers respond to the product of all three components.'},
     'gyro_scale_settling': {'sensor': 'gyroscope', 'column': ['w_x * exp(-time / tau)', 'w_y * exp(-time / tau)', 'w_z * exp(-time / tau)'],
                             'unit': '1', 'tolerance': 1e-3, 'largest': 0.05, 'text': 'The gyroscope scale factors settle after turn-on.'},
@@ -110,8 +111,9 @@ def with_values(name, share=1.0):
 def test_an_added_effect_does_what_its_text_says(name):
     (model, values), ref, sensor = with_values(name), motion(), SENSOR[name]
     plain = SensorModel()
-    change = sensor_output(model, sensor, values, ref) - sensor_output(plain, sensor, plain.start(), ref)
-    np.testing.assert_allclose(change, FORMULA[name](ref.force_s, ref.rate_s, ref.time, values[model.slices[sensor, name]]), rtol=1e-9, atol=1e-12)
+    change = sensor_output(model, sensor, values, ref=ref) - sensor_output(plain, sensor, plain.start(), ref=ref)
+    np.testing.assert_allclose(change, FORMULA[name](ref.force_s, ref.rate_s, ref.time, values[model.slices[sensor, name]]), rtol=1e-9,
+                               atol=1e-12)
 
 
 @pytest.mark.parametrize('name', ADDED)
@@ -123,7 +125,7 @@ def test_its_derivative_is_that_of_differences(name):
     for k in range(model.slices[sensor, name].start, model.slices[sensor, name].stop):
         step = np.zeros(len(values))
         step[k] = 1e-4 * max(abs(values[k]), 1e-3)
-        ends = [sensor_output(model.at(values + sign * step), sensor, values + sign * step, ref) for sign in (1, -1)]
+        ends = [sensor_output(model.at(values + sign * step), sensor, values + sign * step, ref=ref) for sign in (1, -1)]
         np.testing.assert_allclose(slopes[:, :, k], (ends[0] - ends[1]) / (2 * step[k]), rtol=1e-6, atol=1e-9)
 
 
@@ -161,7 +163,8 @@ def test_compensation_takes_it_out_offline_and_live():
     truth = replace(session(*INVERTED).truth, frame_id='')
     ref = motion(400)
     model, values = truth.model, truth.values
-    measured = [sensor_output(model, sensor, values, replace(ref, alpha_s=np.zeros((400, 3)))) for sensor in ('accelerometer', 'gyroscope')]
+    measured = [sensor_output(model, sensor, values, ref=replace(ref, alpha_s=np.zeros((400, 3)))) for sensor in ('accelerometer',
+                                                                                                                  'gyroscope')]
     kernel = make_kernel(truth)
     got = np.array([kernel(*f, *w, 0.0, 0.0, 0.0, 0.0) for f, w in zip(*measured, strict=True)])
     np.testing.assert_allclose(got, np.hstack([ref.force_s, ref.rate_s]), atol=1e-9)
@@ -191,7 +194,8 @@ def test_diagnosis_finds_and_names_it(name):
 def test_by_hand_it_is_found_too(name):
     made = session(name)
     samples = SampleBlock(made.samples.imu)
-    calibrated = imu.calibrate(samples, catalogue=MINE, **{key: text.replace('+accel_size_effect', '') for key, text in models(name).items()})
+    calibrated = imu.calibrate(samples, catalogue=MINE,
+                               **{key: text.replace('+accel_size_effect', '') for key, text in models(name).items()})
     truth = made.truth.value(SENSOR[name], name)
     assert np.all(np.abs(calibrated.calibration.value(SENSOR[name], name) - truth) < 0.2 * np.abs(truth))
     found = imu.diagnose(samples, catalogue=MINE)
@@ -208,7 +212,8 @@ def test_documents_and_processes_carry_it(tmp_path):
     program = ('import sys, numpy as np, imu_calibration as imu\n'
                "force, rate = imu.load(sys.argv[1]).compensate([[1., 2., 9.]], [[.1, .2, .3]], time=[0.])\n"
                'print(repr(np.hstack([force, rate])[0].tolist()))')
-    done = subprocess.run([sys.executable, '-c', program, tmp_path / 'calibration.yaml'], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    done = subprocess.run([sys.executable, '-c', program, tmp_path / 'calibration.yaml'], capture_output=True, text=True, cwd=ROOT,
+                          timeout=60)
     here = np.hstack(truth.compensate([[1.0, 2.0, 9.0]], [[0.1, 0.2, 0.3]], time=[0.0]))[0]
     np.testing.assert_allclose(ast.literal_eval(done.stdout), here, rtol=1e-12)
 
@@ -222,7 +227,8 @@ def test_pickles_and_saved_sessions_carry_it():
     found = imu.calibrate(made.samples, made.table, catalogue=MINE, **models('gyro_anisoelasticity')).result
     data = to_bytes(found.gathered, found.gathered_model)
     assert len(from_bytes(data, found.gathered_model).accumulator.rows) == len(found.gathered.accumulator.rows)
-    other = replace(found.gathered_model, catalogue=CATALOGUE.with_effects(term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})))
+    other = replace(found.gathered_model,
+                    catalogue=CATALOGUE.with_effects(term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})))
     with pytest.raises(DocumentError, match='must hold the columns of the model'):
         from_bytes(data, other)
 
@@ -233,8 +239,10 @@ def test_the_package_knows_nothing_of_what_others_added():
         SensorModel().with_effect('gyroscope', 'gyro_anisoelasticity').param_names  # noqa: B018
 
 
-@pytest.mark.parametrize('column', ["__import__('os').system('true')", 'f_x.real', 'f_x[0]', '(lambda: f_x)()', 'f_x if f_y else f_z', 'f_w', 'f_x ** 99',
-                                    'f_x ** f_y', 'abs(f_x, f_y)', "'f_x'", 'f_x and f_y', 'f_x < 3', '[f_x]', 'print(f_x)', '1e999', '+'.join(['f_x'] * 300),
+@pytest.mark.parametrize('column', ["__import__('os').system('true')", 'f_x.real', 'f_x[0]', '(lambda: f_x)()', 'f_x if f_y else f_z',
+                                    'f_w', 'f_x ** 99',
+                                    'f_x ** f_y', 'abs(f_x, f_y)', "'f_x'", 'f_x and f_y', 'f_x < 3', '[f_x]', 'print(f_x)', '1e999',
+                                    '+'.join(['f_x'] * 300),
                                     '(' * 300 + 'f_x' + ')' * 300, '', 'f_x := 2', 'True'])
 def test_a_column_is_arithmetic_and_nothing_else(column):
     with pytest.raises(InputError, match='a column must be arithmetic'):
@@ -242,7 +250,8 @@ def test_a_column_is_arithmetic_and_nothing_else(column):
 
 
 @pytest.mark.parametrize('changed, text', [
-    ({'sensor': 'thermometer'}, 'must belong to accelerometer or gyroscope'), ({'column': ['f_x', 'f_y']}, 'one column, or one for each axis'),
+    ({'sensor': 'thermometer'}, 'must belong to accelerometer or gyroscope'),
+    ({'column': ['f_x', 'f_y']}, 'one column, or one for each axis'),
     ({'tolerance': -1.0}, 'the tolerance of effect .* a number above zero'), ({'tolerance': '1'}, 'a number above zero'),
     ({'unit': None}, 'the unit .* must be a text'), ({'colour': 'red'}, 'must have sensor, column, unit, tolerance and text')])
 def test_a_definition_is_refused_in_one_line(changed, text):
@@ -259,7 +268,8 @@ def test_a_name_must_be_free(name):
 
 def by_code(**changed):
     """Return an effect that is made of code, to be undone, with one column."""
-    fields = {'name': 'mine', 'sensor': 'gyroscope', 'components': ('all',), 'shape': (1,), 'unit': '1', 'tolerance': 1.0, 'prior_sd': 1.0, 'explanation': '',
+    fields = {'name': 'mine', 'sensor': 'gyroscope', 'components': ('all',), 'shape': (1,), 'unit': '1', 'tolerance': 1.0, 'prior_sd': 1.0,
+              'explanation': '',
               'motion': ('static_poses',), 'compensation': 'exact', 'groups': (ColumnGroup('mine', ('f_x * w_x',)),),
               'coefficients': lambda values, point: {'mine': np.tile(values['mine'], 3)[None]}}
     return Effect(**fields | changed)

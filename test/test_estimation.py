@@ -43,7 +43,7 @@ def measured(windows, model, values, rng, force_sd=0.0, rate_sd=0.0, offset=0.0)
     """Return the windows with outputs of the model, white noise, and an offset per window in units of the mean's noise."""
     result = []
     for window in windows:
-        force, rate = predict(model, values, TABLE, window.motion)
+        force, rate = predict(model, values, TABLE, motion=window.motion)
         n = len(window.time)
         force, rate = (output + rng.normal(0, sd, (n, 3)) + rng.normal(0, offset * sd, 3) if sd else np.broadcast_to(output, (n, 3)).copy()
                        for output, sd in ((force, force_sd), (rate, rate_sd)))
@@ -68,7 +68,7 @@ class SameMotion:
     def __call__(self, model, sensor, table, motion, temperature_c=None, references=None):
         key = sensor, id(motion)
         if key not in self.known:
-            self.known[key] = columns(model, sensor, table, motion, temperature_c)
+            self.known[key] = columns(model, sensor, table, motion=motion, temperature_c=temperature_c)
         return self.known[key]
 
     def outputs(self, session, values, rng):
@@ -202,9 +202,9 @@ def test_columns_are_the_derivative_of_the_prediction(session, name):
         for index in range(part.start, part.stop):
             step = np.zeros(len(values))
             step[index] = 0.02 * effect.tolerance
-            high, low = (predict(model, values + s * step, TABLE, window.motion) for s in (1, -1))
+            high, low = (predict(model, values + s * step, TABLE, motion=window.motion) for s in (1, -1))
             for sensor, up, down in zip(('accelerometer', 'gyroscope'), high, low):
-                design = columns(model, sensor, TABLE, window.motion)
+                design = columns(model, sensor, TABLE, motion=window.motion)
                 derivative = design @ (coefficients(model, sensor, values + step) - coefficients(model, sensor, values - step))
                 scale = max(np.max(np.abs(up - down)), 1e-9)
                 np.testing.assert_allclose(derivative, up - down, atol=0.01 * scale + 1e-10)
@@ -218,5 +218,5 @@ def test_a_warp_of_one_sensor_leaves_the_other_sensors_motion_alone(session):
     model, window = model.at(values), next(w for w in session if w.kind == 'dynamic')
     together = References(model, TABLE, window.motion)
     for sensor in ('accelerometer', 'gyroscope'):
-        np.testing.assert_array_equal(columns(model, sensor, TABLE, window.motion, references=together),
-                                      columns(model, sensor, TABLE, window.motion))
+        np.testing.assert_array_equal(columns(model, sensor, TABLE, motion=window.motion, references=together),
+                                      columns(model, sensor, TABLE, motion=window.motion))

@@ -46,7 +46,7 @@ def motion(seed, n=12):
 
 
 def readings(calibration, ref):
-    return tuple(sensor_output(calibration.model, sensor, calibration.values, ref) for sensor in SENSORS)
+    return tuple(sensor_output(calibration.model, sensor, calibration.values, ref=ref) for sensor in SENSORS)
 
 
 def with_values(calibration, **changed):
@@ -78,7 +78,9 @@ def held_by(name, seed, **fields):
     """Return a random calibration with those effects alone that a target holds, biases gone where it estimates them."""
     target = find_target(name)
     model = random_calibration(seed, FURTHER['accelerometer'], FURTHER['gyroscope']).model
-    kept = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and holding_of(e, target.holds) and e.role not in (Role.OFFSET, Role.LINEAR))
+    kept = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and holding_of(e,
+                                                                                             target.holds) and e.role not in (Role.OFFSET,
+                                                                                                                              Role.LINEAR))
             for sensor in SENSORS}
     found = random_calibration(seed, kept['accelerometer'], kept['gyroscope'], **fields)
     return with_values(found, OFFSET=None) if holding_of(found.model.effects[0], target.estimates) else found
@@ -157,7 +159,8 @@ def test_basalt_corrects_as_we_do_in_turned_axes(seed):
     calibration = held_by('basalt', seed)
     ref = motion(seed).reference
     found = export(calibration, find_target('basalt'), motion=motion(seed))
-    assert close(applied(programs.basalt, found.content, *readings(calibration, ref)), (ref.force_s @ found.placement.mat_ts.T, ref.rate_s @ found.placement.mat_ts.T))
+    assert close(applied(programs.basalt, found.content, *readings(calibration, ref)),
+                 (ref.force_s @ found.placement.mat_ts.T, ref.rate_s @ found.placement.mat_ts.T))
     assert found.loss.nothing
 
 
@@ -211,7 +214,8 @@ def test_what_px4_takes_no_notice_of_is_said():
     assert len(said) == 3 and 'move by 0.0069 from 0' in said[0] and 'SCALE' in said[1]
     large = with_values(small, OFFSET=lambda b: np.full(3, 0.4), LINEAR=lambda m: np.eye(3) * 1.02)
     assert not any('unchanged' in line for line in export(large, find_target('px4')).lines)
-    assert any('arming will be refused' in line for line in export(with_values(small, OFFSET=lambda b: b + 4.0), find_target('ardupilot')).lines)
+    assert any('arming will be refused' in line for line in export(with_values(small, OFFSET=lambda b: b + 4.0),
+                                                                   find_target('ardupilot')).lines)
 
 
 # Noise
@@ -224,7 +228,8 @@ def noise_figures():
     """Noise of 100 Hz recordings whose axes differ: the worst one counts."""
     def axis(sensor, share):
         term = {'white_noise': WHITE[sensor] * share, 'random_walk': WALK[sensor] * share}
-        return AxisFigures({name: Term(name, value, (0.9 * value, 1.1 * value), 'determined', '') for name, value in term.items()}, form=('random_walk',))
+        return AxisFigures({name: Term(name, value, (0.9 * value, 1.1 * value), 'determined', '') for name, value in term.items()},
+                           form=('random_walk',))
     return NoiseFigures(*(tuple(axis(sensor, share) for share in (0.7, 1.0, 0.9)) for sensor in SENSORS), rate=100.0)
 
 
@@ -345,7 +350,8 @@ def back_and_forth(name, calibration):
     return import_file(target, export(calibration, target).content, 'file')
 
 
-@pytest.mark.parametrize('name', sorted(name for name, target in all_targets().items() if target.write and target.read and not target.whole))
+@pytest.mark.parametrize('name',
+                         sorted(name for name, target in all_targets().items() if target.write and target.read and not target.whole))
 @given(seed=SEEDS)
 @settings(max_examples=10, deadline=None)
 def test_an_import_of_an_export_is_what_it_was(name, seed):
@@ -446,7 +452,7 @@ def test_imu_tk_is_read_with_both_its_files(seed):
         for named in texts:
             path = Path(folder, f'test_imu{named}')
             found = import_file(find_reader('imu-tk'), path.read_bytes(), path)
-            true = compensate(found, ref.force_s, ref.rate_s, ref.alpha_s)
+            true = compensate(found, ref.force_s, ref.rate_s, alpha_s=ref.alpha_s)
             for made, ending, raw in ((true.force, '.acc', ref.force_s), (true.rate, '.gyro', ref.rate_s)):
                 np.testing.assert_allclose(made, [programs.imu_tk(texts[ending], sample) for sample in raw], rtol=0, atol=40 * EXACT)
         Path(folder, 'test_imu.gyro').unlink()
@@ -456,7 +462,8 @@ def test_imu_tk_is_read_with_both_its_files(seed):
 
 
 @pytest.mark.parametrize('name', sorted(name for name, target in all_targets().items() if target.read))
-@pytest.mark.parametrize('content', (b'', b'\xff\xfe\x00', b'[1, 2]', b'a: [', b'{"value0": 3}', b'imu0: 5', b'CAL_ACC0_XOFF nan x', b'SM: [1]'))
+@pytest.mark.parametrize('content',
+                         (b'', b'\xff\xfe\x00', b'[1, 2]', b'a: [', b'{"value0": 3}', b'imu0: 5', b'CAL_ACC0_XOFF nan x', b'SM: [1]'))
 def test_files_of_something_else_are_refused_in_one_line(name, content, tmp_path):
     with pytest.raises(InputError) as error:
         import_file(find_reader(name), content, tmp_path / 'file')

@@ -57,7 +57,8 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
         asked.append((question, mate))
         return 'turn it over'
 
-    made = [finding(Search(), [FIRST, SECOND], place, solution, share=lambda named, q: 0.9, gain_of=lambda place: GAIN, motion_of=motion_of)
+    made = [finding(Search(), [FIRST, SECOND], place, solution=solution, share=lambda named, q: 0.9, gain_of=lambda place: GAIN,
+                    motion_of=motion_of)
             for place in (0, 1)]
     assert [f.indistinguishable_from for f in made] == [(MATE.name,), (MATE.name, OTHER.name)]
     assert asked == [(FIRST, MATE), (SECOND, MATE)]

@@ -38,7 +38,7 @@ def test_spline_equals_scipys():
     coefficients = rng.normal(size=(knots.n_coefficients, 2))
     reference = BSpline(-1.0 + 0.3 * np.arange(-5, 18), coefficients, 5)
     time = rng.uniform(-1.0, 2.6, 100)
-    values = evaluate_pieces(knots, piece_coefficients(coefficients), time, 3)
+    values = evaluate_pieces(knots, piece_coefficients(coefficients), time, derivatives=3)
     for order in range(4):
         np.testing.assert_allclose(values[order], reference.derivative(order)(time) if order else reference(time), atol=1e-10)
         if order < 2:
@@ -231,7 +231,7 @@ def test_velocities_that_agree_make_the_curve_better():
 def test_a_joint_at_rest_does_not_vouch_for_its_velocities():
     rng = np.random.default_rng(9)
     noise = 1e-5 * rng.normal(size=(3, 1000))
-    assert not check_velocity(noise[0], noise[1], noise[2], 100.0, QUIET)[0]
+    assert not check_velocity(noise[0], noise[1], noise[2], dof=100.0, settings=QUIET)[0]
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 5, 8, 12])
@@ -276,7 +276,7 @@ def smooth_motion(time):
 def test_encoder_harmonics_and_their_derivatives(order):
     cos, sin, step = np.array([0.02, 0.0]), np.array([-0.01, 0.03]), 1e-3
     time = 0.4 + step * np.arange(-2, 3)
-    motion = with_encoder_harmonics(smooth_motion(time), order, cos, sin)
+    motion = with_encoder_harmonics(smooth_motion(time), order, cos, sin_amplitude=sin)
     position = smooth_motion(time).position
     np.testing.assert_allclose(motion.position, position + cos * np.cos(order * position) + sin * np.sin(order * position), atol=1e-15)
     first = np.array([1, -8, 0, 8, -1]) / (12 * step)

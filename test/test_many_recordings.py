@@ -34,7 +34,7 @@ def motion():
     imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0)
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
-    return [(window, {s: columns(MODEL, s, TABLE, window.motion) for s in SENSORS}) for window in windows]
+    return [(window, {s: columns(MODEL, s, TABLE, motion=window.motion) for s in SENSORS}) for window in windows]
 
 
 def recordings(motion, values, steps, rng):
@@ -46,7 +46,7 @@ def recordings(motion, values, steps, rng):
             outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s],
                                                                                           (len(window.time), 3)) for s in SENSORS]
             part.add(reduce_window(Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]}), MODEL, TABLE, session=session,
-                                   column_function=lambda model, sensor, *rest, known=designs, **shared: known[sensor]))
+                                   column_function=lambda model, sensor, table, known=designs, **motion: known[sensor]))
         total.merge(part)
     return total
 

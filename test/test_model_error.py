@@ -37,7 +37,8 @@ def measured(windows, change_of, seed):
     for window in windows:
         values = MODEL.start()
         values[MODEL.param_names.index(YAW)] += change_of(window.time.mean() / end)
-        outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out, sd in zip(predict(MODEL, values, TABLE, window.motion), (2e-2, 2e-3))]
+        outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out,
+                   sd in zip(predict(MODEL, values, TABLE, motion=window.motion), (2e-2, 2e-3))]
         found.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
     return found
 

@@ -54,7 +54,7 @@ def test_earth_rate_turns_the_level_frame():
     time, earth = np.linspace(0, 1000, 2001), np.array([4.6e-5, -1e-5, 5.6e-5])
     start = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
     rate_s = np.tile(start.T @ earth, (len(time), 1))
-    mat_ns = navigation.integrate_attitude(time, rate_s, start, earth)
+    mat_ns = navigation.integrate_attitude(time, rate_s, start, earth_rate_n=earth)
     np.testing.assert_allclose(mat_ns, np.broadcast_to(start, mat_ns.shape), atol=1e-12)
 
 

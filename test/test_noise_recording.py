@@ -219,7 +219,8 @@ def test_the_report_holds_the_plots_and_is_the_same_each_time(quiet):
     figures = figures_of(quiet[1])
     page = noise_report(quiet[1], figures)
     assert page == noise_report(quiet[1], figures)
-    assert page.count('<svg') == 2 and 'slope −½' in page and 'averaging time τ, s' in page and 'nan' not in page.lower().replace('nano', '')
+    assert page.count('<svg') == 2 and 'slope −½' in page and 'averaging time τ, s' in page and 'nan' not in page.lower().replace('nano',
+                                                                                                                                  '')
 
 
 def test_memory_is_that_of_a_shorter_recording():
@@ -241,16 +242,17 @@ def test_memory_is_that_of_a_shorter_recording():
 
 def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys):
     imu = resting(120.0, 10)
-    write_session(tmp_path / 'bag', imu, None, None)
+    write_session(tmp_path / 'bag', imu, None, temperature=None)
     assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
     said = capsys.readouterr().out
-    assert 'accelerometer, white noise N, µg/√Hz' in said and 'at 200 Hz' in said and max(map(len, said.splitlines()[:-1])) <= 80 and 'to determine all of them: record' in said
+    assert 'accelerometer, white noise N, µg/√Hz' in said and 'at 200 Hz' in said and max(map(len,
+                                                                                              said.splitlines()[:-1])) <= 80 and 'to determine all of them: record' in said
     figures = files.read_noise(tmp_path / 'out/noise.yaml')
     assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
     assert figures.provenance['bags'][0]['name'] == 'bag'
     assert (tmp_path / 'out/report.html').read_text().startswith('<!DOCTYPE html>')
     short = imu.select(slice(0, 400))
-    write_session(tmp_path / 'short', short, None, None)
+    write_session(tmp_path / 'short', short, None, temperature=None)
     assert main(['noise', str(tmp_path / 'short'), '--output', str(tmp_path / 'none')]) == 1
     error = capsys.readouterr().err
     assert error.count('\n') == 1 and 'must rest' in error and not (tmp_path / 'none').exists()

@@ -78,7 +78,7 @@ def wandering(seed, size, count=20):
 
 
 def offsets_of(rows, white, times, sessions, known):
-    return estimate_offsets(rows, white, times, sessions, np.zeros((2, 2)), known=known)
+    return estimate_offsets(rows, white, times, sessions=sessions, information=np.zeros((2, 2)), known=known)
 
 
 def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():

@@ -21,13 +21,14 @@ from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 GRAVITY = 9.81
 MODEL = SensorModel()
 NAMES = list(MODEL.param_names)
-NOISE = {sensor: NoiseModel(np.array([1.0, 4.0, 9.0]) * variance, np.full(3, 2.0), 1e-4, (BiasProcess(2e-4, 100.0), BiasProcess(1e-4, 10.0)))
+NOISE = {sensor: NoiseModel(np.array([1.0, 4.0, 9.0]) * variance, np.full(3, 2.0), 1e-4,
+                            (BiasProcess(2e-4, 100.0), BiasProcess(1e-4, 10.0)))
          for sensor, variance in (('accelerometer', 1e-4), ('gyroscope', 1e-6))}
 BY_NAME = {motion.name: motion for motion in MOTIONS}
 
 
 def added(name, model=MODEL, noise=NOISE):
-    return added_information(model, model.start(), noise, BY_NAME[name], GRAVITY)
+    return added_information(model, model.start(), noise, motion=BY_NAME[name], gravity=GRAVITY)
 
 
 def test_a_rest_adds_what_means_of_five_seconds_say():
@@ -88,7 +89,7 @@ def test_the_motion_that_is_needed_is_the_one_that_helps_most_with_the_sd_it_wil
     have = added('static_poses')
     tolerances = np.where(['gyroscope.matrix' in name for name in NAMES], 1e-3, np.inf)
     prior_sd = make_prior(MODEL).sd
-    needed = needed_motions(solution(have), tolerances, GRAVITY, prior_sd)
+    needed = needed_motions(solution(have), tolerances, GRAVITY, prior_sd=prior_sd)
     assert set(needed) == {name for name in NAMES if 'gyroscope.matrix' in name}
     after = {motion.text: solution(have + added(motion.name)).sd for motion in MOTIONS}
     for name, (text, sd) in needed.items():
@@ -99,13 +100,14 @@ def test_the_motion_that_is_needed_is_the_one_that_helps_most_with_the_sd_it_wil
 
 
 def test_nothing_is_needed_where_everything_is_determined():
-    assert needed_motions(solution(added('three_speeds') + added('static_poses')), np.full(len(NAMES), np.inf), GRAVITY, make_prior(MODEL).sd) == {}
+    assert needed_motions(solution(added('three_speeds') + added('static_poses')), np.full(len(NAMES), np.inf), GRAVITY,
+                          prior_sd=make_prior(MODEL).sd) == {}
 
 
 def test_where_no_motion_of_the_sensor_helps_that_of_the_table_is_named():
     model = SensorModel(reference=('table_tilt',))
     tolerances = np.where(['table_tilt' in name for name in model.param_names], 1e-9, np.inf)
-    needed = needed_motions(solution(added('static_poses', model), model), tolerances, GRAVITY, make_prior(model).sd)
+    needed = needed_motions(solution(added('static_poses', model), model), tolerances, GRAVITY, prior_sd=make_prior(model).sd)
     assert {text for text, _ in needed.values()} == {TABLE_MOTIONS['turn_about_vertical']}
     assert all(np.isnan(sd) for _, sd in needed.values())
 

@@ -51,7 +51,7 @@ def predicted(session, name=None):
     for key, value in parts.items():
         values[model.slices[key]] = np.ravel(value)
     table = Table.from_mapping(session.table | {'gravity': session.truth['gravity']})
-    return predict(model, values, table, told_motion(session), session.truth['temperature_c'])
+    return predict(model, values, table, motion=told_motion(session), temperature_c=session.truth['temperature_c'])
 
 
 @pytest.mark.parametrize('name', EFFECTS)

@@ -176,8 +176,10 @@ FAULTS = (
     (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'look like deg/s', 'gyroscope_scale 57.29578')),
     (twice_converted, 'rate_unit', REFUSE, ('twice',)),
     (mirrored_gyroscope, 'handedness', REFUSE, ("the gyroscope's y is minus the accelerometer's y", 'left-handed')),
-    (gyroscope_axes_swapped, 'handedness', REFUSE, ("the gyroscope's y is the accelerometer's x", "the gyroscope's x is the accelerometer's y", 'left-handed')),
-    (gyroscope_turned, 'handedness', REFUSE, ("the gyroscope's x is the accelerometer's y", "the gyroscope's y is minus the accelerometer's x", 'turned against')),
+    (gyroscope_axes_swapped, 'handedness', REFUSE,
+     ("the gyroscope's y is the accelerometer's x", "the gyroscope's x is the accelerometer's y", 'left-handed')),
+    (gyroscope_turned, 'handedness', REFUSE,
+     ("the gyroscope's x is the accelerometer's y", "the gyroscope's y is minus the accelerometer's x", 'turned against')),
     (dead_axis, 'frozen', REFUSE, ('accelerometer y never changes',)),
     (dead_gyroscope, 'frozen', REFUSE, ('the gyroscope must measure something',)),
     (stuck_axis, 'frozen', WARNING, ('gyroscope y stands still',)),
@@ -200,7 +202,8 @@ IDS = [f'{fault.__name__}-{check}' for fault, check, *_ in FAULTS]
 
 @pytest.mark.parametrize(('fault', 'check', 'severity', 'words'), FAULTS, ids=IDS)
 def test_inspect_names_the_fault(capsys, tmp_path, session, fault, check, severity, words):
-    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
+    write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     code = main(['inspect', str(tmp_path / 'bag')])
     printed = ' '.join(capsys.readouterr().out.split())
     found = [f for f in findings(fault(session.imu, session.joints, session.temperature)) if f.check == check and f.severity == severity]
@@ -212,7 +215,8 @@ def test_inspect_names_the_fault(capsys, tmp_path, session, fault, check, severi
 @pytest.mark.parametrize('fault', sorted({fault for fault, _, severity, _ in FAULTS if severity == REFUSE}, key=lambda f: f.__name__))
 def test_calibrate_refuses_what_would_make_the_result_wrong(capsys, tmp_path, session, table, fault):
     """One line, exit code 1, nothing written: with the table and by hand."""
-    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
+    write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     for more in (['--table', str(table)], []) if fault is not two_clocks else (['--table', str(table)],):
         capsys.readouterr()
         assert main(['calibrate', str(tmp_path / 'bag'), *more, '--output', str(tmp_path / 'out')]) == 1
@@ -225,7 +229,8 @@ def test_calibrate_refuses_what_would_make_the_result_wrong(capsys, tmp_path, se
 @pytest.mark.parametrize(('fault', 'check', 'unusable'), ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)))
 def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, fault, check, unusable):
     """Said on standard error, kept in the file and the report; exit code 3 when samples are unusable."""
-    write_session(str(tmp_path / 'bag'), *fault(session.imu, session.joints, session.temperature))
+    imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
+    write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     more = [] if unusable else ['--no-report']   # one report is enough
     code = main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out'), *more])
     text, = (line for line in capsys.readouterr().err.splitlines() if line.startswith('warning: '))
@@ -305,9 +310,12 @@ def test_a_crooked_mount_is_no_exchange_of_axes(angle_deg, wrong):
 
 
 GOOD_SESSIONS = {
-    'white': {}, 'realistic': {'noise': 'realistic'}, 'consumer': {'grade': 'consumer', 'noise': 'realistic'}, 'without noise': {'noise': 'none'},
-    'two axes': {'table': 'two_axis'}, 'centrifuge': {'table': 'centrifuge'}, 'no velocity': {'velocity': 'none'}, 'coarse encoder': {'encoder_resolution': 1e-3},
-    'late clock': {'hidden': {'time_offset': 0.05}}, 'slow gyroscope': {'hidden': {'gyro_bandwidth': None}}, 'g-sensitive': {'hidden': {'gyro_g_sensitivity': None}},
+    'white': {}, 'realistic': {'noise': 'realistic'}, 'consumer': {'grade': 'consumer', 'noise': 'realistic'},
+    'without noise': {'noise': 'none'},
+    'two axes': {'table': 'two_axis'}, 'centrifuge': {'table': 'centrifuge'}, 'no velocity': {'velocity': 'none'},
+    'coarse encoder': {'encoder_resolution': 1e-3},
+    'late clock': {'hidden': {'time_offset': 0.05}}, 'slow gyroscope': {'hidden': {'gyro_bandwidth': None}},
+    'g-sensitive': {'hidden': {'gyro_g_sensitivity': None}},
 }
 
 
@@ -352,11 +360,12 @@ def several_topics(folder, session, imu=1, joints=1, temperature=1):
     from rosbags.rosbag2 import Reader, Writer
     from rosbags.typesys import Stores, get_typestore
     few = session.imu.select(slice(0, 300)), session.joints.select(slice(0, 300)), session.temperature.select(slice(0, 3))
-    write_session(str(folder / 'plain'), *few)
+    write_session(str(folder / 'plain'), *few[:2], temperature=few[2])
     kinds = {'/imu/data_raw': ('imu', imu), '/joint_states': ('joints', joints), '/imu/temperature': ('temperature', temperature)}
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with Reader(folder / 'plain') as reader, Writer(folder / 'bag', version=9) as writer:
-        out = {c.topic: [writer.add_connection(f'/{kinds[c.topic][0]}_{k}', c.msgtype, typestore=typestore) for k in range(kinds[c.topic][1])]
+        out = {c.topic: [writer.add_connection(f'/{kinds[c.topic][0]}_{k}', c.msgtype,
+                                               typestore=typestore) for k in range(kinds[c.topic][1])]
                for c in reader.connections}
         for connection, stamp, data in reader.messages():
             for target in out[connection.topic]:
@@ -397,7 +406,8 @@ def test_inspect_looks_at_every_imu(capsys, tmp_path, session):
     listing, *looks = capsys.readouterr().out.split('\n\n')
     assert [look.splitlines()[0].strip() for look in looks] == ['/imu_0', '/imu_1']
     assert all('force unit' in look for look in looks)
-    assert {line.split()[0] for line in listing.splitlines() if line.rstrip().endswith('read')} == {'/imu_0', '/imu_1', '/joints_0', '/temperature_0'}
+    assert {line.split()[0] for line in listing.splitlines() if line.rstrip().endswith('read')} == {'/imu_0', '/imu_1', '/joints_0',
+                                                                                                    '/temperature_0'}
     assert main(['inspect', str(bag), '--imu-topic', '/imu_1']) == 0
     assert '\n/imu_0\n' not in capsys.readouterr().out
 
@@ -424,7 +434,8 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
 def test_the_only_topic_of_a_type_is_taken_whatever_its_name(capsys, tmp_path, session):
     main(['inspect', str(several_topics(tmp_path, session))])
     out = capsys.readouterr().out
-    assert [name for name in ('/imu_0', '/joints_0', '/temperature_0') if not any(name in line and 'read' in line for line in out.splitlines())] == []
+    assert [name for name in ('/imu_0', '/joints_0',
+                              '/temperature_0') if not any(name in line and 'read' in line for line in out.splitlines())] == []
 
 
 def test_a_bag_without_imu_lists_what_it_holds(capsys, tmp_path, session):

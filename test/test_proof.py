@@ -87,13 +87,15 @@ def test_memory_does_not_grow_with_the_session(clean):
     for _ in range(3):
         twice.merge(clean.result.gathered.held_out)
     sizes = [factor.shape for block in twice.blocks for factor in block.pieces.values()]
-    assert twice.n_windows == 3 * clean.result.gathered.held_out.n_windows and max(rows for rows, _ in sizes) <= max(width for _, width in sizes)
+    assert twice.n_windows == 3 * clean.result.gathered.held_out.n_windows and max(rows for rows, _ in sizes) <= max(width for _,
+                                                                                                                     width in sizes)
 
 
 def test_one_motion_that_gets_worse_is_enough(clean):
     entry = clean.calibration.proof['gyroscope']
     worse = {'before': 1.0, 'after': 1.2, 'ci95': [1.1, 1.3], 'seconds': 10.0}
-    spoiled = replace(clean.calibration, proof=clean.calibration.proof | {'gyroscope': entry | {'regimes': entry['regimes'] | {'fast turns': worse}}})
+    spoiled = replace(clean.calibration,
+                      proof=clean.calibration.proof | {'gyroscope': entry | {'regimes': entry['regimes'] | {'fast turns': worse}}})
     assert 'fast turns' in trust.objections(spoiled)[0] and 'makes this motion worse' in trust.objections(spoiled)[0]
     unsure = entry | {'regimes': {'fast turns': worse | {'ci95': [0.9, 1.5]}}}
     assert not trust.objections(replace(clean.calibration, proof={'gyroscope': unsure}))
@@ -103,7 +105,7 @@ def test_a_piece_knows_its_mean_and_how_the_input_changed():
     time = np.arange(0.0, 5.0, 0.01)
     rate = np.stack([2.5 * np.sin(time), np.zeros_like(time), np.zeros_like(time)], axis=1)
     rows = np.concatenate([np.ones((len(time), 1)), rate], axis=1)
-    pieces = moving_pieces(rows, time, rate, rate)
+    pieces = moving_pieces(rows, time, rate, rate_s=rate)
     assert set(pieces) == {Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING}
     total = np.concatenate(list(pieces.values()))
     assert len(total) == 19 and np.all(total[:, 0] == 1.0)

@@ -30,7 +30,7 @@ def result():
     imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile('quick', 9, TABLE),
                               options=SimulationOptions(noise=GRADES['industrial'].noise), seed=9)
     block = SampleBlock(imu, joints)
-    return diagnose_recording(lambda: iter([block]), TABLE, CalibrationOptions(), {'bags': [{'name': 'session', 'sha256': '0'}]})
+    return diagnose_recording(lambda: iter([block]), TABLE, CalibrationOptions(), provenance={'bags': [{'name': 'session', 'sha256': '0'}]})
 
 
 def test_the_finding_is_told_drawn_and_measured(result):

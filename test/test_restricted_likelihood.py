@@ -40,7 +40,7 @@ def dense(times, variance, sessions, processes):
 def test_whitening_inverts_the_covariance(rows, processes):
     """Products of whitened rows are products weighted with the inverse covariance (to rounding)."""
     values, times, variance, sessions = rows
-    white = Whitening(variance, times, sessions, processes, STEP**2)(values)
+    white = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2)(values)
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         expected = values[:, axis].T @ np.linalg.solve(covariance, values[:, axis])
         np.testing.assert_allclose(white[:, axis].T @ white[:, axis], expected, rtol=1e-10)
@@ -49,7 +49,7 @@ def test_whitening_inverts_the_covariance(rows, processes):
 def test_a_row_is_whitened_with_earlier_rows_only(rows, processes):
     """What is locked away later in time cannot reach what was whitened before it."""
     values, times, variance, _ = rows
-    whitening, spoilt = Whitening(variance, times, [np.arange(20)], processes), values.copy()
+    whitening, spoilt = Whitening(variance, times, [np.arange(20)], processes=processes), values.copy()
     spoilt[12:] += 100.0
     np.testing.assert_array_equal(whitening(spoilt)[:12], whitening(values)[:12])
     assert np.all(np.abs(whitening(spoilt)[12:] - whitening(values)[12:]).max(axis=(1, 2)) > 1.0)
@@ -57,7 +57,7 @@ def test_a_row_is_whitened_with_earlier_rows_only(rows, processes):
 
 def test_weighing_is_the_inverse_covariance_itself(rows, processes):
     values, times, variance, sessions = rows
-    found = Whitening(variance, times, sessions, processes, STEP**2).weigh(values)
+    found = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2).weigh(values)
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         np.testing.assert_allclose(found[:, axis], np.linalg.solve(covariance, values[:, axis]), rtol=1e-9, atol=1e-11)
 
@@ -65,7 +65,8 @@ def test_weighing_is_the_inverse_covariance_itself(rows, processes):
 def test_one_process_in_two_halves_is_the_same_process(rows):
     values, times, variance, sessions = rows
     one, two = (BiasProcess(0.7, 60.0),), (BiasProcess(0.7 * 0.6, 60.0), BiasProcess(0.7 * 0.8, 60.0))
-    np.testing.assert_allclose(Whitening(variance, times, sessions, one)(values), Whitening(variance, times, sessions, two)(values), rtol=1e-9)
+    np.testing.assert_allclose(Whitening(variance, times, sessions, processes=one)(values),
+                               Whitening(variance, times, sessions, processes=two)(values), rtol=1e-9)
 
 
 def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
@@ -74,7 +75,8 @@ def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
     logs, normal = RestrictedLikelihood(values, times, sessions).whitened(variance, processes, STEP**2)
     matrices = dense(times, variance, sessions, processes)
     np.testing.assert_allclose(logs, sum(np.linalg.slogdet(matrix)[1] for matrix in matrices), rtol=1e-10)
-    np.testing.assert_allclose(normal, sum(values[:, a].T @ np.linalg.solve(matrix, values[:, a]) for a, matrix in enumerate(matrices)), rtol=1e-9)
+    np.testing.assert_allclose(normal, sum(values[:, a].T @ np.linalg.solve(matrix, values[:, a]) for a, matrix in enumerate(matrices)),
+                               rtol=1e-9)
 
 
 def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(rows, processes):
@@ -98,7 +100,7 @@ def test_offsets_of_sessions_are_conditional_means(rows, processes):
     values, times, variance, sessions = rows
     misfit = values[:, :, 0]
     noise = NoiseModel(np.ones(3), np.ones(3), bias_processes=processes, session_sd=STEP, session_variance=STEP**2)
-    found = predict_session_offsets(misfit, variance, times, sessions, noise)
+    found = predict_session_offsets(misfit, variance, times, sessions=sessions, noise=noise)
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         weighted = np.linalg.solve(covariance, misfit[:, axis])
         np.testing.assert_allclose(found[:, axis], [STEP**2 * weighted[index].sum() for index in sessions], rtol=1e-9)
@@ -107,7 +109,7 @@ def test_offsets_of_sessions_are_conditional_means(rows, processes):
 def test_fewer_parameters_are_fewer_columns_of_the_same_normal_matrix(rows):
     values, times, variance, sessions = rows
     shape = (0.3, 0.5, 60.0)
-    few, all_columns = (NoiseLikelihood(v, variance, times, sessions) for v in (values[:, :, [0, 2, 3]], values))
+    few, all_columns = (NoiseLikelihood(v, variance, times, sessions=sessions) for v in (values[:, :, [0, 2, 3]], values))
     np.testing.assert_allclose(all_columns.loss(shape, np.array([0, 2])), few.loss(shape), rtol=1e-9)
     assert all_columns.loss(shape) < all_columns.loss(shape, np.array([0, 2])) + 20
 

@@ -183,8 +183,8 @@ def looking_ahead(case):
     slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0)
     slope = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     transfer = Transfer.from_pose('imu_b', xyz, rpy)
-    central = compensate(calibration, imu.force_s, imu.rate_s, slope, transfer=transfer)
-    still = compensate(calibration, imu.force_s, imu.rate_s, np.zeros_like(slope), transfer=transfer)
+    central = compensate(calibration, imu.force_s, imu.rate_s, alpha_s=slope, transfer=transfer)
+    still = compensate(calibration, imu.force_s, imu.rate_s, alpha_s=np.zeros_like(slope), transfer=transfer)
     lags = range(-4, 5)
     columns = np.stack([np.cross(np.roll(still.rate, lag, axis=0), -transfer.arm_t) for lag in lags], axis=2)
     keep = case.usable & (np.arange(len(imu)) >= 4) & (np.arange(len(imu)) < len(imu) - 4)

@@ -42,7 +42,7 @@ class FormFit:
     fit: MomentFit
     """Coefficients."""
     cost: float
-    """Minus twice the log likelihood, and the price of the parameters."""
+    """Minus twice the log likelihood, and the penalty of the parameters."""
 
 
 @dataclass(frozen=True, eq=False)

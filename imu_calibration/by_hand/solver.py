@@ -63,7 +63,7 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     start = np.maximum(scatter.variance, 0.01 * fallback)
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
-    cov = covariance_with_held(factor, ~held, held, priors) + _of_gravity(state.values, gravity_sd / model.gravity)
+    cov = covariance_with_held(factor, ~held, held, prior_sd=priors) + _of_gravity(state.values, gravity_sd / model.gravity)
     return HandSolution(state, cov, held, scatter, factor, steps + more)
 
 
@@ -123,7 +123,7 @@ def _iterate(model, state, poses, turns, free, priors, variance, fallback, memor
         group = np.concatenate([system.component, np.full(free.sum(), -1)])
         before = scatter.variance
         if number > 2:  # the first steps leave errors of linearisation that are not scatter
-            scatter = estimate_group_variances(design, residual, noise, group, start=scatter.variance, fallback=fallback)
+            scatter = estimate_group_variances(design, residual, noise, group=group, start=scatter.variance, fallback=fallback)
         root = np.sqrt(scatter.total(noise, group))
         orthogonal, factor = np.linalg.qr(design / root[:, None])
         reduced = scipy.linalg.solve_triangular(factor, orthogonal.T @ (residual / root))

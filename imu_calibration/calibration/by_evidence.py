@@ -56,14 +56,16 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     windows = gathered.spread.windows
     if len(windows) < LEAST_WINDOWS:
         return EvidentResult(conclude(*first, table, options, provenance), None)
-    found = investigate(windows, table, baseline_model(options, table, solution.model), asking, bias_processes=options.bias_processes)
+    found = investigate(windows, table, baseline_model(options, table, solution.model), progress=asking,
+                        bias_processes=options.bias_processes)
     added = [question for question in found.named if (question.sensor, question.name) not in model.slices]
     if added:
         options = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
         solution, gathered, model = solve_recordings(sources, table, options, progress, mapper, names)
     solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
     if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
-        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, found.named, saturations=found.limits)
+        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named,
+                                     saturations=found.limits)
     clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
     changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
     return EvidentResult(conclude(solution, gathered, model, table, options, provenance, changes), found)
@@ -88,7 +90,8 @@ def baseline_model(options: CalibrationOptions, table: Table, solved: SensorMode
     """
     model = choose_model(baseline_options(options), table)
     names = {effect.name for effect in model.effects}
-    return replace(model, point={name: value for name, value in solved.point.items() if name in names}, temperature_ref_c=solved.temperature_ref_c)
+    return replace(model, point={name: value for name, value in solved.point.items() if name in names},
+                   temperature_ref_c=solved.temperature_ref_c)
 
 
 def _point(found):

@@ -30,10 +30,13 @@ MOVING_SAMPLES = 20_000
 class ReferenceErrors:
     """Standard deviations of what the reference is made of."""
 
-    levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated', (0.0, 0.1))
+    levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated',
+                               (0.0, 0.1))
     joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, drawn anew in every window', (0.0, 0.1))
     rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
-    gravity: float = setting(5e-4, 'm/s^2', 'local gravity, when the table description states no gravity_sd: 50 mGal, an anomaly of the normal field', (0.0, 1.0))
+    gravity: float = setting(5e-4, 'm/s^2',
+                             'local gravity, when the table description states no gravity_sd: 50 mGal, an anomaly of the normal field',
+                             (0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +158,7 @@ def parameter_shifts(result, changes):
 def _whitening(noise, pieces):
     """Return the `Whitening` of the means of the windows."""
     variance = noise.mean_variance([p.kind for p in pieces], np.array([p.count for p in pieces])) + noise.offset_sd**2
-    return Whitening(variance, np.array([p.time for p in pieces]), sessions_of(pieces), noise.bias_processes)
+    return Whitening(variance, np.array([p.time for p in pieces]), sessions_of(pieces), processes=noise.bias_processes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,13 +202,14 @@ def _piece(result, kind, time, session, count, stride, motion, temperature, chan
     model, values, table = result.solution.model, result.solution.values, result.table
     temperature = _known(model, motion, temperature)
     parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
-    references = References(model, table, motion, temperature)
+    references = References(model, table, motion, temperature_c=temperature)
     for sensor in SENSORS:
         ref = references.at(sensor)
-        design = columns(model, sensor, table, motion, temperature, references)
+        design = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references)
         slope = coefficient_jacobian(model, sensor, values)
-        output = sensor_output(model, sensor, values, ref)
-        moved = np.array([_output(model, sensor, values, *change(table, motion), temperature) - output for change in changes]).reshape(-1, len(motion), 3)
+        output = sensor_output(model, sensor, values, ref=ref)
+        moved = np.array([_output(model, sensor, values, *change(table, motion),
+                                  temperature) - output for change in changes]).reshape(-1, len(motion), 3)
         mean = design.mean(axis=0)
         parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
         parts['change'][sensor] = moved.mean(axis=1)
@@ -224,4 +228,4 @@ def _known(model, motion, temperature):
 
 
 def _output(model, sensor, values, table, motion, temperature):
-    return sensor_output(model, sensor, values, warped_reference(model, sensor, table, motion, temperature))
+    return sensor_output(model, sensor, values, ref=warped_reference(model, sensor, table, motion=motion, temperature_c=temperature))

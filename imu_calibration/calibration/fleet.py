@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.calibration.status import HELD
@@ -32,7 +32,7 @@ class UnitResult:
 
     name: str
     """Name of the unit."""
-    calibration: object = None
+    calibration: Calibration | None = None
     """The Calibration, or None when the unit was refused."""
     verdict: str = 'refused'
     """'good', 'weak', 'bad' or 'refused'."""

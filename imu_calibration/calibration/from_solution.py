@@ -18,7 +18,8 @@ from imu_calibration.segmentation.window_cutter import dropped
 
 def motions_needed(solution, tolerances, table):
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
-    return observability.needed_motions(solution, tolerances, table.gravity_value, make_prior(solution.model).sd, _only_axis(table))
+    return observability.needed_motions(solution, tolerances, table.gravity_value, prior_sd=make_prior(solution.model).sd,
+                                        only_axis=_only_axis(table))
 
 
 def _only_axis(table):
@@ -68,7 +69,8 @@ def statistics(solution, gathered):
         noise = solution.noise[sensor]
         result[sensor] = {
             'noise_sd': noise.white_sd, 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd,
-            'wander_sd': float(np.sqrt(noise.bias_variance)), 'wander_time_s': noise.bias_time, 'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
+            'wander_sd': float(np.sqrt(noise.bias_variance)), 'wander_time_s': noise.bias_time,
+            'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
         if sensor in solution.session_biases:
             result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}

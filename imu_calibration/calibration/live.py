@@ -41,7 +41,8 @@ class LiveSettings:
                                       'too small: the diagnosis takes a core from other programs', live=True)
     diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each',
                                      (1000, 100_000_000),
-                                     'too small: effects that need the whole session are not found', fixed='windows that were not kept are gone')
+                                     'too small: effects that need the whole session are not found',
+                                     fixed='windows that were not kept are gone')
 
 
 class LiveCalibration:

@@ -14,7 +14,7 @@ def columns_at(window, model, table, told):
     motion, temperature = joined_motion([window])
     if window.kind != 'static':
         motion, temperature = motion.select(told), None if temperature is None else temperature[told]
-    return {sensor: columns(model, sensor, table, motion, temperature) for sensor in SENSORS}
+    return {sensor: columns(model, sensor, table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
 
 
 class LiveCollector(Collector):

@@ -58,7 +58,7 @@ def choose_model(options, table):
     """
     names = table.joint_names
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, options.catalogue) for sensor, text in asked.items()}
+    chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, catalogue=options.catalogue) for sensor, text in asked.items()}
     model = SensorModel(**chosen, reference=parse_reference(options.reference_model, table), joint_names=names, catalogue=options.catalogue)
     model = with_common_arm(model) if table.mount_xyz is None else model
     for sensor, name in options.added:

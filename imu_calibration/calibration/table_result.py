@@ -76,7 +76,7 @@ class TableResult(CalibrationResult):
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return measured minus what the motion of the table predicts."""
-        predicted = predict(self.solution.model, self.solution.values, self.table, window.motion, window.temperature_c)
+        predicted = predict(self.solution.model, self.solution.values, self.table, motion=window.motion, temperature_c=window.temperature_c)
         return {sensor: measured - model for sensor, measured,
                 model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
 

@@ -1,6 +1,9 @@
 """``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
 
+from argparse import Namespace
+
 from imu_calibration.by_hand.workflow import read_imu
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import console, warn
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight, warnings
@@ -11,13 +14,13 @@ NAME = 'arm'
 HELP = 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
     parser.add_argument('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Estimate and print."""
     from imu_calibration.by_hand.relative_arm import estimate_arm
     if len(options.imu_topic) != 2:

@@ -1,8 +1,11 @@
 """``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
 
+from argparse import Namespace
+
 from imu_calibration import files
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import show_calibration, warn
 from imu_calibration.use_cases.calibrate import calibrate
 
@@ -10,7 +13,7 @@ NAME = 'calibrate'
 HELP = 'Write calibration.yaml and report.html from one or several recordings of the same IMU.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bags', nargs='+', metavar='BAG', help='rosbag2 folder, .db3, .mcap or ROS 1 .bag')
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
@@ -24,7 +27,7 @@ def add_arguments(parser):
                                              help='add nothing to the model, whatever the recording demands')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
     with files.output_folder(options.output) as folder:
         found = calibrate(options.bags, stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices_of(options))

@@ -1,5 +1,7 @@
 """``imu_calibration check``: is a calibration still good on this recording?"""
 
+from argparse import ArgumentParser, Namespace
+
 from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.show import console, warn
 from imu_calibration.preflight.checks import warnings
@@ -10,7 +12,7 @@ NAME = 'check'
 HELP = 'Say whether a calibration helps on a recording: errors before and after, by sensor and by what the IMU does.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help='a recording of the IMU that was calibrated')
     parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
@@ -18,7 +20,7 @@ def add_arguments(parser):
     add_topic_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Print errors before and after with their interval and the answer; return 0 when it helps, 3 when it does not or cannot be told."""
     from rich.table import Table
     chosen = {name: value for name, value in vars(options).items() if name in Choices.__annotations__}

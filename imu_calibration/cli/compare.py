@@ -1,7 +1,10 @@
 """``imu_calibration compare``: whether two calibrations agree."""
 
+from argparse import Namespace
+
 from imu_calibration import files
 from imu_calibration.calibration import comparison
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import console
 from imu_calibration.units import for_people, with_sd
 
@@ -9,13 +12,13 @@ NAME = 'compare'
 HELP = 'Say whether two calibrations agree, in units of their combined standard deviation.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('first', metavar='A.yaml')
     parser.add_argument('second', metavar='B.yaml')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Compare and print."""
     from rich.table import Table
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))

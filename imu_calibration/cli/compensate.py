@@ -1,5 +1,7 @@
 """``imu_calibration compensate``: a bag with the corrected topic beside the others."""
 
+from argparse import ArgumentParser, Namespace
+
 from imu_calibration.cli.arguments import add_topic_arguments
 from imu_calibration.use_cases.compensate import CORRECTED_TOPIC, compensate
 
@@ -7,7 +9,7 @@ NAME = 'compensate'
 HELP = 'Write a bag with the corrected Imu topic beside all other topics.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
     parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
@@ -25,7 +27,7 @@ def add_arguments(parser):
     add_topic_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Compensate into a new bag, print what was noticed, return the exit code."""
     names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'noise', 'correct_stamps', 'imu_topic',
              'temperature_topic')

@@ -1,7 +1,10 @@
 """``imu_calibration diagnose``: what the model gets wrong, why, the extended model, and the measured gain."""
 
+from argparse import Namespace
+
 from imu_calibration import files
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import console, warn
 from imu_calibration.use_cases.diagnose import diagnose
 
@@ -9,7 +12,7 @@ NAME = 'diagnose'
 HELP = 'Show what the model gets wrong, name the cause, extend the model, and measure the gain on data that were not fitted.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
@@ -19,7 +22,7 @@ def add_arguments(parser):
     add_model_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, stand_of(options), **choices_of(options))

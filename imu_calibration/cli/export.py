@@ -1,5 +1,7 @@
 """``imu_calibration export``: a calibration as estimators and autopilots want it."""
 
+from argparse import ArgumentParser, Namespace
+
 from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.show import console
 from imu_calibration.errors import InputError
@@ -12,7 +14,7 @@ NAME = 'export'
 HELP = 'Write a calibration and its noise as another program wants them, and say what that loses.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('document', metavar='CALIBRATION', nargs='?', help='calibration.yaml')
     parser.add_argument('--to', metavar='NAME', help='the program: one of those that --list shows')
@@ -25,7 +27,7 @@ def add_arguments(parser):
     add_topic_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Show the list, or write the file and print what is lost."""
     if options.list:
         _show_targets()

@@ -1,13 +1,16 @@
 """``imu_calibration fleet``: many units, one result each, a summary table."""
 
+from argparse import Namespace
+
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.use_cases.choices import calibration_options
 
 NAME = 'fleet'
 HELP = 'Calibrate a folder of many units: one result each, and a summary table with the spread of each parameter.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('folder', metavar='FOLDER', help='folder that holds one bag, or one sub-folder with bags, per unit')
     parser.add_argument('--output', metavar='DIR', required=True,
@@ -20,7 +23,7 @@ def add_arguments(parser):
     add_model_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Calibrate all units, continuing past a bad bag."""
     from imu_calibration.cli.fleet_run import run_fleet
     return run_fleet(options, calibration_options(choices_of(options)))

@@ -3,9 +3,13 @@
 import csv
 import io
 import math
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
 
 from imu_calibration import files
-from imu_calibration.calibration.fleet import FleetStep, fleet_exit_code, summarise
+from imu_calibration.calibration.fleet import FleetStep, Spread, UnitResult, fleet_exit_code, summarise
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
@@ -23,11 +27,11 @@ HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical
             'highest_unit')
 
 
-def run_fleet(options, settings):
+def run_fleet(options: Namespace, settings: CalibrationOptions) -> int:
     """Calibrate every unit of a folder; return the exit code."""
     found = find_units(options.folder, options.output)
     table = _table(options, [path for _, paths in found for path in paths])
-    units = [unit_of(name, paths, choices_of(options), table.joint_names) for name, paths in found]
+    units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names) for name, paths in found]
     folder = files.make_folder(options.output)
     with progress_bar('units', len(units), 'units') as advance:
         mapper = _mapper(options, len(units), lambda result: advance(1))
@@ -39,7 +43,7 @@ def run_fleet(options, settings):
     files.write_text(folder / 'summary.csv', parameters_csv(spreads))
     files.write_text(folder / 'units.csv', units_csv(results))
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
-    show_fleet(results, spreads, folder, hints_of(options))
+    show_fleet(results, spreads, folder, hints=hints_of(options))
     return fleet_exit_code(results)
 
 
@@ -62,13 +66,13 @@ def _mapper(options, n_units, done):
     return process_mapper(jobs_for(options.jobs, n_units), done)
 
 
-def parameters_csv(spreads):
+def parameters_csv(spreads: Sequence[Spread]) -> str:
     """Return the summary: one row per parameter, SI."""
     rows = [(s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest) for s in spreads]
     return _csv([HEADINGS, *rows])
 
 
-def units_csv(results):
+def units_csv(results: Sequence[UnitResult]) -> str:
     """Return one row per unit: verdict, exit code, why it was refused, samples lost, and each parameter with its sd, SI."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
     rows = [['name', 'verdict', 'exit_code', 'error', 'dropped'] + [heading for name in names for heading in (name, f'{name}.sd')]]
@@ -88,7 +92,7 @@ def _csv(rows):
     return text.getvalue()
 
 
-def shown(spread):
+def shown(spread: Spread) -> tuple[str, ...]:
     """Return the cells of a parameter for people: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
     factor, unit = for_people(spread.unit)
     if not spread.count:
@@ -103,7 +107,7 @@ def shown(spread):
 COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
 
 
-def show_fleet(results, spreads, folder, hints):
+def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
     from rich.table import Table
     out, table = console(), Table(box=None, pad_edge=False)
@@ -120,6 +124,6 @@ def show_fleet(results, spreads, folder, hints):
     out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}', soft_wrap=True)
 
 
-def summary_html(results, spreads):
+def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:
     """Return the summary as one page."""
     return render('fleet.html', results=results, columns=COLUMNS, rows=[shown(spread) for spread in spreads])

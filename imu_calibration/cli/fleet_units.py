@@ -1,16 +1,18 @@
 """Which recordings in a folder belong to which unit."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from imu_calibration.calibration.fleet import Unit
 from imu_calibration.errors import InputError
-from imu_calibration.use_cases.choices import kept, topics_of
+from imu_calibration.reference.joint import JointNames
+from imu_calibration.use_cases.choices import Choices, kept, topics_of
 from imu_calibration.use_cases.recordings import provenance_of, source_of
 from msg_adapters.storages import suffixes
 
 
-def find_units(folder, output):
+def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     """
     Return (name, paths of recordings) for each unit: a bag, or a sub-folder that holds bags, which are joined.
 
@@ -40,19 +42,19 @@ def find_units(folder, output):
     return units
 
 
-def bags_of(path):
+def bags_of(path: Path) -> list[Path]:
     """Return the recordings of a unit in order of name."""
     return [path] if is_bag(path) else [inner for inner in sorted(path.iterdir()) if is_bag(inner)]
 
 
-def is_bag(path):
+def is_bag(path: Path) -> bool:
     """Tell whether a path looks like a recording."""
     if not path.is_dir():
         return path.suffix in (*suffixes(), '.bag')
     return (path / 'metadata.yaml').exists() or any(inner.suffix in suffixes() for inner in path.iterdir())
 
 
-def unit_of(name, paths, choices, joint_names):
+def unit_of(name: str, paths: Sequence[Path], choices: Choices, *, joint_names: JointNames) -> Unit:
     """Return the Unit whose sources read the bags, without progress bars of their own."""
     paths = [path.resolve() for path in paths]
     sources = tuple(source_of(path, topics_of(choices), joint_names, quiet=True) for path in paths)

@@ -1,5 +1,7 @@
 """``imu_calibration import``: a calibration that another program made."""
 
+from argparse import ArgumentParser, Namespace
+
 from imu_calibration.calibration.status import HELD
 from imu_calibration.use_cases.exporting import import_calibration
 
@@ -7,7 +9,7 @@ NAME = 'import'
 HELP = 'Read the calibration that another program made, so that it can be compared and used.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('file', metavar='FILE', help='what the other program wrote')
     parser.add_argument('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
@@ -15,7 +17,7 @@ def add_arguments(parser):
     parser.add_argument('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Read, write, and say what is not known."""
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
     held = [name for name, status in found.requested.items() if status == HELD]

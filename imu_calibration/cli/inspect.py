@@ -1,8 +1,11 @@
 """``imu_calibration inspect``: what a recording holds, what looks wrong with it, and what it can determine."""
 
+from argparse import Namespace
+
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError, with_hint
 from imu_calibration.use_cases.choices import calibration_options, topics_of
@@ -16,7 +19,7 @@ HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions fou
 TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic', 'temperature'))
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG')
     add_stand_arguments(parser, 'with it axes and units are compared with the joints, and the motions are found and judged')
@@ -24,12 +27,12 @@ def add_arguments(parser):
     add_model_arguments(parser)
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Read each Imu topic through and print what it is like; with the table also the motions and what they determine."""
     bag, choices, stand = existing(options.bag), choices_of(options), stand_of(options)
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu))
-    looks = inspect(bag, topics, table, calibration_options(choices))
+    looks = inspect(bag, topics, table, options=calibration_options(choices))
     out = console()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints_of(options))

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.errors import ImuCalibrationError
@@ -10,7 +11,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 """The matrices are narrow: threads of BLAS cost more than they give, above all where other programs run."""
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code (0 done, 1 refused, 3 written but not everything was determined or usable)."""
     from imu_calibration.cli.parser import make_parser  # numpy counts its threads when it is imported
     arguments = sys.argv[1:] if arguments is None else list(arguments)

@@ -1,6 +1,7 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
 import sys
+from argparse import ArgumentParser, Namespace
 from itertools import groupby
 from textwrap import fill
 
@@ -13,7 +14,7 @@ NAME = 'noise'
 HELP = 'Identify white noise, bias instability and random walk from a recording at rest, with intervals: noise.yaml and report.html.'
 
 
-def add_arguments(parser):
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help='a recording that holds rest, an hour if possible; motion is found and left out')
     parser.add_argument('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
@@ -28,7 +29,7 @@ def add_arguments(parser):
     group.add_argument('--temperature-topic', metavar='TOPIC', help='sensor_msgs/Temperature, default /imu/temperature')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Identify into a folder that can be written, print the figures, return the exit code."""
     with files.output_folder(options.output) as folder:
         found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, nominal=options.nominal,

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from importlib import import_module
+from typing import NoReturn
 
 import imu_calibration
 
@@ -13,13 +14,13 @@ VERBS = ('inspect', 'calibrate', 'compensate', 'check', 'diagnose', 'simulate', 
 class OneLineParser(argparse.ArgumentParser):
     """Refuses with one line and exit code 1."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         """Print what is wrong and stop."""
         print(f"{self.prog}: {message}; see '{self.prog} --help'", file=sys.stderr)
         raise SystemExit(1)
 
 
-def make_parser(verb=None):
+def make_parser(verb: str | None = None) -> OneLineParser:
     """Return the parser; each verb brings its own arguments. When `verb` is one, only its module is imported, which is faster."""
     parser = OneLineParser(prog='imu_calibration',
                            description='Calibrate, compensate and diagnose inertial measurement units from recordings.',

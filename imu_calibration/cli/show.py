@@ -1,11 +1,16 @@
 """What the verbs print: short tables on standard output."""
 
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
 from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.errors import with_hint
-from imu_calibration.preflight.finding import Severity
+from imu_calibration.preflight.finding import CheckFinding, Severity
+from imu_calibration.use_cases.calibrate import Calibrated
 
 
-def console():
+def console() -> Any:
     """Return a console on standard output that keeps lines whole when it is not a terminal."""
     import sys
 
@@ -13,7 +18,7 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
 
 
-def warn(found):
+def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
     """Print what looks wrong with a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
     import sys
     for item in found:
@@ -23,7 +28,7 @@ def warn(found):
 STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}
 
 
-def show_findings(out, findings, hints):
+def show_findings(out: Any, findings: tuple[CheckFinding, ...], hints: dict[str, str]) -> None:
     """Print findings on a console, the worst first; `hints` as for `errors.with_hint`."""
     from rich.table import Table
     from rich.text import Text
@@ -37,7 +42,7 @@ def show_findings(out, findings, hints):
     out.print(table)
 
 
-def show_calibration(found, folder, hints, report=True):
+def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
     """Print the parameters of a `Calibrated`, the verdict and where the files are."""
     from rich.table import Table
     out, table = console(), Table(title=None, box=None, pad_edge=False)

@@ -1,6 +1,9 @@
 """``imu_calibration simulate``: a bag from a simulated session, and the truth beside it."""
 
+from argparse import Namespace
+
 from imu_calibration.cli.arguments import add_stand_arguments, stand_of
+from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.simulation.profiles import profile_names
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.simulate import simulate
@@ -13,7 +16,7 @@ NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_ra
 """Options that are arguments of `simulate` by the same name."""
 
 
-def add_arguments(parser):
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
     parser.add_argument('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
@@ -36,11 +39,11 @@ def add_arguments(parser):
     parser.add_argument('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
-def run(options):
+def run(options: Namespace) -> int:
     """Simulate and write."""
     made = simulate(options.profile, effects=options.effect, table=stand_of(options), **{name: getattr(options, name) for name in NAMES})
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
-    print(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu)} Imu, {len(samples.joints)} JointState), '
+    print(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, {len(samples.joints or ())} JointState), '
           'with truth.yaml and table.yaml')
     return 0

@@ -1,6 +1,7 @@
 """Angular acceleration from the measured rate: a causal filter whose delay and noise are known."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,22 +22,22 @@ class CausalDerivative:
     """Sampling period, s."""
 
     @property
-    def delay(self):
+    def delay(self) -> float:
         """Delay of the angular acceleration, s."""
         return (self.taps - 1) / 2 * self.period
 
     @property
-    def weights(self):
+    def weights(self) -> np.ndarray:
         """Weights of the newest to the oldest sample, 1/s, shape (taps,)."""
         index = (self.taps - 1) / 2 - np.arange(self.taps)
         return index / (index @ index) / self.period
 
-    def noise_sd(self, rate_sd):
+    def noise_sd(self, rate_sd: float) -> float:
         """Return the standard deviation of the angular acceleration for white rate noise, rad/s^2."""
         return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
 
 
-def choose_derivative(period, rate_sd, arm, force_sd, largest_delay=0.02):
+def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: float, largest_delay: float = 0.02) -> CausalDerivative:
     """
     Return the shortest window whose noise, through the arm, stays below a third of the accelerometer's own noise.
 
@@ -98,7 +99,7 @@ class StampedDerivative:
 
     """
 
-    def __init__(self, derivative):
+    def __init__(self, derivative: CausalDerivative):
         self.taps, self.period = derivative.taps, derivative.period
         self._period_ns = derivative.period * 1e9
         self._least = max(2, (self.taps + 1) // 2)
@@ -114,7 +115,7 @@ class StampedDerivative:
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._age = 0
 
-    def push(self, stamp_ns, x, y, z):
+    def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the derivative (x, y, z) after one more sample, per second."""
         if self._newest is not None:
             step = (stamp_ns - self._newest) / self._period_ns
@@ -164,17 +165,17 @@ class StampedDerivative:
             part = k / (missing + 1)
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
 
-    def rebase(self, stamp_ns):
+    def rebase(self, stamp_ns: np.ndarray) -> None:
         """Count the newest sample as taken at another time."""
         self._newest = stamp_ns
 
-    def seed(self, other):
+    def seed(self, other: 'StampedDerivative') -> None:
         """Take over the past of another derivative of the same stream, as far as this window reaches."""
         self._newest = other._newest
         for x, y, z in list(other._window)[-self.taps:]:
             self._add(x, y, z)
 
-    def push_block(self, stamp_ns, values):
+    def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
@@ -202,7 +203,7 @@ class StampedDerivative:
         self._refresh()
 
 
-def typical_period(stamp_ns):
+def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float:
     """Return the median of the steps ahead between stamps, s; None without one."""
     steps = np.diff(np.asarray(stamp_ns, np.int64))
     steps = steps[steps > 0]

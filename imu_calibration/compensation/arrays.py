@@ -1,14 +1,19 @@
 """Compensation of whole arrays at once: for notebooks and other programs."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imu_calibration.compensation.compensate import arms_of
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 
 
-def compensate_readings(calibration, samples, rate_s=None, *, time=None, temperature_c=None):
+def compensate_readings(calibration: FittedErrors, samples: Sequence[Sequence[float]] | np.ndarray | ImuSamples,
+                        rate_s: Sequence[Sequence[float]] | np.ndarray | None = None, *, time: Sequence[float] | np.ndarray | None = None,
+                        temperature_c: np.ndarray | TemperatureSamples | float | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
     """
     Return readings with the calibrated errors taken out.
 

@@ -1,13 +1,16 @@
 """Compensation: the calibration inverted, with the lever-arm correction from the measured rate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
 
@@ -47,7 +50,7 @@ class Transfer:
     """From the target's origin to the sensor, in the target frame, m, shape (3,)."""
 
     @classmethod
-    def from_pose(cls, frame_id, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0)):
+    def from_pose(cls, frame_id: str, xyz: Sequence[float] = (0.0, 0.0, 0.0), rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> 'Transfer':
         """
         Return the transfer to a frame in which the sensor sits at `xyz` (m), turned by `rpy`.
 
@@ -67,32 +70,33 @@ class Transfer:
     def _quaternion_st(self):
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
 
-    def turned_quaternion(self, quaternion):
+    def turned_quaternion(self, quaternion: Sequence[float]) -> tuple[float, ...]:
         """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros stay zeros."""
         px, py, pz, pw = quaternion
         qx, qy, qz, qw = self._quaternion_st
         return (pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
                 pw * qz + px * qy - py * qx + pz * qw, pw * qw - px * qx - py * qy - pz * qz)
 
-    def turned_covariance(self, covariance):
+    def turned_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Return a covariance in the target frame, shape (3, 3)."""
         return self.mat_ts @ covariance @ self.mat_ts.T
 
 
-def invertible(model):
+def invertible(model: SensorModel) -> SensorModel:
     """Return the model with only those effects that compensation inverts."""
     keep = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact') for sensor in SENSORS}
     return replace(model, reference=(), **keep)
 
 
-def invertible_values(calibration):
+def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarray]:
     """Return (model, values) of the part of a calibration that compensation inverts."""
     model = invertible(calibration.model)
     values = np.concatenate([calibration.values[calibration.model.slices[e.key]] for e in model.effects])
     return model, values
 
 
-def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transfer=None):
+def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray,
+               temperature_c: np.ndarray | None = None, transfer: Transfer | None = None) -> Corrected:
     """
     Return corrected samples.
 
@@ -125,7 +129,7 @@ def compensate(calibration, force_s, rate_s, alpha_s, temperature_c=None, transf
     flagged = marks.any(axis=1) | beyond
     if transfer is None:
         return Corrected(true_force, true_rate, flagged, marks)
-    return Corrected(*moved(transfer, true_force, true_rate, alpha_s), flagged, marks)
+    return Corrected(*moved(transfer, true_force, true_rate, alpha_s=alpha_s), flagged, marks)
 
 
 def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
@@ -138,7 +142,7 @@ def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
         change = np.zeros(len(force_s))
         for sensor in ('gyroscope', 'accelerometer'):
             ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, temperature_c)
-            step = (measured[sensor] - sensor_output(model, sensor, values, ref)) @ inverse[sensor].T
+            step = (measured[sensor] - sensor_output(model, sensor, values, ref=ref)) @ inverse[sensor].T
             true[sensor] = true[sensor] + step
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
         if np.max(change, initial=0.0) < 1e-14:
@@ -147,19 +151,19 @@ def _invert(model, values, force_s, rate_s, alpha_s, temperature_c):
     return true['accelerometer'], true['gyroscope'], np.where(np.isnan(change) & given, np.inf, change)
 
 
-def moved(transfer, force_s, rate_s, alpha_s):
+def moved(transfer: Transfer, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (force, rate) at the target point in the target frame."""
     force, rate, alpha = (vector @ transfer.mat_ts.T for vector in (force_s, rate_s, alpha_s))
     return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
 
 
-def saturation_level(calibration, sensor):
+def saturation_level(calibration: FittedErrors, sensor: str) -> float:
     """Return the reading from which a sensor counts as saturated, infinite without a saturation in the calibration."""
     level = calibration.of(sensor, Role.LIMIT)
     return np.inf if level is None else float(level) * (1 - 1e-6)
 
 
-def saturation_marks(calibration, force_s, rate_s):
+def saturation_marks(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray) -> np.ndarray:
     """Return the square of the saturation level where a component of (force, rate) reaches it, else 0; shape (n, 2)."""
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
@@ -169,13 +173,14 @@ def saturation_marks(calibration, force_s, rate_s):
     return marks
 
 
-def arms_of(calibration):
+def arms_of(calibration: FittedErrors) -> np.ndarray:
     """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
     arms = calibration.of('accelerometer', Role.ARMS)
     return np.zeros((3, 3)) if arms is None else arms
 
 
-def outside_conditions(calibration, rate_s, temperature_c=None):
+def outside_conditions(calibration: FittedErrors, rate_s: np.ndarray,
+                       temperature_c: Sequence[float] | np.ndarray | None = None) -> list[str]:
     """Return lines that say where samples leave the range of the calibration (rate, temperature)."""
     lines = []
     largest = calibration.conditions.get('largest_rate')

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import invertible_values
+from imu_calibration.compensation.angular_acceleration import CausalDerivative
+from imu_calibration.compensation.compensate import Transfer, invertible_values
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import SlopeError
 from imu_calibration.effects.base import SENSORS, Role
@@ -20,7 +22,7 @@ LARGEST = 1e30
 """Covariances from here on say nothing; below it no arithmetic overflows."""
 
 
-def is_known(covariance):
+def is_known(covariance: np.ndarray) -> bool:
     """Return whether a covariance from a message says something: neither NaN nor huge, variances not negative, not all zero."""
     return bool(np.all(np.abs(covariance) < LARGEST) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
 
@@ -45,7 +47,7 @@ class Sensitivity:
     slope_error: SlopeError
     """How far the derivative is off at the present motion."""
 
-    def covariances(self, force_cov, rate_cov, with_parameters=True):
+    def covariances(self, force_cov: np.ndarray, rate_cov: np.ndarray, with_parameters: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each shape (3, 3).
 
@@ -77,7 +79,8 @@ class Uncertainty:
 
     """
 
-    def __init__(self, calibration, transfer=None, derivative=None, period=None):
+    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, derivative: CausalDerivative | None = None, *,
+                 period: float | None = None):
         self._model, self._values = invertible_values(calibration)
         self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
@@ -88,7 +91,7 @@ class Uncertainty:
         self._calibration = calibration
         self.use(derivative, period)
 
-    def use(self, derivative, period=None):
+    def use(self, derivative: CausalDerivative, period: float | None = None) -> None:
         """Take the angular acceleration from another CausalDerivative, or from none, and the noise of samples `period` s apart."""
         self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
         weights = np.zeros(1) if derivative is None else derivative.weights
@@ -99,7 +102,10 @@ class Uncertainty:
         steps = 1e-30j * np.eye(len(self._values))
         return np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
 
-    def at(self, force=(0.0, 0.0, 9.8), rate=(0.0, 0.0, 0.0), derivative=(0.0, 0.0, 0.0), dt=0.0, slope_error=None):
+    def at(self, force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
+           rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
+           derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0), *, dt: float = 0.0,
+           slope_error: SlopeError | None = None) -> Sensitivity:
         """
         Return the Sensitivity at a measured sample.
 
@@ -128,5 +134,5 @@ class Uncertainty:
         """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
         temperature = np.full(1, self._model.temperature_ref_c + dt)
         ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature)
-        rows = [columns_at_point(self._model, sensor, None, None, ref=ref)[0] for sensor in SENSORS]
+        rows = [columns_at_point(self._model, sensor, None, motion=None, ref=ref)[0] for sensor in SENSORS]
         return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])

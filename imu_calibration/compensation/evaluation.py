@@ -1,15 +1,18 @@
 """How good a calibration is on another session of the same IMU: errors against the table before and after compensation."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.samples import ImuSamples
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -38,7 +41,7 @@ class ErrorFigures:
     """Median position error after dead reckoning, m."""
 
 
-def session_truth(blocks, table, settings=WindowSettings()):
+def session_truth(blocks: Iterable[SampleBlock], table: Table, settings: WindowSettings = WindowSettings()) -> SessionTruth:
     """Return the samples of a session with their reference, as far as joints and IMU are both there."""
     windows = MotionGatherer(table, settings, keep_unused=True).all_of(blocks)
     references = [_reference(window, table) for window in windows]
@@ -57,7 +60,7 @@ def _reference(window, table):
     return Reference(window.time, reference.mat_sn, reference.force_s, reference.rate_s, reference.alpha_s, reference.gravity)
 
 
-def error_figures(truth, force_s, rate_s, seconds=50.0):
+def error_figures(truth: SessionTruth, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0) -> ErrorFigures:
     """
     Return the ErrorFigures of a version of the samples.
 
@@ -66,8 +69,9 @@ def error_figures(truth, force_s, rate_s, seconds=50.0):
     reference = truth.reference
     period = float(np.median(np.diff(reference.time)))
     length = max(int(round(1.0 / period)), 1)
-    drift = drift_over(reference, force_s, rate_s, seconds)
-    return ErrorFigures(_rms_of_means(force_s - reference.force_s, length) / STANDARD_GRAVITY * 1e3, _rms_of_means(rate_s - reference.rate_s, length) / DEG,
+    drift = drift_over(reference, force_s, rate_s, seconds=seconds)
+    return ErrorFigures(_rms_of_means(force_s - reference.force_s, length) / STANDARD_GRAVITY * 1e3,
+                        _rms_of_means(rate_s - reference.rate_s, length) / DEG,
                         float(np.median(drift.velocity)), float(np.median(drift.position)))
 
 
@@ -77,7 +81,8 @@ def _rms_of_means(error, length):
     return float(np.sqrt((means**2).mean()))
 
 
-def before_and_after(truth, calibration, seconds=50.0):
+def before_and_after(truth: SessionTruth, calibration: FittedErrors, seconds: float = 50.0) -> tuple[ErrorFigures, ErrorFigures]:
     """Return ErrorFigures of the raw and of the compensated samples."""
     corrected = CompensationStream(calibration).correct(truth.imu)
-    return (error_figures(truth, truth.imu.force_s, truth.imu.rate_s, seconds), error_figures(truth, corrected.force, corrected.rate, seconds))
+    return (error_figures(truth, truth.imu.force_s, truth.imu.rate_s, seconds=seconds),
+            error_figures(truth, corrected.force, corrected.rate, seconds=seconds))

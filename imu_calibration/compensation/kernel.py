@@ -7,10 +7,12 @@ further effect adds fixed-point steps.
 """
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, invertible_values
+from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, Transfer, invertible_values
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
@@ -22,7 +24,7 @@ BEFOREHAND = {'temperature', 'reference temperature'}
 """What is known of a sample before either sensor is corrected."""
 
 
-def make_kernel(calibration, transfer=None):
+def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> Callable:
     """
     Return the function that compensates one sample.
 
@@ -47,7 +49,7 @@ def make_kernel(calibration, transfer=None):
     return namespace['kernel']
 
 
-def kernel_text(calibration, transfer=None):
+def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> str:
     """Return the Python text of the function that `make_kernel` compiles: measured f, w, a to true force u, rate v and slope g."""
     model, values = invertible_values(calibration)
     known = _known(model.temperature_ref_c)
@@ -88,7 +90,8 @@ class _Part:
 
     def bends_with(self, letter):
         """Return whether a variable enters the rest in a product or a function."""
-        return any(re.search(rf'\b{letter}[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
+        return any(re.search(rf'\b{letter}[xyz]\b',
+                             ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
 
 
 def _known(temperature_ref_c):
@@ -101,7 +104,8 @@ def _iteration(accel, gyro):
     """Return the lines that leave the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
     # ax, ay, az have gone into gx, gy, gz by now: a is the force, b the rate, that matrix and bias alone would give.
     lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
-    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({ITERATIONS}):', '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
+    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({ITERATIONS}):',
+              '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
     for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
         if any(part.rest):
             lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
@@ -151,5 +155,6 @@ def _worked_out(rows, indent):
 
     for row in rows:
         factors = {key: [f if f.isidentifier() else name_of(f) for f in key] for key in row}
-        sums.append({(name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[key] for key, found in factors.items()})
+        sums.append({(name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[key] for key,
+                     found in factors.items()})
     return lines, [as_text(terms) for terms in sums]

@@ -5,8 +5,9 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import invertible, saturation_level
+from imu_calibration.compensation.compensate import Transfer, invertible, saturation_level
 from imu_calibration.compensation.covariance import Uncertainty, is_known
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
@@ -27,7 +28,7 @@ class SampleCompensation:
 
     """
 
-    def __init__(self, calibration, transfer=None, with_parameters=True):
+    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, with_parameters: bool = True):
         self.calibration, self.transfer, self.with_parameters = calibration, transfer, with_parameters
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
         self.needs_temperature = invertible(calibration.model).needs_temperature
@@ -44,12 +45,12 @@ class SampleCompensation:
         self._uncertainty = Uncertainty(calibration, transfer)
         self.refresh()
 
-    def set_temperature(self, temperature_c):
+    def set_temperature(self, temperature_c: float) -> None:
         """Tell the temperature near the sensor, degrees Celsius."""
         if self.needs_temperature and temperature_c - temperature_c == 0.0:
             self.dt = temperature_c - self.calibration.model.temperature_ref_c
 
-    def correct(self, stamp_ns, wx, wy, wz, fx, fy, fz):
+    def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...]:
         """Return corrected rate and specific force, six floats, or None when there is nothing to publish; `counts` says why."""
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
@@ -65,31 +66,33 @@ class SampleCompensation:
         self.corrected += 1
         return vx, vy, vz, ux, uy, uz
 
-    def refuse(self, reason):
+    def refuse(self, reason: str) -> None:
         """Count a sample that cannot be corrected; return None."""
         self.counts[reason] += 1
 
-    def covariances(self, force_cov, rate_cov):
+    def covariances(self, force_cov: np.ndarray, rate_cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at the sample at which they were taken last.
 
         Those of the measured ones, (3, 3), may be zero or no covariances at all: the calibration's noise is taken; or None: not measured.
         """
-        known = [np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
+        known = [np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise for cov,
+                 noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
         return self._sensitivity.covariances(*known, self.with_parameters)
 
-    def refresh(self):
+    def refresh(self) -> None:
         """Take the covariances of the corrected readings anew at the latest sample."""
-        self._sensitivity = self._uncertainty.at(*self.last, slope_error=self.slope.error() if self.needs_slope else None)
+        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3],
+                                                 slope_error=self.slope.error() if self.needs_slope else None)
         self.revision += 1
 
-    def prepare(self, before):
+    def prepare(self, before: 'SampleCompensation') -> None:
         """Do beforehand what takes long when this takes over from `before`: period and covariances at its latest sample."""
         self.slope.prepare(before.slope)
         self.last = before.last
         self.refresh()
 
-    def follow(self, before):
+    def follow(self, before: 'SampleCompensation') -> None:
         """Go on where another compensation stops: same past of the rate, same temperature, same counts."""
         self.counts, self.corrected, self.fastest_squared = before.counts, before.corrected, before.fastest_squared
         if before.dt is not None and before.needs_temperature and self.dt is None:

@@ -1,15 +1,19 @@
 """Compensation of a stream of blocks: the state that has to go from one block to the next, and what is noticed on the way."""
 
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import choose_derivative, typical_period
-from imu_calibration.compensation.compensate import Transfer, arms_of, compensate, invertible, outside_conditions
+from imu_calibration.compensation.angular_acceleration import CausalDerivative, choose_derivative, typical_period
+from imu_calibration.compensation.compensate import Corrected, Transfer, arms_of, compensate, invertible, outside_conditions
 from imu_calibration.compensation.covariance import Uncertainty, is_known
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples, TemperatureSamples
 from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
@@ -30,7 +34,7 @@ class CompensationStream:
 
     """
 
-    def __init__(self, calibration, temperature=None, transfer=None):
+    def __init__(self, calibration: FittedErrors, temperature: TemperatureSamples | None = None, transfer: Transfer | None = None):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
         if invertible(calibration.model).needs_temperature and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
@@ -38,9 +42,10 @@ class CompensationStream:
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
         self._uncertainty = Uncertainty(calibration, transfer)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
-        self._fastest, self._temperatures, self._last = 0.0, [], ()
+        self._fastest, self._temperatures = 0.0, []
+        self._last: dict[str, Any] = {}
 
-    def correct(self, imu):
+    def correct(self, imu: ImuSamples) -> Corrected:
         """
         Return `Corrected` for the next block of ImuSamples.
 
@@ -55,7 +60,8 @@ class CompensationStream:
         slope[finite] = self.slope.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
         force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
                            for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
-        corrected = compensate(self.calibration, force_s, rate_s, slope @ self._inverse_rate.T, temperature, self.transfer)
+        corrected = compensate(self.calibration, force_s, rate_s, alpha_s=slope @ self._inverse_rate.T, temperature_c=temperature,
+                               transfer=self.transfer)
         corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
         corrected.rate[~finite] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
@@ -70,7 +76,7 @@ class CompensationStream:
         if len(usable):
             k = usable[-1]
             dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
-            self._last = (imu.force_s[k], imu.rate_s[k], slope[k], dt)
+            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k], 'dt': dt}
 
     def _temperature_at(self, stamp_ns):
         if self.temperature is None or not len(self.temperature):
@@ -82,7 +88,7 @@ class CompensationStream:
             self._temperatures = [min(self._temperatures), max(self._temperatures)]
         return values
 
-    def propagate(self, force_cov, rate_cov):
+    def propagate(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at the last sample.
 
@@ -94,9 +100,9 @@ class CompensationStream:
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
         known = [c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
-        return self._uncertainty.at(*self._last, slope_error=self.slope.error()).covariances(*known)
+        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(*known)
 
-    def warnings(self):
+    def warnings(self) -> list[str]:
         """Return lines about what was outside the calibration's conditions or could not be corrected."""
         fastest = np.array([[self._fastest, 0.0, 0.0]])
         lines = outside_conditions(self.calibration, fastest, self._temperatures or None)
@@ -110,21 +116,21 @@ class CompensationStream:
         return lines
 
 
-def derivative_for(calibration, period, transfer=None):
+def derivative_for(calibration: FittedErrors, period: float, transfer: Transfer | None = None) -> CausalDerivative:
     """Return the causal derivative that suits the arms and the noise of a calibration."""
     arm = float(np.max(np.linalg.norm(arms_of(calibration), axis=1)))
     if transfer is not None:
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
     (force_sd, _), (rate_sd, _) = (calibration.noise(sensor, period) for sensor in ('accelerometer', 'gyroscope'))
-    return choose_derivative(period, float(rate_sd.max()), arm, float(force_sd.min()))
+    return choose_derivative(period, float(rate_sd.max()), arm, force_sd=float(force_sd.min()))
 
 
-def uses_slope(calibration, transfer=None):
+def uses_slope(calibration: FittedErrors, transfer: Transfer | None = None) -> bool:
     """Return whether the angular acceleration enters what is corrected: there is a lever arm."""
     return bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
 
 
-def refuse_corrected(topic):
+def refuse_corrected(topic: str) -> None:
     """
     Refuse a stream that is corrected already.
 
@@ -138,7 +144,7 @@ def refuse_corrected(topic):
         raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic", key='imu_topic')
 
 
-def requested_transfer(frame_id, xyz, rpy):
+def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]) -> Transfer | None:
     """
     Return the Transfer that options or parameters ask for, None without a target frame.
 
@@ -156,7 +162,7 @@ def requested_transfer(frame_id, xyz, rpy):
     return None
 
 
-def late_ns(calibration, wanted=True):
+def late_ns(calibration: FittedErrors, wanted: bool = True) -> int:
     """Return by how much stamps are to be moved back, ns: the calibration's time_offset when that is `wanted`, else 0."""
     late = calibration.of('reference', Role.DELAY) if wanted else None
     return 0 if late is None else round(float(late) * 1e9)

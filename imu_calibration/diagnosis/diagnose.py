@@ -21,7 +21,7 @@ from imu_calibration.selection.gain import Gain, heldout_gain
 from imu_calibration.selection.investigation import Investigation, investigate
 
 
-def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
+def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
              bias_processes: dict | None = None) -> Diagnosis:
     """
     Say what a model gets wrong, and why.
@@ -52,13 +52,13 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, progre
         When there are too few windows to hold any out.
 
     """
-    result = told(windows, table, investigate(windows, table, model, progress, bias_processes=bias_processes))
+    result = told(windows, table, investigate(windows, table, model, progress=progress, bias_processes=bias_processes))
     if progress:
         progress(1.0)
     return result
 
 
-def told(windows: Sequence[Window], table: Table, found: Investigation, calibrated: Solution | None = None) -> Diagnosis:
+def told(windows: Sequence[Window], table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
     """
     Return what an investigation found as a Diagnosis.
 
@@ -70,22 +70,25 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, calibrat
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
-    baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, [])
-    solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, named, saturations=limits) if named or limits else baseline
+    baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
+    solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
+                                 saturations=limits) if named or limits else baseline
 
     def gain_of(place):
-        return heldout_gain(attempt, named[:place], named[:place + 1], sensors_of(named[place].effect))
+        return heldout_gain(attempt, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
 
     def motion_of(question, mate):
-        return separating_motion(solution, question, mate, table.gravity_value)
+        return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
-    findings += [finding(attempt.search, named, place, told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of)
+    findings += [finding(attempt.search, named, place, solution=told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of)
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named), tuple(found.not_testable),
-                     baseline, solution, heldout_gain(attempt, [], named, sensors), residual_traces(windows, table, baseline, solution),
+    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named),
+                     tuple(found.not_testable),
+                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),
+                     residual_traces(windows, table, baseline, after=solution),
                      len(found.used), int(np.sum(attempt.locked)))
 
 
@@ -93,5 +96,5 @@ def _clipping(limit, solution):
     effect = solution.model.find(limit.sensor, Role.LIMIT)
     parameters = parameters_of(solution, limit.sensor, effect.name)
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
-    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, limit.n_clipped), parameters, limit.p_value,
+    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
                    limit.n_expected, 1.0, gain, (), '')

@@ -1,13 +1,16 @@
 """The diagnosis as plain data: diagnosis.json."""
 
+from typing import Any
+
 import numpy as np
 
+from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.base import SENSORS
 
 FORMAT = 'imu_calibration/diagnosis/1'
 
 
-def to_mapping(diagnosis):
+def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for what is not a number."""
     return _plain({
         'format': FORMAT,

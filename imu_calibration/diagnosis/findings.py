@@ -1,5 +1,6 @@
 """One chosen effect as a finding, the same on a table and by hand."""
 
+from collections.abc import Sequence
 from typing import Callable
 
 from imu_calibration.diagnosis.result import Finding, parameters_of
@@ -9,7 +10,7 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
 
-def finding(search: Search, named: list[Question], place: int, solution: Solution, *, share: Callable, gain_of: Callable,
+def finding(search: Search, named: Sequence[Question], place: int, *, solution: Solution, share: Callable, gain_of: Callable,
             motion_of: Callable) -> Finding:
     """
     Return the Finding of the effect at `place` among those named.

@@ -1,14 +1,21 @@
 """A diagnosis while the motion goes on: the windows that are kept for it, and its outcome in the words of a status."""
 
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 from imu_calibration.calibration.by_evidence import baseline_model
+from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.estimation.window_store import owned_window
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.investigation import LEAST_WINDOWS
 
 
@@ -55,13 +62,13 @@ class RecentWindows:
 
     """
 
-    def __init__(self, most):
+    def __init__(self, most: int):
         self._most, self._windows, self.n_samples, self.forgotten = most, deque(), 0, 0
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._windows)
 
-    def add(self, windows):
+    def add(self, windows: Sequence) -> None:
         """Take windows in order."""
         for window in windows:
             if window.kind != 'unused' and len(window) <= self._most:
@@ -71,7 +78,7 @@ class RecentWindows:
             self.n_samples -= len(self._windows.popleft())
             self.forgotten += 1
 
-    def list(self):
+    def list(self) -> list[Window]:
         """Return the windows in order; they are not changed by anybody."""
         return list(self._windows)
 
@@ -87,15 +94,15 @@ class LiveDiagnosis:
 
     """
 
-    def __init__(self, most):
+    def __init__(self, most: int):
         self._most, self.recent = most, RecentWindows(most)
 
-    def add(self, windows):
+    def add(self, windows: Sequence) -> None:
         """Take the windows that a `LiveCalibration` has completed."""
         if self._most:
             self.recent.add(windows)
 
-    def question(self, live):
+    def question(self, live: LiveCalibration) -> 'DiagnosisQuestion | None':
         """Return the DiagnosisQuestion about the last solution of a `LiveCalibration`, or None while there are too few windows."""
         windows = self.recent.list() + live.open_windows
         if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
@@ -109,14 +116,14 @@ class DiagnosisQuestion:
 
     windows: list
     """Windows in order."""
-    table: object
+    table: Table
     """The Table."""
-    model: object
+    model: SensorModel
     """The model to diagnose."""
     forgotten: int = 0
     """Windows that were no longer there."""
 
-    def answer(self, progress=None):
+    def answer(self, progress: Callable[[float], object] | None = None) -> DiagnosisState:
         """Diagnose and return the DiagnosisState; `progress` is called with the share done and may raise to end it."""
         try:
             return describe(diagnose(self.windows, self.table, self.model, progress=progress), self.forgotten)
@@ -124,9 +131,10 @@ class DiagnosisQuestion:
             return DiagnosisState(WAITING, str(error), {'windows': len(self.windows)})
 
 
-def describe(diagnosis, forgotten=0):
+def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
     """Return the DiagnosisState of a Diagnosis: the first finding, or nothing, or what stays unexplained."""
-    values = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked, 'older windows not looked at': forgotten}
+    values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked,
+                              'older windows not looked at': forgotten}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
     values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor)
                for sensor, found in diagnosis.unexplained.items() if found.significant}

@@ -1,9 +1,12 @@
 """What a diagnosis hands back."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
 
 
@@ -67,13 +70,13 @@ class Diagnosis:
     """Every effect that was asked about, strongest first (Candidate)."""
     not_testable: tuple
     """{'effect', 'why', 'needs'} of the effects that could not be asked about."""
-    baseline: object
+    baseline: Solution
     """Solution of the model that was diagnosed."""
-    solution: object
+    solution: Any
     """Solution of the extended model on all windows; the baseline's when nothing was found."""
     gain: Gain
     """`gain.Gain` of all findings together on windows that took no part in choosing."""
-    traces: object
+    traces: Any
     """`gain.Traces`: residuals before and after, for plots."""
     windows: int
     """Windows used."""
@@ -81,12 +84,12 @@ class Diagnosis:
     """Windows that took no part in choosing."""
 
     @property
-    def model(self):
+    def model(self) -> SensorModel:
         """The extended SensorModel, linearised at the solution."""
         return self.solution.model.at(self.solution.values)
 
 
-def parameters_of(solution, sensor, effect):
+def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, tuple[float, float, str]]:
     """Return parameter name -> (value, sd, unit) of one effect."""
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
     part = solution.model.slices[sensor, effect]

@@ -1,12 +1,19 @@
 """Findings as sentences that an engineer would write."""
 
+from collections.abc import Collection, Sequence
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Candidate
-from imu_calibration.selection.search import FAMILY_WISE
+from imu_calibration.effects.base import Effect
+from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 
-READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'), 'm': (1e-3, 'mm'),
+READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'),
+            'm': (1e-3, 'mm'),
             '1': (1e-6, 'ppm'), 'm/s^2/K': (1e-3 * STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (DEG, 'deg/s/K'), '1/K': (1e-6, 'ppm/K'),
             '(m/s^2)^-1': (1e-3 / STANDARD_GRAVITY, 'mg/g^2'),
             '(m/s^2)^-2': (1e-3 / STANDARD_GRAVITY**2, 'mg/g^3'), '(rad/s)^-1': (1e-6 / DEG, 'ppm per deg/s'),
@@ -14,7 +21,7 @@ READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), '
 """SI unit -> (size of the readable unit in SI, its name)."""
 
 
-def sentence(effect, parameters, gain, n_clipped=None):
+def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
     """
     Return what was found in one or two sentences, with its size in units that people use.
 
@@ -47,13 +54,13 @@ def _size(value, sd, unit):
     return f'{value / step:.{min(digits, 6)}f} +- {sd / step:.{min(digits, 6)}f} {name}'
 
 
-def readable(value, unit):
+def readable(value: float, unit: str) -> str:
     """Return a value with three digits in a unit that people use."""
     step, name = READABLE.get(unit, (1.0, unit))
     return f'{value / step:.4g} {name}'
 
 
-def candidates_of(search, named):
+def candidates_of(search: Search, named: Sequence[Question]) -> tuple[Candidate, ...]:
     """Return every effect that a search asked about beside the findings, the strongest first; of a warm-up its best time constant."""
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:
@@ -64,12 +71,13 @@ def candidates_of(search, named):
         if question.name in rows and rows[question.name].gain_alone >= alone.gain:
             continue
         beside = None if question.name in found else search.score(named, question)
-        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, beside and beside.gain,
-                                        beside and beside.p_value, verdict_of(question.name, alone, beside, found, mates))
+        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, None if beside is None else beside.gain,
+                                        None if beside is None else beside.p_value,
+                                        verdict_of(question.name, alone, beside, found=found, mates=mates))
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 
-def verdict_of(name, alone, beside, found, mates):
+def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collection[str], mates: dict[str, Any]) -> str:
     """
     Return 'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or why the effect was refused.
 

@@ -1,17 +1,21 @@
 """Which motion would tell two effects apart: the standard motions are tried, for the effects as large as they were found."""
 
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.selection.questions import Question
 
 ENOUGH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
 
 
-def separating_motion(solution, question, mate, gravity):
+def separating_motion(solution: Solution, question: Question, mate: Question, *, gravity: float) -> Any:
     """
     Return the standard motion after which the mate could no longer pass for the effect that was found.
 
@@ -33,7 +37,7 @@ def separating_motion(solution, question, mate, gravity):
     return motions_of(question, mate)
 
 
-def motions_of(question, mate):
+def motions_of(question: Question, mate: Question) -> str:
     """Return the motions that two effects declare as theirs."""
     own = [name for name in question.effect.motion + mate.effect.motion]
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
@@ -48,7 +52,7 @@ def _best_motion(solution, question, mate, gravity):
     own = model.slices[question.sensor, question.name]
     best = (ENOUGH, None)
     for motion in MOTIONS:
-        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion, gravity)
+        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
         left = _unimitated(total, values, own)
         if left > best[0]:
             best = (left, motion.text)

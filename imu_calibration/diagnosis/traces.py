@@ -1,5 +1,6 @@
 """Residuals before and after as a person looks at them: averaged over short blocks, and dead reckoning with both models."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -7,8 +8,11 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import INPUT_OF, warped_reference
 from imu_calibration.effects.forward_equations import predict
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""
@@ -45,7 +49,7 @@ class Traces:
     no stretch of the recording is long enough."""
 
 
-def residual_traces(windows, table, before, after):
+def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *, after: Solution) -> Traces:
     """
     Return the Traces of two solutions.
 
@@ -61,9 +65,9 @@ def residual_traces(windows, table, before, after):
     errors, references = [], []
     for solution in (before, after):
         model = solution.model.at(solution.values)
-        predicted = predict(model, solution.values, table, motion, temperature)
+        predicted = predict(model, solution.values, table, motion=motion, temperature_c=temperature)
         errors.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
-        references.append({s: warped_reference(model, s, table, motion, temperature) for s in SENSORS})
+        references.append({s: warped_reference(model, s, table, motion=motion, temperature_c=temperature) for s in SENSORS})
     time = np.concatenate([w.time for w in windows])
     navigation = _dead_reckoning(time, (before, after), errors, references, rows)
     known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
@@ -135,4 +139,4 @@ def _drifts(piece, time, solution, error, reference, rows):
         felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[at] + np.linalg.solve(matrix, error[sensor][piece].T).T
     base = reference['accelerometer'].select(at)
     true = replace(base, time=time[piece], rate_s=reference['gyroscope'].rate_s[at])
-    return drift_over(true, felt['accelerometer'], felt['gyroscope'], DEAD_RECKONING)
+    return drift_over(true, felt['accelerometer'], felt['gyroscope'], seconds=DEAD_RECKONING)

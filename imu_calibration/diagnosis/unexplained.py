@@ -1,11 +1,15 @@
 """What remains when every effect has been asked about: how much, what it goes with, and where in the session it sits."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import f as f_distribution
 
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.questions import Question
 
 SIGNIFICANT = 5.0
 """Standard deviations above noise from which a rest is significant."""
@@ -39,7 +43,7 @@ class Unexplained:
     """What noise alone would leave there, shape (k, 3)."""
 
 
-def unexplained(attempt, explained, chosen):
+def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), attempt.search.used(chosen)
     values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
@@ -65,7 +69,7 @@ def _rest(attempt, explained, sensor, excess, values):
     return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
 
 
-def correlate(explanations, residual):
+def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
     """
     Return (name, adjusted share of the variance) of what the residual goes with most, or (None, 0).
 
@@ -102,7 +106,7 @@ def _explanations(recording):
     yield 'motion (moving windows against windows at rest)', recording.moving[:, None].astype(float), every
 
 
-def slow_explanations(time, temperature):
+def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield (name, columns, mask) of time, steps in time, and temperature where it is known and changes."""
     every = np.ones(len(time), bool)
     time = (time - time.mean()) / max(np.ptp(time), 1e-9)
@@ -117,7 +121,7 @@ def _step(time):
     return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)
 
 
-def where_most(time, residual, noise_sd):
+def where_most(time: np.ndarray, residual: np.ndarray, noise_sd: np.ndarray) -> str | None:
     """Return a sentence about the shortest stretch that holds four fifths of the rest, or None when it is everywhere."""
     order = np.argsort(time)
     weight = np.maximum(((residual / noise_sd)**2 - 1).sum(axis=1)[order], 0.0)

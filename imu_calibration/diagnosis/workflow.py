@@ -1,6 +1,8 @@
 """Use cases of diagnosis as plain functions: on a table and by hand; what they find in lines for people."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
+from imu_calibration.reference.table import Table
 from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.units import for_people, significant
 
@@ -38,17 +41,18 @@ class DiagnosisResult:
     """What was asked for."""
 
     @property
-    def document(self):
+    def document(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""
         return to_mapping(self.diagnosis)
 
     @property
-    def lines(self):
+    def lines(self) -> list[str]:
         """What was found, in lines for people."""
         return diagnosis_lines(self.diagnosis)
 
 
-def diagnose_recording(source, table, options=CalibrationOptions(), provenance=None, progress=None):
+def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+                       provenance: dict[str, Any] | None = None, progress: Callable | None = None) -> DiagnosisResult:
     """
     Calibrate a recording, say what the model gets wrong and why, and extend it.
 
@@ -71,18 +75,21 @@ def diagnose_recording(source, table, options=CalibrationOptions(), provenance=N
     windows = []
 
     def read(step, numbered):
-        return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session, source in numbered]
+        return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session,
+                source in numbered]
     report = _percent(progress) if progress else None
     calibrated = calibrate_by_evidence([source], table, options, provenance, asking=report, mapper=read)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spread.windows))
-    result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated.result.solution)
+    result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated=calibrated.result.solution)
     if report:
         report(1.0)
     return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options))
 
 
-def diagnose_without_table(source, options=CalibrationOptions(), provenance=None, progress=None):
+def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(), provenance: dict[str, Any] | None = None,
+                           *,
+                           progress: Callable | None = None) -> DiagnosisResult:
     """
     Calibrate a recording by hand, say what the model gets wrong and why, and extend it (see `diagnosis.by_hand`).
 
@@ -119,7 +126,7 @@ def _percent(advance):
     return report
 
 
-def diagnosis_lines(diagnosis):
+def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """Return findings, what stays unexplained and what could not be tested, as lines."""
     lines = []
     for number, finding in enumerate(diagnosis.findings, 1):
@@ -137,7 +144,7 @@ def diagnosis_lines(diagnosis):
     return lines
 
 
-def in_words(value, sensor):
+def in_words(value: float, sensor: str) -> str:
     """Return a specific force or rate in people's units."""
     factor, unit = for_people({'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
     return f'{significant(value * factor)} {unit}'

@@ -1,5 +1,6 @@
 """What an effect is: one physical cause of sensor output, declared once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Callable
@@ -132,60 +133,60 @@ class Effect:
         return from_definition, (self.name, self.definition)
 
     @property
-    def key(self):
+    def key(self) -> tuple[str, str]:
         """(sensor, name), by which models and catalogues know it."""
         return self.sensor, self.name
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Return the number of parameters."""
         return len(self.components)
 
     @property
-    def heading(self):
+    def heading(self) -> str:
         """Its title, or its name in words."""
         return self.title or self.name.replace('_', ' ')
 
     @property
-    def section(self):
+    def section(self) -> str:
         """Section of the document that lists it."""
         return 'reference' if self.in_reference else self.sensor
 
     @property
-    def relinearised(self):
+    def relinearised(self) -> bool:
         """Whether its columns depend on its own value."""
         return self.warp is not None or self.time_constant
 
     @property
-    def shared(self):
+    def shared(self) -> bool:
         """Whether its values enter the coefficients of other effects."""
         return self.role in (Role.LINEAR, Role.ARMS, Role.ARM)
 
     @property
-    def largest(self):
+    def largest(self) -> float:
         """Largest plausible size, infinite where nothing is known."""
         return max((limit for _, limit, _ in self.plausible), default=np.inf)
 
-    def prior_values(self):
+    def prior_values(self) -> np.ndarray:
         """Return the prior values, shape (size,)."""
         return np.array(np.broadcast_to(np.asarray(self.prior, float), (self.size,)))
 
-    def prior_sds(self):
+    def prior_sds(self) -> np.ndarray:
         """Return the standard deviations of the prior, shape (size,)."""
         return np.array(np.broadcast_to(np.asarray(self.prior_sd, float), (self.size,)))
 
-    def amplitudes(self, values):
+    def amplitudes(self, values: Sequence[Any] | np.ndarray) -> np.ndarray:
         """Return the values without the time constant."""
         return values[:-1] if self.time_constant else values
 
-    def at_time_constant(self, constant):
+    def at_time_constant(self, constant: float) -> np.ndarray:
         """Return the prior values with another time constant, shape (size,): where a bank takes the columns."""
         return np.append(self.prior_values()[:-1], constant)
 
-    def param_names(self):
+    def param_names(self) -> list[str]:
         """Return SENSOR.EFFECT.COMPONENT for each parameter."""
         return [f'{self.sensor}.{self.name}.{component}' for component in self.components]
 
-    def unit_of(self, index):
+    def unit_of(self, index: int) -> str:
         """Return the unit of component `index`."""
         return self.unit if isinstance(self.unit, str) else self.unit[index]

@@ -1,7 +1,9 @@
 """The catalogue of effects: declared once for simulation, calibration, compensation, diagnosis and planning."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 from imu_calibration.effects.base import SECTIONS, Effect
 from imu_calibration.effects.reference_effects import reference_effects
@@ -37,11 +39,11 @@ class Catalogue:
         """Travel by what was added."""
         return Catalogue, (self.added,)
 
-    def effects(self, joint_names=JOINTS):
+    def effects(self, joint_names: tuple[str, str, str] | JointNames = JOINTS) -> dict[tuple[str, str], Effect]:
         """Return every effect by (sensor, name) for a table with these joints."""
         return _own_effects(JointNames.of(joint_names)) | {effect.key: effect for effect in self.added}
 
-    def find(self, sensor, name, joint_names=JOINTS):
+    def find(self, sensor: str, name: str, joint_names: JointNames = JOINTS) -> Effect:
         """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
@@ -49,14 +51,14 @@ class Catalogue:
             raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
         return effects[sensor, name]
 
-    def owner_of(self, name, joint_names=JOINTS):
+    def owner_of(self, name: str, joint_names: tuple[str, str, str] | JointNames = JOINTS) -> str:
         """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:
             raise InputError(f"effect '{name}' is unknown or ambiguous; choose from {', '.join(sorted(n for n in names if names.count(n) == 1))}")
         return next(sensor for sensor, known in self.effects(joint_names) if known == name)
 
-    def with_effects(self, *effects: Effect):
+    def with_effects(self, *effects: Effect) -> 'Catalogue':
         """
         Return a catalogue with further effects.
 
@@ -72,7 +74,7 @@ class Catalogue:
             grown = replace(grown, added=(*grown.added, effect))
         return grown
 
-    def definitions(self, names):
+    def definitions(self, names: Collection[str]) -> dict[str, Any]:
         """Return {effect name: plain data} of those among `names` that were added, for a document."""
         added = [effect for effect in self.added if effect.name in names]
         for effect in added:
@@ -81,7 +83,7 @@ class Catalogue:
         return {effect.name: effect.definition for effect in added}
 
     @classmethod
-    def from_definitions(cls, definitions):
+    def from_definitions(cls, definitions: dict[str, Any]) -> 'Catalogue':
         """Return the catalogue with the effects of {name: plain data}."""
         return cls().with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
 

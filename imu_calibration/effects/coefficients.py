@@ -25,7 +25,7 @@ class Amplitudes:
     time_constant: bool = False
     """Whether the last value is a time constant."""
 
-    def __call__(self, values, point):
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         own = values[self.effect]
         amplitudes = own[:-1] if self.time_constant else own
@@ -43,7 +43,7 @@ class AlongAxis:
     group: str
     function: object
 
-    def __call__(self, values, point):
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         return {self.group: self.function(input_axes(values)) * values[self.effect][None, :]}
 
@@ -55,7 +55,7 @@ class Products:
     effect: str
     group: str
 
-    def __call__(self, values, point):
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         block = values[self.effect].reshape(3, 3).T
         return {self.group: np.concatenate([np.zeros((3, 3), block.dtype), block])}
@@ -68,7 +68,7 @@ class OfMatrix:
     effect: str
     group: str
 
-    def __call__(self, values, point):
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         matrix = values['matrix'].reshape(3, 3)
         return {self.group: matrix.T if self.effect == 'matrix' else (matrix * values[self.effect][:, None]).T}
@@ -80,13 +80,13 @@ class LeverArms:
 
     effect: str
 
-    def __call__(self, values, point):
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the coefficients; one arm stands for three."""
         matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[self.effect].reshape(-1, 3), (3, 3))
         return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
 
 
-def input_axes(values):
+def input_axes(values: dict[str, np.ndarray]) -> np.ndarray:
     """Return the unit vectors along which the three sensing elements sense: rows of the matrix, normalised."""
     matrix = values['matrix'].reshape(3, 3)
     return matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]

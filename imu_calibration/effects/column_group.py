@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, array_function, names_in, products, read
+from imu_calibration.reference.reference_motion import Reference
 
 STEP = 1e-30
 """Complex step of the derivative by a time constant."""
@@ -36,17 +37,17 @@ class ColumnGroup:
         return [read(text) for text in self.text]
 
     @cached_property
-    def names(self):
+    def names(self) -> frozenset[str]:
         """Names of `expressions.PLACES` in the texts."""
         return frozenset().union(*map(names_in, self._trees))
 
     @cached_property
-    def uses(self):
+    def uses(self) -> frozenset[str]:
         """Quantities of `expressions.QUANTITIES` that the columns are made of."""
         return frozenset(QUANTITY_OF[name] for name in self.names)
 
     @cached_property
-    def width(self):
+    def width(self) -> int:
         """Number of columns."""
         return len(self.text) * (2 if 'tau' in self.names else 1)
 
@@ -58,7 +59,7 @@ class ColumnGroup:
     def _places(self):
         return [(name, field, (slice(None), *index)) for name in sorted(self.names) for field, *index in [PLACES[name]] if field]
 
-    def columns(self, ref, point):
+    def columns(self, ref: Reference, point: dict[str, float]) -> np.ndarray:
         """
         Return the columns, shape (n, width).
 
@@ -81,6 +82,6 @@ class ColumnGroup:
                 result[:, count + k] = column.imag / STEP
         return result
 
-    def products(self, known):
+    def products(self, known: dict[str, dict[tuple[str], float]]) -> list[dict[tuple[str, ...], float]]:
         """Return each column as a sum of products (`expressions.products`)."""
         return [products(tree, known) for tree in self._trees]

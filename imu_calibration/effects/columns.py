@@ -1,15 +1,20 @@
 """The columns of a sensor: what its coefficients multiply, at the point where the model is linearised."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from imu_calibration.effects.base import Role
-from imu_calibration.effects.sensor_model import WARP
+from imu_calibration.effects.base import Effect, Role
+from imu_calibration.effects.sensor_model import WARP, SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
+from imu_calibration.reference.table import Table
 
 
-def warped_reference(model, sensor, table, motion, temperature_c=None, values=None):
+def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
+                     values: np.ndarray | None = None) -> Reference:
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -32,14 +37,16 @@ def warped_reference(model, sensor, table, motion, temperature_c=None, values=No
     return mean_reference(references, motion)
 
 
-def mean_reference(weighted, motion):
+def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
     """Return the weighted mean of references (a lag is a mean over delays); attitude from the last, which moves little."""
     if len(weighted) == 1:
         return weighted[0][1]
     total = sum(weight for weight, _ in weighted)
     first = weighted[0][1]
-    mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')}
-    return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c, motion)
+    mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s',
+                                                                                                    'mat_sn')}
+    return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c,
+                     motion)
 
 
 INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
@@ -48,41 +55,43 @@ INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
 class References:
     """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
 
-    def __init__(self, model, table, motion, temperature_c=None):
+    def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
         self.model, self.table, self.motion, self.temperature_c, self._known = model, table, motion, temperature_c, {}
 
-    def at(self, sensor, effect=None, values=None):
+    def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None) -> Reference:
         """Return the reference of `sensor`, with other values for one effect where given."""
         acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
         moved = effect is not None and np.any(values != self.model.point_of(effect))
         key = (acting, *((effect.name, *values) if moved else ()))
         if key not in self._known:
             change = None if effect is None else {effect.name: values}
-            self._known[key] = warped_reference(self.model, sensor, self.table, self.motion, self.temperature_c, change)
+            self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
+                                                values=change)
         return self._known[key]
 
 
-def columns(model, sensor, table, motion, temperature_c=None, references=None):
+def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
+            references: References | None = None) -> np.ndarray:
     """
     Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
 
     A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
     its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
     """
-    references = references or References(model, table, motion, temperature_c)
+    references = references or References(model, table, motion, temperature_c=temperature_c)
     ref, layout, parts = references.at(sensor), model.layout(sensor), []
     if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
         raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
         if name in warps:
-            parts += warp_columns(model, warps[name], sensor, references)
+            parts += warp_columns(model, warps[name], sensor, references=references)
         elif name in layout.groups:
             parts.append(layout.groups[name].columns(ref, layout.point))
     return np.concatenate(parts, axis=1)
 
 
-def warp_columns(model, effect, sensor, references):
+def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references: References) -> list[np.ndarray]:
     """
     Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
 
@@ -120,8 +129,9 @@ def _steps(effect, at, forward):
         yield at + step, below, (at + step - below)[index]
 
 
-def columns_at_point(model, sensor, table, motion, temperature_c=None, ref=None):
+def columns_at_point(model: SensorModel, sensor: str, table: Table | None, *, motion: JointMotion | None,
+                     temperature_c: np.ndarray | None = None, ref: Reference | None = None) -> np.ndarray:
     """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
-    ref = warped_reference(model, sensor, table, motion, temperature_c) if ref is None else ref
+    ref = warped_reference(model, sensor, table, motion=motion, temperature_c=temperature_c) if ref is None else ref
     layout = model.layout(sensor)
     return np.concatenate([group.columns(ref, layout.point) for group in layout.groups.values()], axis=1)

@@ -7,6 +7,7 @@ from which the compensation of one sample is written. Text may come from a docum
 
 import ast
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -32,7 +33,7 @@ OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 SIGNS = (ast.UAdd, ast.USub)
 
 
-def read(text):
+def read(text: str) -> ast.expr:
     """
     Return the syntax tree of a column.
 
@@ -72,12 +73,12 @@ def _check(node):
             raise ValueError
 
 
-def names_in(tree):
+def names_in(tree: ast.expr) -> set[str]:
     """Return the names of quantities in a tree."""
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in PLACES}
 
 
-def array_function(trees):
+def array_function(trees: Sequence[ast.expr]) -> Callable:
     """Return ``function({name: array or number}) -> tuple of arrays``, one for each tree."""
     source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
     code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
@@ -85,7 +86,7 @@ def array_function(trees):
     return lambda values: eval(code, known, values)   # the trees hold arithmetic alone: see `read`
 
 
-def products(tree, known):
+def products(tree: ast.expr, known: dict[str, dict[tuple[str], float]]) -> dict[tuple[str, ...], float]:
     """
     Return a column as a sum of products, {factors: coefficient}, factors a sorted tuple of Python expressions in plain floats.
 
@@ -129,7 +130,7 @@ def products(tree, known):
     return added(left, right if isinstance(node.op, ast.Add) else scaled(right, -1.0))
 
 
-def added(*sums):
+def added(*sums: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
     """Return the sum of sums of products; what cancels is left out."""
     total = {}
     for terms in sums:
@@ -138,7 +139,7 @@ def added(*sums):
     return {factors: coefficient for factors, coefficient in total.items() if coefficient != 0.0}
 
 
-def scaled(terms, factor):
+def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str, ...], float]:
     """Return a multiple of a sum of products."""
     return {factors: factor * coefficient for factors, coefficient in terms.items() if factor * coefficient != 0.0}
 
@@ -149,9 +150,10 @@ def _multiplied(left, right):
     return added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
 
 
-def as_text(terms):
+def as_text(terms: dict[tuple[str, ...], float]) -> str:
     """Return a sum of products as a Python expression, coefficients of one left out."""
-    texts = [' * '.join([*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]) for factors, coefficient in terms.items()]
+    texts = [' * '.join([*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]) for factors,
+             coefficient in terms.items()]
     return ' + '.join(texts) or '0.0'
 
 

@@ -2,12 +2,15 @@
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.columns import columns_at_point
-from imu_calibration.effects.sensor_model import WARP, WARP_LEVER
+from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.reference.table import Table
 
 
-def coefficients(model, sensor, values):
+def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """Return the coefficients of the columns for a parameter vector (real or complex), shape (n_columns, 3)."""
     of_sensor, layout = model.values_of(sensor, values), model.layout(sensor)
     total = np.zeros((layout.width, 3), values.dtype)
@@ -31,12 +34,12 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
             total[layout.rows[group]] += block
 
 
-def all_arms(model, values):
+def all_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """Return the arms from the reference point to the three sensitive points, shape (3, 3), zero where the model has none."""
     return sum((values[model.slices[e.key]].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
 
 
-def coefficient_jacobian(model, sensor, values):
+def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """
     Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params).
 
@@ -57,7 +60,8 @@ def coefficient_jacobian(model, sensor, values):
     return jacobian
 
 
-def effect_slopes(effect, of_sensor, point):
+def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
+                  point: dict[str, float]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return {group: coefficients (w, 3)} of one effect and {group: derivative by its own values (w, 3, size)}, by complex steps."""
     found = effect.coefficients(of_sensor, point)
     slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
@@ -69,7 +73,8 @@ def effect_slopes(effect, of_sensor, point):
     return found, slopes
 
 
-def predict(model, values, table, motion, temperature_c=None):
+def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion,
+            temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     Return what the IMU of this model would read, (force, rate), each shape (n, 3): the forward equations.
 
@@ -78,24 +83,25 @@ def predict(model, values, table, motion, temperature_c=None):
     exact = model.at(values)
     outputs = []
     for sensor in SENSORS:
-        output = columns_at_point(exact, sensor, table, motion, temperature_c) @ coefficients_at_point(exact, sensor, values)
-        outputs.append(clip(exact, sensor, values, output))
+        output = columns_at_point(exact, sensor, table, motion=motion, temperature_c=temperature_c) @ coefficients_at_point(exact, sensor,
+                                                                                                                            values)
+        outputs.append(clip(exact, sensor, values, output=output))
     return tuple(outputs)
 
 
-def coefficients_at_point(model, sensor, values):
+def coefficients_at_point(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """Return the coefficients that belong to `columns_at_point`."""
     layout, found = model.layout(sensor), coefficients(model, sensor, values)
     return np.concatenate([found[layout.rows[name]] for name in layout.groups])
 
 
-def clip(model, sensor, values, output):
+def clip(model: SensorModel, sensor: str, values: np.ndarray, *, output: np.ndarray) -> np.ndarray:
     """Clip the output at the saturation level, when the model has one."""
     level = model.value(sensor, Role.LIMIT, values)
     return output if level is None else np.clip(output, -level, level)
 
 
-def sensor_output(model, sensor, values, ref):
+def sensor_output(model: SensorModel, sensor: str, values: np.ndarray, *, ref: Reference) -> np.ndarray:
     """
     Return the output for a given true motion, without warps: what compensation inverts, shape (n, 3).
 
@@ -105,4 +111,4 @@ def sensor_output(model, sensor, values, ref):
         True specific force, rate and angular acceleration in the sensor frame.
 
     """
-    return columns_at_point(model, sensor, None, None, ref=ref) @ coefficients_at_point(model, sensor, values)
+    return columns_at_point(model, sensor, None, motion=None, ref=ref) @ coefficients_at_point(model, sensor, values)

@@ -1,8 +1,15 @@
 """Models with a name, the models that are taken when nobody asks, and models as users write them."""
 
+from typing import TYPE_CHECKING
+
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.catalogue import CATALOGUE, JOINTS
+from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.errors import InputError
+from imu_calibration.reference.joint import JointNames
+from imu_calibration.reference.table import Table
+
+if TYPE_CHECKING:
+    from imu_calibration.effects.sensor_model import SensorModel
 
 BASE = ('bias', 'matrix')
 """Effects that every sensor has."""
@@ -22,7 +29,7 @@ DEFAULT = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
 """What is asked of a recording on a table when nobody says more."""
 
 
-def parse_effects(sensor, text, joint_names=JOINTS, catalogue=CATALOGUE):
+def parse_effects(sensor: str, text: str, joint_names: JointNames = JOINTS, *, catalogue: Catalogue = CATALOGUE) -> tuple[str, ...]:
     """
     Return effect names from a named model or names joined by '+'.
 
@@ -40,7 +47,7 @@ def parse_effects(sensor, text, joint_names=JOINTS, catalogue=CATALOGUE):
     return names
 
 
-def parse_reference(text, table):
+def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     """
     Return effect names of table and clock from names joined by '+' or 'none'.
 
@@ -55,7 +62,7 @@ def parse_reference(text, table):
         CATALOGUE.find('reference', name).moot is None or CATALOGUE.find('reference', name).moot(table) is None))
 
 
-def with_common_arm(model):
+def with_common_arm(model: 'SensorModel') -> 'SensorModel':
     """Return the model with a common lever arm beside the arms of the size effect; without a size effect as it is."""
     lacks = model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM)
     return model.with_effect('accelerometer', 'lever_arm') if lacks else model

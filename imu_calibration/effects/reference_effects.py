@@ -59,7 +59,7 @@ def _harmonics(table, motion, values):
     amplitudes = np.zeros((motion.position.shape[1], len(ORDERS), 2))
     amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ORDERS), 2))
     for index, order in enumerate(ORDERS):
-        motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], amplitudes[:, index, 1])
+        motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1])
     return [(1.0, table, motion)]
 
 
@@ -94,14 +94,15 @@ def _places_taken(table):
 
 def _lag_effect(sensor):
     return Effect(
-        name=f'{SHORT[sensor]}_bandwidth', sensor=sensor, components=('time_constant',), shape=(), unit='s', nonnegative=True, in_reference=True,
+        name=f'{SHORT[sensor]}_bandwidth', sensor=sensor, components=('time_constant',), shape=(), unit='s', nonnegative=True,
+        in_reference=True,
         explanation=f'The {sensor} answers through a first-order low-pass filter: its output lags and loses amplitude at speed.',
         tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
         tolerance_reason='1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer' else '0.1 deg/s while the rate changes by 1000 deg/s^2',
         motion=('oscillate_fast',), compensation='none', warp=_lag, acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
 
 
-def reference_effects(joint_names):
+def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
     of_table = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True, 'against': ('angle',)}
@@ -115,7 +116,8 @@ def reference_effects(joint_names):
         Effect(
             **of_table, name='axis_non_orthogonality', components=names.angles, shape=(len(names.angles),),
             explanation='The axes of the table do not stand at the angles to one another that its description says.',
-            tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
+            tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
+            plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
             motion=('two_axis', 'static_dense'), warp=_axes, needs=('joints', 'two_joints')),
         Effect(
             **of_table, name='encoder_zero', components=names.zeros, shape=(len(names.zeros),),
@@ -138,14 +140,17 @@ def reference_effects(joint_names):
         Effect(
             name='time_offset', sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
             explanation='The IMU stamps are late against the joint stamps.',
-            tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1, plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
+            tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1,
+            plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
             motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late, needs=('joints', 'dynamic'), step=2e-4),
         Effect(
             name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
             title='Earth rate in the level frame', known_size=True, moot=_earth_known,
             explanation="The gyroscopes feel the Earth's rotation, which the model leaves out.",
-            tolerance=2e-6, tolerance_reason="3 % of the Earth's rotation", prior_sd=1e-4, plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),),
-            motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth, acts_on=('gyroscope',),
+            tolerance=2e-6, tolerance_reason="3 % of the Earth's rotation", prior_sd=1e-4,
+            plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),),
+            motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth,
+            acts_on=('gyroscope',),
             needs=('joints',)),
         *map(_lag_effect, SENSORS),
     )

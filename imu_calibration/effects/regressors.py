@@ -34,18 +34,18 @@ ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES
 WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in SHORT.items()}
 
 
-def square_coefficients(axes):
+def square_coefficients(axes: np.ndarray) -> np.ndarray:
     """Return the coefficients of `SQUARES` that give (u_i . v)^2 for each row u_i of `axes`, shape (6, 3)."""
     return np.stack([axes[:, j] * axes[:, k] * (1.0 if j == k else 2.0) for j, k in PAIRS])
 
 
-def cube_coefficients(axes):
+def cube_coefficients(axes: np.ndarray) -> np.ndarray:
     """Return the coefficients of `CUBES` that give (u_i . v)^3 for each row u_i of `axes`, shape (10, 3)."""
     count = [1 if i == j == k else 6 if len({i, j, k}) == 3 else 3 for i, j, k in TRIPLES]
     return np.stack([axes[:, i] * axes[:, j] * axes[:, k] * m for (i, j, k), m in zip(TRIPLES, count)])
 
 
-def signed_coefficients(axes):
+def signed_coefficients(axes: np.ndarray) -> np.ndarray:
     """Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`, shape (9, 3)."""
     block = np.zeros((3, 3, 3), axes.dtype)
     block[np.arange(3), :, np.arange(3)] = axes

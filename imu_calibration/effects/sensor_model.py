@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from imu_calibration.effects.base import SECTIONS, SENSORS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import InputError
@@ -68,64 +69,64 @@ class SensorModel:
         return SensorModel, tuple(getattr(self, f.name) for f in fields(self))
 
     @cached_property
-    def effects(self):
+    def effects(self) -> list[Effect]:
         """Effects in parameter order."""
         return [self.catalogue.find(sensor, name, self.joint_names) for sensor in SECTIONS for name in getattr(self, sensor)]
 
     @cached_property
-    def param_names(self):
+    def param_names(self) -> list[str]:
         """Names in parameter order."""
         return [name for effect in self.effects for name in effect.param_names()]
 
     @cached_property
-    def slices(self):
+    def slices(self) -> dict[tuple[str, str], slice]:
         """Slice of the parameter vector for each (sensor, effect name)."""
         ends = np.cumsum([0] + [effect.size for effect in self.effects])
         return {effect.key: slice(a, b) for effect, a, b in zip(self.effects, ends, ends[1:])}
 
-    def find(self, sensor, role):
+    def find(self, sensor: str, role: Role) -> Effect | None:
         """Return the effect of a sensor in a place of its equation, or None."""
         return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)
 
-    def part(self, sensor, role):
+    def part(self, sensor: str, role: Role) -> slice:
         """Return the slice of the parameter vector of the effect in a place of a sensor's equation; empty where there is none."""
         effect = self.find(sensor, role)
         return slice(0, 0) if effect is None else self.slices[effect.key]
 
-    def value(self, sensor, role, values):
+    def value(self, sensor: str, role: Role, values: np.ndarray) -> np.ndarray | None:
         """Return the values of the effect in a place of a sensor's equation in its documented shape, or None."""
         effect = self.find(sensor, role)
         return None if effect is None else values[self.slices[effect.key]].reshape(effect.shape)
 
     @property
-    def definitions(self):
+    def definitions(self) -> dict[str, Any]:
         """Plain data of those effects that somebody added to the catalogue, by name: what a document needs beside the names."""
         return self.catalogue.definitions({effect.name for effect in self.effects})
 
     @property
-    def further(self):
+    def further(self) -> list[Effect]:
         """Effects that are neither offset nor linear response."""
         return [e for e in self.effects if e.role not in (Role.OFFSET, Role.LINEAR)]
 
     @property
-    def needs_temperature(self):
+    def needs_temperature(self) -> bool:
         """Whether an effect depends on temperature."""
         return any('temperature' in effect.needs for effect in self.effects)
 
     @cached_property
-    def requested(self):
+    def requested(self) -> np.ndarray:
         """Whether somebody asks for each parameter; table, clock and the common arm are nuisances. Shape (n_params,)."""
         return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
 
-    def prior(self):
+    def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Return prior values and prior standard deviations, both shape (n_params,)."""
         return tuple(np.concatenate(parts) for parts in zip(*((e.prior_values(), e.prior_sds()) for e in self.effects)))
 
-    def start(self):
+    def start(self) -> np.ndarray:
         """Return the values to start from: the prior's, or the point of the columns."""
         return np.concatenate([self.point_of(effect) for effect in self.effects])
 
-    def start_from(self, other, known):
+    def start_from(self, other: 'SensorModel', known: np.ndarray) -> np.ndarray:
         """Return the values to start from, those of the effects of another model as they are known there."""
         values = self.start()
         for effect in other.effects:
@@ -133,45 +134,45 @@ class SensorModel:
                 values[self.slices[effect.key]] = known[other.slices[effect.key]]
         return values
 
-    def values_of(self, sensor, values):
+    def values_of(self, sensor: str, values: np.ndarray) -> dict[str, np.ndarray]:
         """Return {effect name: values} that concern `sensor`, its own and the reference's."""
         return {e.name: values[self.slices[e.key]] for e in self.effects if e.sensor in (sensor, 'reference')}
 
-    def with_effect(self, sensor, name):
+    def with_effect(self, sensor: str, name: str) -> 'SensorModel':
         """Return the model extended by one effect."""
         return replace(self, **{sensor: getattr(self, sensor) + (name,)})
 
-    def with_role(self, sensor, role):
+    def with_role(self, sensor: str, role: Role) -> 'SensorModel':
         """Return the model extended by the catalogue's effect for a place of a sensor's equation."""
         effects = self.catalogue.effects(self.joint_names).values()
         return self.with_effect(sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role))
 
-    def with_reference_temperature(self, temperature_c):
+    def with_reference_temperature(self, temperature_c: float) -> 'SensorModel':
         """Return the model whose thermal effects vanish at the whole degree nearest to a temperature."""
         return replace(self, temperature_ref_c=float(round(temperature_c)))
 
-    def without(self, sensor, *names):
+    def without(self, sensor: str, *names: str) -> 'SensorModel':
         """Return the model without some effects of a sensor."""
         return replace(self, **{sensor: tuple(known for known in getattr(self, sensor) if known not in names)})
 
-    def without_arms(self):
+    def without_arms(self) -> 'SensorModel':
         """Return the model without lever arms."""
         return self.without('accelerometer', *(effect.name for effect in self.arms))
 
     @property
-    def arms(self):
+    def arms(self) -> list[Effect]:
         """Effects that are lever arms of the accelerometers."""
         return [e for e in self.effects if e.role in (Role.ARMS, Role.ARM)]
 
-    def concerning(self, sensor):
+    def concerning(self, sensor: str) -> list[Effect]:
         """Return the effects that contribute columns to `sensor`."""
         return [e for e in self.effects if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on)]
 
-    def groups(self, sensor):
+    def groups(self, sensor: str) -> list[tuple[str, int]]:
         """Return the columns of `sensor` in order: (group name, width)."""
         return [(name, rows.stop - rows.start) for name, rows in self.layout(sensor).rows.items()]
 
-    def layout(self, sensor):
+    def layout(self, sensor: str) -> ColumnLayout:
         """
         Return where the coefficients of each group stand (worked out once per sensor).
 
@@ -201,32 +202,32 @@ class SensorModel:
     def _layouts(self):
         return {}
 
-    def columns_of(self, sensor, role):
+    def columns_of(self, sensor: str, role: Role) -> slice:
         """Return the slice of the columns that the effect in a place of a sensor's equation multiplies."""
         return self.layout(sensor).rows[self.find(sensor, role).groups[0].name]
 
-    def point_of(self, effect):
+    def point_of(self, effect: Effect) -> np.ndarray:
         """Return the values at which `effect`'s columns are taken: its prior's when nothing is known yet."""
         known = self.point.get(effect.name)
         return effect.prior_values() if known is None else np.atleast_1d(np.asarray(known, float))
 
     @property
-    def relinearised(self):
+    def relinearised(self) -> list[Effect]:
         """Effects whose columns depend on their own value."""
         return [e for e in self.effects if e.relinearised]
 
-    def at(self, values):
+    def at(self, values: np.ndarray) -> 'SensorModel':
         """Return the same model linearised at `values`."""
         moved = {e.name: np.array(values[self.slices[e.key]], float) for e in self.relinearised}
         return replace(self, point={**self.point, **moved})
 
-    def full_point(self):
+    def full_point(self) -> dict[str, float]:
         """Return what the column groups need to know besides the reference."""
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
         return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
 
 
-def linear_names(sensor):
+def linear_names(sensor: str) -> np.ndarray:
     """Return the parameter names of a sensor's matrix, shape (3, 3)."""
     model = SensorModel()
     return np.array(model.param_names)[model.part(sensor, Role.LINEAR)].reshape(3, 3)

@@ -1,6 +1,8 @@
 """Effects made of plain data: a column as text, and what a person has to say of it. They travel in documents and to other processes."""
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 from imu_calibration.effects.base import AXES, SENSORS, VECTOR, Effect
 from imu_calibration.effects.coefficients import Amplitudes
@@ -15,7 +17,9 @@ MANY = 100.0
 """Tolerances in the prior's standard deviation, where nobody says more."""
 
 
-def term(name, *, sensor, column, unit, tolerance, text, tolerance_reason='', prior_sd=None, largest=None, time_constant=300.0):
+def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | None, tolerance: float | str, text: str,
+         tolerance_reason: str = '', prior_sd: float | None = None, largest: float | None = None,
+         time_constant: float = 300.0) -> Effect | None:
     """
     Return an effect ``output_i += value_i column``, with one value for each axis.
 
@@ -85,7 +89,7 @@ def term(name, *, sensor, column, unit, tolerance, text, tolerance_reason='', pr
         against=tuple(quantity for quantity in DRAWN_AGAINST if quantity in group.uses)[:1])
 
 
-def from_definition(name, definition):
+def from_definition(name: str, definition: dict[str, Any]) -> Effect:
     """
     Return the effect that plain data define.
 

@@ -48,7 +48,7 @@ class BandMisfit:
         return np.where(self.apart, self.slow, self.overall)
 
 
-def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, dof_slow: float) -> BandMisfit:
+def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_slow: float) -> BandMisfit:
     """
     Return the `BandMisfit` of centred rows.
 

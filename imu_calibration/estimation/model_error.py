@@ -45,7 +45,7 @@ class ModelError:
         return covariance * np.outer(self.factor, self.factor) + np.diag(self.added_variance)
 
 
-def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], free: np.ndarray) -> ModelError:
+def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray) -> ModelError:
     """
     Return by how much the blocks of a recording ask for different parameters than noise explains.
 

@@ -104,7 +104,8 @@ class NoiseModel:
     def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
         """Return what noise alone would be: no offsets, no misfit along the columns, and only the bias processes that are given."""
         moving = {kind: replace(factors, every=factors.every / factors.along) for kind, factors in self.moving.items()}
-        moving = {kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0))) for kind, factors in moving.items()}
+        moving = {kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0))) for kind,
+                  factors in moving.items()}
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel', change: float = 0.05) -> bool:
@@ -120,7 +121,7 @@ class NoiseModel:
         return True
 
 
-def dof_factor(dof):
+def dof_factor(dof: np.ndarray) -> np.ndarray:
     """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: what a variance from few data is taken larger by."""
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
 

@@ -38,13 +38,13 @@ class NoiseLikelihood:
 
     """
 
-    def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray | None = None, *,
-                 known: tuple[BiasProcess, ...] = ()):
+    def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
+                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = ()):
         self.typical = float(np.sqrt(np.median(white)))
         self.many, self.known = len(rows) >= LEAST_WINDOWS, known
-        self._white, self._likelihood, self._losses = white, RestrictedLikelihood(rows, times, sessions, information), {}
+        self._white, self._likelihood, self._losses = white, RestrictedLikelihood(rows, times, sessions, information=information), {}
 
-    def loss(self, shape: tuple, used: np.ndarray | None = None, restricted: bool = True, session: float = 0.0) -> float:
+    def loss(self, shape: tuple, used: np.ndarray | None = None, restricted: bool = True, *, session: float = 0.0) -> float:
         """Return minus twice the (restricted) log likelihood with the parameters `used`, all where not given."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:
@@ -62,7 +62,7 @@ class NoiseLikelihood:
         return (*self.known, BiasProcess(sd, time)) if sd > 0 else self.known
 
 
-def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray, *,
+def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray], information: np.ndarray,
                      known: tuple[BiasProcess, ...] = ()) -> dict:
     """
     Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
@@ -78,7 +78,7 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, ses
         As in `NoiseLikelihood`.
 
     """
-    search = _Search(NoiseLikelihood(rows, white, times, sessions, information, known=known))
+    search = _Search(NoiseLikelihood(rows, white, times, sessions=sessions, information=information, known=known))
     trials, costs = search.grid(0.0)
     session = search.best_session(trials[np.argmin(costs)]) if len(sessions) > 1 else 0.0
     if session > 0:

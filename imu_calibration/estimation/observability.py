@@ -1,16 +1,21 @@
 """What a recording can determine, in tolerances, and which motion would determine the rest."""
 
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
-from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, TABLE_MOTIONS
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, TABLE_MOTIONS, Motion
 
 
-def added_information(model, values, noise, motion, gravity):
+def added_information(model: SensorModel, values: np.ndarray, noise: dict[str, NoiseModel], *, motion: Motion,
+                      gravity: float) -> np.ndarray:
     """
     Return the information matrix that one minute of a standard motion would add, shape (n_params, n_params).
 
@@ -47,7 +52,7 @@ def _columns(layout, name, rows, piece):
     return np.zeros((len(piece), rows.stop - rows.start)) if unknown else group.columns(piece, layout.point)
 
 
-def tolerance_scaled_singular_values(information, tolerances):
+def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     """
     Return the singular values of the design with parameters in units of their tolerance, descending.
 
@@ -57,7 +62,7 @@ def tolerance_scaled_singular_values(information, tolerances):
     return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
 
 
-def weak_directions(covariance, tolerances, names, limit=6):
+def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Sequence[str], *, limit: int = 6) -> list[dict[str, float]]:
     """
     Return the directions in which the standard deviation exceeds the tolerance, worst first.
 
@@ -79,7 +84,8 @@ def weak_directions(covariance, tolerances, names, limit=6):
     return found
 
 
-def needed_motions(solution, tolerances, gravity, prior_sd, only_axis=None):
+def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *, prior_sd: np.ndarray,
+                   only_axis: np.ndarray | None = None) -> dict[str, tuple[str, float]]:
     """
     Return for each parameter that is not determined the standard motion that would serve it best.
 
@@ -99,7 +105,7 @@ def needed_motions(solution, tolerances, gravity, prior_sd, only_axis=None):
     base = solution.information + np.diag(1 / prior_sd**2)
     predicted = {}
     for motion in MOTIONS:
-        total = base + added_information(solution.model, solution.values, solution.noise, motion, gravity)
+        total = base + added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)
         predicted[motion] = np.sqrt(np.clip(np.diag(inverse_normal(total)), 0, None))
     if only_axis is None:
         return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}

@@ -36,7 +36,7 @@ def count_pieces(duration: float) -> int:
     return max(round(duration / PIECE_TIME), 1)
 
 
-def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, rate_s: np.ndarray) -> dict[str, np.ndarray]:
+def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *, rate_s: np.ndarray) -> dict[str, np.ndarray]:
     """
     Return {regime: rows ``[columns | d(true input)/dt | output]``} of a moving window, a row for the mean over each piece.
 

@@ -27,7 +27,7 @@ class RestrictedLikelihood:
 
     """
 
-    def __init__(self, rows: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], information: np.ndarray | None = None):
+    def __init__(self, rows: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], *, information: np.ndarray | None = None):
         self._rows, self._times, self._sessions = rows, times, sessions
         self._information = np.zeros((rows.shape[2],) * 2) if information is None else information
 
@@ -36,9 +36,10 @@ class RestrictedLikelihood:
         logs, normal = self.whitened(variance, processes, session_variance)
         return logs + profile(normal)
 
-    def whitened(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> tuple[float, np.ndarray]:
+    def whitened(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> tuple[float,
+                                                                                                                            np.ndarray]:
         """Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included."""
-        whitening = Whitening(variance, self._times, self._sessions, processes, session_variance)
+        whitening = Whitening(variance, self._times, self._sessions, processes=processes, session_variance=session_variance)
         white = whitening(self._rows).reshape(-1, self._rows.shape[2])
         return whitening.log_determinant, self._information + white.T @ white
 

@@ -35,7 +35,7 @@ def inverse_normal(information: np.ndarray) -> np.ndarray:
     return np.linalg.inv(scaled) * np.outer(scale, scale)
 
 
-def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, prior_mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (values, covariance) of the parameters `used` that minimise the quadratic form of a normal matrix plus a prior.
 
@@ -60,7 +60,7 @@ def quadratic(normal: np.ndarray, used: np.ndarray, values: np.ndarray) -> float
     return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)
 
 
-def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
+def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *, prior_sd: np.ndarray) -> np.ndarray:
     """
     Return the covariance of all parameters where some are held at their prior, which enters everybody else's.
 

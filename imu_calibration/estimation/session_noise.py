@@ -15,7 +15,8 @@ from imu_calibration.estimation.weighted_system import WeightedSystem
 
 def first_noise(system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]) -> dict[str, NoiseModel]:
     """Return the noise before any residual is known; fast parts wait with weight zero where slow ones can be fitted better."""
-    return {sensor: _with_bands(system, sensor, replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
+    return {sensor: _with_bands(system, sensor,
+                                replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
 
 
 def updated_noise(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, NoiseModel]:
@@ -46,7 +47,8 @@ def _updated(system, sensor, values, noise):
         noise = replace(_at_rest(system, sensor, values), known=noise.known)
     noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})
     rows, information = system.linearised(sensor, values, noise)
-    return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, system.sessions, information, known=noise.known))
+    return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, sessions=system.sessions,
+                                             information=information, known=noise.known))
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:
@@ -70,4 +72,4 @@ def _misfit_of(system, sensor, kind, values=None) -> BandMisfit:
     slow = system.accumulator.slow[sensor, kind] if n_slow > 0 else rows[:0]
     misfits = [own_misfit(part) if values is None else system.misfit(sensor, part, values) for part in (rows, slow)]
     total, of_slow = ((misfit**2).sum(axis=0) for misfit in misfits)
-    return band_misfit(total, system.dof_within[kind], of_slow, n_slow)
+    return band_misfit(total, system.dof_within[kind], of_slow, dof_slow=n_slow)

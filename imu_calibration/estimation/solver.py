@@ -75,8 +75,8 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     if held.any():
         values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
     data = system.jacobian(values, factors)
-    covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior.sd)
-    error = model_error(system, values, noises, free & ~held)
+    covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
+    error = model_error(system, values, noises, free=free & ~held)
     covariance = error.added(covariance)
     chi2, rms = _fit_quality(system, values, noises)
     return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error)
@@ -180,7 +180,7 @@ def _session_biases(system, values, noises):
         if noise.session_variance > 0:
             misfit = system.misfit(sensor, system.means[sensor], values)
             found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + predict_session_offsets(
-                misfit, system.mean_variance(noise) + noise.offset_sd**2, system.times, system.sessions, noise)
+                misfit, system.mean_variance(noise) + noise.offset_sd**2, system.times, sessions=system.sessions, noise=noise)
     return found
 
 

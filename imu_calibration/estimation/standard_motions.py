@@ -26,7 +26,7 @@ class Motion:
     axis: tuple | None = None
     """The one axis of the sensor that it turns about; None: it takes several, or other attitudes."""
 
-    def possible_about(self, axis_s):
+    def possible_about(self, axis_s: np.ndarray) -> bool:
         """Return whether a table can do it that turns the sensor about one axis only, given as a unit vector in the sensor frame."""
         return self.axis is not None and abs(float(np.dot(self.axis, axis_s))) > ALONG
 

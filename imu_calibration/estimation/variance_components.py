@@ -40,7 +40,7 @@ class GroupVariances:
         return noise + np.append(self.variance * factor, 0.0)[group]
 
 
-def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np.ndarray, group: np.ndarray, *, start: np.ndarray,
+def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np.ndarray, *, group: np.ndarray, start: np.ndarray,
                              fallback: np.ndarray) -> GroupVariances:
     """
     Estimate the additional variance of each group of rows.

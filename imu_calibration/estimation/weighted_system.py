@@ -1,5 +1,6 @@
 """The rows of one solve: accumulated windows with the columns of a model, weighed with a noise, and the prior."""
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -66,7 +67,7 @@ class WeightedSystem:
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
         variance = self.mean_variance(noise) + noise.offset_sd**2
-        return Whitening(variance, self.times, self.sessions, noise.bias_processes, noise.session_variance)(rows)
+        return Whitening(variance, self.times, self.sessions, processes=noise.bias_processes, session_variance=noise.session_variance)(rows)
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
         """Return the whitened mean rows ``[columns | output]`` of each axis, shape (n_windows, 3, p + 1)."""
@@ -80,10 +81,12 @@ class WeightedSystem:
     def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
         """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
         white, weighed = self.whitened_means(sensor, noise), list(self.weighed_rows(sensor, noise))
-        return [triangular(np.concatenate([white[:, axis], *(rows[:, self.columns_and(sensor, axis)] * weight[axis] for rows, weight in weighed)]))
+        return [triangular(np.concatenate([white[:, axis],
+                                           *(rows[:, self.columns_and(sensor, axis)] * weight[axis] for rows, weight in weighed)]))
                 for axis in range(3)]
 
-    def weighed_rows(self, sensor: str, noise: NoiseModel, part: Accumulator | WindowBlock | None = None):
+    def weighed_rows(self, sensor: str, noise: NoiseModel,
+                     part: Accumulator | WindowBlock | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
         Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more.
 

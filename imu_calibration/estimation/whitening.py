@@ -5,7 +5,7 @@ from typing import Sequence
 import numpy as np
 from scipy.linalg import lapack
 
-from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 
 
 class Whitening:
@@ -29,7 +29,7 @@ class Whitening:
 
     """
 
-    def __init__(self, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], processes: Sequence[BiasProcess] = (),
+    def __init__(self, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], *, processes: Sequence[BiasProcess] = (),
                  session_variance: float = 0.0):
         self._variance, self._sessions, self._session_variance = variance, sessions, session_variance
         self._filter, self._ones = None, None
@@ -139,7 +139,8 @@ def _gains_of_one(variance, decay, fresh):
     return total, (1 - variance / total)[:, None]
 
 
-def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], noise) -> np.ndarray:
+def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
+                            noise: NoiseModel) -> np.ndarray:
     """
     Return the offset of each session, shape (n_sessions, 3): the mean of its residuals, weighted, drawn towards zero by the noise of that mean.
 
@@ -150,6 +151,6 @@ def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.
     noise : NoiseModel
 
     """
-    rows = Whitening(variance, times, sessions, noise.bias_processes)(np.stack([np.ones_like(misfit), misfit], axis=2))
+    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(np.stack([np.ones_like(misfit), misfit], axis=2))
     ones, rest = np.moveaxis(rows, 2, 0)
     return np.array([(ones[index] * rest[index]).sum(axis=0) / ((ones[index]**2).sum(axis=0) + 1 / noise.session_variance) for index in sessions])

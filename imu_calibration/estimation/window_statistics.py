@@ -83,8 +83,9 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
 
     """
     motion, temperature = joined_motion(windows)
-    references = References(model, table, motion, temperature)
-    designs = {sensor: column_function(model, sensor, table, motion, temperature, references=references) for sensor in SENSORS}
+    references = References(model, table, motion, temperature_c=temperature)
+    designs = {sensor: column_function(model, sensor, table, motion=motion, temperature_c=temperature,
+                                       references=references) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
     inputs = {s: model.columns_of(s, Role.LINEAR) for s in SENSORS} if with_pieces else None
     return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session, inputs) for window, a, b in zip(windows, edges, edges[1:])]
@@ -116,7 +117,8 @@ def _reduced(window, designs, session, inputs):
         pieces = {s: pieces_at_rest(sensors[s].mean, duration) for s in SENSORS}
     elif inputs:
         rate_s = designs['gyroscope'][:, inputs['gyroscope']]
-        pieces = {s: moving_pieces(np.concatenate([designs[s], outputs[s]], axis=1), window.time, designs[s][:, inputs[s]], rate_s) for s in SENSORS}
+        pieces = {s: moving_pieces(np.concatenate([designs[s], outputs[s]], axis=1), window.time, designs[s][:, inputs[s]],
+                                   rate_s=rate_s) for s in SENSORS}
     return WindowStatistics(window.kind, float(window.time.mean()), duration, len(window.time), sensors, session, pieces)
 
 

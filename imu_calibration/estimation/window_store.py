@@ -67,7 +67,8 @@ class WindowStore:
 
 def _again(reduced, motion, temperature, model, table):
     """Return a static window's statistics with the columns taken anew."""
-    sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion, temperature).mean(axis=0), known.mean[-3:]]))
+    sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion=motion, temperature_c=temperature).mean(axis=0),
+                                                         known.mean[-3:]]))
                for name, known in reduced.sensors.items()}
     return replace(reduced, sensors=sensors, pieces={name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()})
 

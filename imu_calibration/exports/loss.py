@@ -71,12 +71,12 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, placemen
     """
     model, values = invertible_values(calibration)
     ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
-    read = {sensor: sensor_output(model, sensor, values, ref) for sensor in SENSORS}
+    read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
     without = values.copy()
     estimated = tuple(e for e in effects.values() if holding_of(e, target.estimates) and e.key in calibration.model.slices)
     for effect in estimated:
         without[model.slices[effect.key]] = effect.prior_values()
-    seen = {sensor: sensor_output(model, sensor, without, ref) for sensor in SENSORS}
+    seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     if target.whole:
         made = true   # it carries all that the full compensation asks for
@@ -100,7 +100,7 @@ def _lost(calibration, effect, holds, motion):
     model, values = invertible_values(calibration)
     holding, less = holding_of(effect, holds), values.copy()
     less[model.slices[effect.key]] = held_values(calibration, effect, holding)
-    change = [sensor_output(model, effect.sensor, v, motion.reference) for v in (values, less)]
+    change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
     return LostEffect(effect, holding is not None, _rms(change[0] - change[1]))
 
 

@@ -67,7 +67,8 @@ class LiveCompensation(SampleCompensation):
             taken = message.read(data)
         stamp_ns, readings = taken
         if self._absent:
-            readings = self._mixed(self.at_zero['gyroscope'] + self.at_zero['accelerometer'], readings)   # does not disturb the other sensor
+            readings = self._mixed(self.at_zero['gyroscope'] + self.at_zero['accelerometer'],
+                                   readings)   # does not disturb the other sensor
         if not stamp_ns:
             self.counts['zero stamp'] += 1
         corrected = self.correct(stamp_ns or sent_ns, *readings)
@@ -75,12 +76,11 @@ class LiveCompensation(SampleCompensation):
             return None
         if self._odd:
             self.counts['covariance not finite'] += 1
-        covariances = self._rate_cov, self._force_cov
-        if self._can_saturate:
-            covariances = self._marked(readings)
+        rate_cov, force_cov = self._marked(readings) if self._can_saturate else (self._rate_cov, self._force_cov)
         if self._absent:
             corrected = self._mixed(taken[1], corrected)
-        return message.rewritten(data, stamp_ns, corrected, *covariances, None if self.transfer is None else self._orientation(data))
+        orientation = None if self.transfer is None else self._orientation(data)
+        return message.rewritten(data, stamp_ns, corrected, rate_cov=rate_cov, force_cov=force_cov, orientation=orientation)
 
     def _open(self, data):
         """Return whether a message with a new head can be corrected."""

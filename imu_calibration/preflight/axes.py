@@ -12,9 +12,10 @@ POOR = 0.6
 TIE = 0.05
 
 
-def signed_permutations():
+def signed_permutations() -> np.ndarray:
     """Return the 48 matrices that exchange axes and signs, the identity first, then those with few changes; shape (48, 3, 3)."""
-    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in product((1.0, -1.0),
+                                                                                                                        repeat=3)]
     return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
 
 
@@ -34,11 +35,11 @@ class AxisMatch:
     """Whether a reflection explains it; with few turns both may."""
 
     @property
-    def wrong(self):
+    def wrong(self) -> bool:
         """Return whether the axes are not those of the reference."""
         return self.as_they_are < POOR
 
-    def exchanges(self, seen=np.eye(3)):
+    def exchanges(self, seen: np.ndarray = np.eye(3)) -> list[tuple[int, int, float]]:
         """Return (measured axis, reference axis, sign) of what is not as it should be, for the reference axes that were seen."""
         found = []
         for j in np.flatnonzero(np.diag(seen) > 0.5):
@@ -48,7 +49,7 @@ class AxisMatch:
         return sorted(found)
 
 
-def match_axes(matrix, seen=np.eye(3)):
+def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
     """
     Return the `AxisMatch` of ``measured = matrix @ reference``.
 

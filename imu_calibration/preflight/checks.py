@@ -4,14 +4,18 @@ What is wrong with a recording before anything is estimated from it.
 `CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects; adding one is adding an entry.
 """
 
+
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
 from imu_calibration.preflight import stamp_checks, value_checks
 from imu_calibration.preflight.evidence import EvidenceGatherer
-from imu_calibration.preflight.finding import REFUSE, WARNING
+from imu_calibration.preflight.finding import REFUSE, WARNING, CheckFinding
+from imu_calibration.segmentation.block_cleaning import BlockCleaner, CleanedBlock
+from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
 CHECKS = (
-    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.full_scale, value_checks.handedness,
+    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.full_scale,
+    value_checks.handedness,
     value_checks.gravity, value_checks.clipping, value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
     stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )
@@ -31,16 +35,18 @@ class Preflight:
 
     """
 
-    def __init__(self, gravity=None, *, strict=True):
+    def __init__(self, gravity: float | None = None, *, strict: bool = True):
         self._gatherer, self._strict = EvidenceGatherer(STANDARD_GRAVITY if gravity is None else gravity), strict
-        self.findings, self.streams, self.lost = (), None, {}
+        self.findings: tuple[CheckFinding, ...] = ()
+        self.streams: dict[str, StreamStatistics] = {}
+        self.lost: dict[str, int] = {}
         """What was found; name -> StreamStatistics; reason -> messages that could not be read: all of them after `finish`."""
 
-    def push(self, cleaned):
+    def push(self, cleaned: CleanedBlock) -> None:
         """Take a CleanedBlock."""
         self._gatherer.push(cleaned)
 
-    def finish(self, cleaner):
+    def finish(self, cleaner: BlockCleaner) -> None:
         """
         Check what was seen of the streams that the BlockCleaner cleaned.
 
@@ -57,18 +63,18 @@ class Preflight:
             refuse(self.findings)
 
 
-def refuse(findings):
+def refuse(findings: tuple[CheckFinding, ...]) -> None:
     """Raise the first finding that makes the result wrong as an InputError."""
     for finding in findings:
         if finding.severity == REFUSE:
             raise InputError(finding.text, key=finding.key)
 
 
-def warnings(findings):
+def warnings(findings: tuple[CheckFinding, ...]) -> list[CheckFinding]:
     """Return the findings that a user must see."""
     return [finding for finding in findings if finding.severity in (REFUSE, WARNING)]
 
 
-def unusable(findings):
+def unusable(findings: tuple[CheckFinding, ...]) -> int:
     """Return how many samples are unusable for reasons that no other count holds."""
     return sum(finding.samples for finding in findings)

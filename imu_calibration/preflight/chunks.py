@@ -33,7 +33,7 @@ class Chunks:
     first_ns: int = 0
     """Stamp of the first sample, where `time` is zero."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.time)
 
 
@@ -50,15 +50,16 @@ class ChunkSeries:
 
     """
 
-    def __init__(self, chunk_time=CHUNK_TIME, capacity=CAPACITY):
+    def __init__(self, chunk_time: float = CHUNK_TIME, capacity: int = CAPACITY):
         self.size, self._chunk_time, self._capacity = None, chunk_time, capacity
         self.n_samples = 0
         self.n_changed = np.zeros(6, np.int64)
         self.n_repeated = 0
-        self._rest, self._first_ns, self._last = None, None, None
+        self._rest: tuple[np.ndarray, np.ndarray] | None = None
+        self._first_ns, self._last = None, None
         self._parts, self._n_chunks = [], 0
 
-    def push(self, stamp_ns, columns):
+    def push(self, stamp_ns: np.ndarray, columns: np.ndarray) -> None:
         """Take clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
         self._count_changes(columns)
         if self._rest is not None:
@@ -69,13 +70,14 @@ class ChunkSeries:
         if self.size is not None:
             self._cut()
 
-    def chunks(self):
+    def chunks(self) -> Chunks:
         """Return the Chunks until now."""
         if self.size is None and self._rest is not None and len(self._rest[0]) > LEAST:
             self.size = _size(self._rest[0], self._chunk_time)
             self._cut()
         parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
-        return Chunks(*(np.concatenate(column) for column in zip(*parts, strict=True)), self.size or LEAST, int(self._first_ns or 0))
+        time, duration, mean, sd, extent = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Chunks(time, duration, mean, sd, extent, self.size or LEAST, int(self._first_ns or 0))
 
     def _count_changes(self, columns):
         if self._last is not None:
@@ -97,7 +99,8 @@ class ChunkSeries:
             return
         if self._first_ns is None:
             self._first_ns = stamp_ns[0]
-        self._parts.append(_describe(((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size), columns[:, :used].reshape(6, n, self.size)))
+        self._parts.append(_describe(((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size),
+                                     columns[:, :used].reshape(6, n, self.size)))
         self._n_chunks += n
 
 

@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.preflight.extremes import Extremes
 from imu_calibration.preflight.full_scale import factor_between_rests
-from imu_calibration.preflight.rest import find_rest
-from imu_calibration.preflight.turning import relate_turns
-from imu_calibration.segmentation.block_cleaning import STREAMS
+from imu_calibration.preflight.rest import Rest, find_rest
+from imu_calibration.preflight.turning import Turning, relate_turns
+from imu_calibration.segmentation.block_cleaning import STREAMS, CleanedBlock
 from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
 IRREGULAR = 0.1
@@ -33,7 +34,7 @@ class Stream:
     """Share of the steps that are off the usual one by more than a tenth."""
 
     @property
-    def real_rate(self):
+    def real_rate(self) -> float:
         """Samples per second of the time that no gap takes, 0 when unknown."""
         s = self.statistics
         time = s.duration - s.gap_total + s.n_gaps * s.period
@@ -64,29 +65,29 @@ class RecordingEvidence:
     """Local gravity, m/s^2."""
 
     @cached_property
-    def rest(self):
+    def rest(self) -> Rest | None:
         """What was read while steady, or None."""
         return find_rest(self.chunks)
 
     @cached_property
-    def turning(self):
+    def turning(self) -> Turning | None:
         """How gravity turns against the rates, or None."""
         return relate_turns(self.chunks)
 
     @cached_property
-    def rate_factor(self):
+    def rate_factor(self) -> float | None:
         """Measured rates over those that carry gravity from rest to rest, or None."""
         return factor_between_rests(self.chunks, self.rest)
 
     @cached_property
-    def quiet_range(self):
+    def quiet_range(self) -> np.ndarray:
         """Largest minus smallest reading in a quiet chunk, shape (6,)."""
         if self.rest is not None:
             return self.rest.range
         return np.quantile(self.chunks.range, 0.1, axis=0) if len(self.chunks) else np.zeros(6)
 
     @cached_property
-    def length(self):
+    def length(self) -> Any:
         """Gravity as the accelerometer reads it, or None without samples."""
         if self.rest is not None:
             return self.rest.length
@@ -96,13 +97,14 @@ class RecordingEvidence:
 class EvidenceGatherer:
     """Takes cleaned blocks and gives the `RecordingEvidence`."""
 
-    def __init__(self, gravity):
+    def __init__(self, gravity: float):
         self.gravity = gravity
         self._steps = {name: _Steps() for name in STREAMS}
         self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
-        self._resolution, self._temperature_c = np.full(6, np.inf), None
+        self._resolution = np.full(6, np.inf)
+        self._temperature_c: tuple[float, float] | None = None
 
-    def push(self, cleaned):
+    def push(self, cleaned: CleanedBlock) -> None:
         """Take a CleanedBlock."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
@@ -113,12 +115,13 @@ class EvidenceGatherer:
             low, high = self._temperature_c or (np.inf, -np.inf)
             self._temperature_c = (min(low, float(temperature.temperature_c.min())), max(high, float(temperature.temperature_c.max())))
 
-    def evidence(self, statistics):
+    def evidence(self, statistics: dict[str, StreamStatistics]) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
         streams = {name: Stream(statistics[name], *steps.summary()) for name, steps in self._steps.items() if steps.first_ns is not None}
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
-        return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends, self._temperature_c, self.gravity)
+        return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends,
+                                 self._temperature_c, self.gravity)
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])

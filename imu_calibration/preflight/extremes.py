@@ -17,11 +17,11 @@ PILE = 5.0
 class Extremes:
     """The largest distinct values of one signal with their counts, in bounded memory."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.level, self.count, self.n_jumps = -np.inf, 0, 0
         self._below, self._last = {}, np.inf
 
-    def push(self, values):
+    def push(self, values: np.ndarray) -> None:
         """Take values, shape (n,)."""
         before, self._last = self._last, values[-1]
         largest = values.max()
@@ -45,12 +45,12 @@ class Extremes:
         self._below = dict(sorted(self._below.items(), reverse=True)[:KEPT])
 
     @property
-    def jumped(self):
+    def jumped(self) -> bool:
         """Whether the pile was entered from far below time and again, as no rounded reading of a constant does."""
         return self.n_jumps >= LEAST_CLIPPED
 
     @property
-    def n_clipped(self):
+    def n_clipped(self) -> int:
         """Samples at the largest value when they are a pile, else 0."""
         counts = [count for value, count in self._below.items() if value > NEAR * self.level][:10]
         usual = sum(counts) / len(counts) if counts else 1.0

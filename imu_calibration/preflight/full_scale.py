@@ -5,6 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.preflight.chunks import Chunks
+from imu_calibration.preflight.rest import Rest
+
 FAR = 0.25
 """Rms angle by which gravity misses the direction after a turn, rad, from which on factors are tried at all: scales off by a tenth leave less."""
 BETTER = 0.3
@@ -44,7 +47,7 @@ def nearest_power(factor: float) -> float:
     return float(power if abs(factor / power - 1) < NEAR_POWER else factor)
 
 
-def factor_between_rests(chunks, rest) -> float | None:
+def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     """
     Return the `believed_factor` of a recording in chunks, or None when too few turns lie between rests.
 

@@ -1,14 +1,18 @@
 """Checks against the table: whether the IMU is on it, units, signs and order of the axes, from the windows that calibration gathered anyway."""
 
+from typing import Any, Protocol
+
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
 from imu_calibration.preflight.on_table import same_motion
+from imu_calibration.reference.table import Table
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power say nothing."""
@@ -16,16 +20,29 @@ RELATED = 0.5
 """Smallest squared correlation from which on factors and axes are looked at."""
 LEAST_RATE = 0.02
 """Rms of the reference's rates below which they say nothing, rad/s."""
-WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'), 'gyroscope': ('angular rates', 'the rates of the joints')}
+WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
+         'gyroscope': ('angular rates', 'the rates of the joints')}
 
 
-def against_joints(gathered, model, table=None):
+class Reduced(Protocol):
+    """What a recording was reduced to: `calibration.gathered.Gathered`."""
+
+    @property
+    def accumulator(self) -> Any:
+        """The `estimation.accumulator.Accumulator` of its windows."""
+
+    @property
+    def kept(self) -> list:
+        """Some windows with their samples."""
+
+
+def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = None) -> tuple[CheckFinding, ...]:
     """
     Return the findings about measured rates and forces beside those that the joints imply.
 
     Parameters
     ----------
-    gathered : Gathered
+    gathered : Reduced
         Windows of a recording.
     model : SensorModel
         Defines the columns.
@@ -83,13 +100,16 @@ def _rate_units(moments):
     if not ratio > 0:
         return
     if 40 < ratio < 80:
-        yield CheckFinding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
                       'convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578', key='nominal')
     elif 1 / 80 < ratio < 1 / 40:
-        yield CheckFinding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
                       'degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
-        yield CheckFinding('rate_unit', REFUSE, f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
                       'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
 
 
@@ -103,7 +123,8 @@ def _axes(sensor, moments, table):
     if not match.wrong:
         return
     what, whose = WORDS[sensor]
-    yield CheckFinding('handedness', REFUSE, f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
+    yield CheckFinding('handedness', REFUSE,
+                       f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
 
 
 def _exchange(match, seen, whose):
@@ -133,7 +154,7 @@ def _mount_rpy_deg(matrix, table):
     return np.degrees([np.arctan2(mat_ls[2, 1], mat_ls[2, 2]), pitch, np.arctan2(mat_ls[1, 0], mat_ls[0, 0])]) + 0.0
 
 
-def check_units(gathered, model, table=None):
+def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:
     """
     Refuse recordings whose units are plainly not SI, or whose axes are not those of the table.
 
@@ -153,7 +174,7 @@ def check_units(gathered, model, table=None):
     refuse(against_joints(gathered, model, table))
 
 
-def check_force(length):
+def check_force(length: float) -> None:
     """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
     if 0.8 < length < 1.25:
         raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '

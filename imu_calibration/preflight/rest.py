@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.preflight.chunks import Chunks
+
 LEAST_CHUNKS = 4
 STILL = 0.02
 """Largest turn of the measured gravity from one chunk to the next, rad."""
@@ -28,12 +30,12 @@ class Rest:
     """First chunk of each stretch and the one after its last, shape (n_stretches, 2)."""
 
     @property
-    def norm(self):
+    def norm(self) -> np.ndarray:
         """Length of the specific force in each stretch, shape (n_stretches,)."""
         return np.linalg.norm(self.force, axis=1)
 
     @property
-    def sphere(self):
+    def sphere(self) -> tuple[np.ndarray, float] | None:
         """Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None."""
         if len(self.force) < LEAST_POSES:
             return None
@@ -48,12 +50,12 @@ class Rest:
         return centre * np.median(self.norm), float(np.sqrt(rest + centre @ centre) * np.median(self.norm))
 
     @property
-    def length(self):
+    def length(self) -> float:
         """Gravity as the accelerometer reads it: the radius of the sphere, else the median length."""
         return float(np.median(self.norm)) if self.sphere is None else self.sphere[1]
 
 
-def find_rest(chunks):
+def find_rest(chunks: Chunks) -> Rest | None:
     """Return the `Rest` of Chunks, or None when the sensor never rests (see `still_chunks`)."""
     still = still_chunks(chunks)
     if still.sum() < LEAST_CHUNKS:
@@ -63,7 +65,7 @@ def find_rest(chunks):
     return Rest(force, np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0), runs)
 
 
-def still_chunks(chunks):
+def still_chunks(chunks: Chunks) -> np.ndarray:
     """
     Return in which chunks the sensor is at rest, bool, shape (n,).
 

@@ -1,5 +1,8 @@
 """Checks of the stamps: what was dropped, gaps, rates, clocks."""
 
+from collections.abc import Iterator
+
+from imu_calibration.preflight.evidence import RecordingEvidence
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
 from imu_calibration.segmentation.block_cleaning import MESSAGES as NAMES
 from imu_calibration.segmentation.stamping import IRREGULAR
@@ -21,7 +24,7 @@ RATE_SHARE = 0.02
 IRREGULAR_SHARE = 0.05
 
 
-def stamps(evidence):
+def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sample has a stamp of its own, later than the one before, and finite readings."""
     clean = []
     for name, stream in evidence.streams.items():
@@ -29,11 +32,13 @@ def stamps(evidence):
         total = found.count + sum(count for reason, count in found.dropped.items() if reason != 'clock reset')
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
-            yield CheckFinding('stamps', REFUSE, f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
+            yield CheckFinding('stamps', REFUSE,
+                               f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
                           f'({reasons}); correct the driver and record again')
             continue
         if found.unstamped:
-            yield CheckFinding('stamps', WARNING, f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero, the driver sets none: the time of arrival '
+            yield CheckFinding('stamps', WARNING,
+                               f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero, the driver sets none: the time of arrival '
                                'is taken; let the driver stamp each sample when it is measured')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
@@ -53,37 +58,40 @@ def _times(count):
     return 'once' if count == 1 else f'{count} times'
 
 
-def gaps(evidence):
+def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Nothing is missing within the streams."""
     for name in FAST:
         if name in evidence.streams:
             found = evidence.streams[name].statistics
             if found.n_gaps:
                 severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
-                yield CheckFinding('gaps', severity, f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
+                yield CheckFinding('gaps', severity,
+                                   f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
                               f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
-def sampling(evidence):
+def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The samples per second are those that the step between stamps promises."""
     for name in FAST:
         if name in evidence.streams:
             stream = evidence.streams[name]
             nominal, real = stream.statistics.rate, stream.real_rate
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
-                yield CheckFinding('sampling', WARNING, f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
+                yield CheckFinding('sampling', WARNING,
+                                   f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
                               'samples were lost, or stamps are made when messages arrive; look at the driver and at the load of the recorder')
             elif nominal:
                 yield CheckFinding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
 
-def jitter(evidence):
+def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Samples are evenly spaced, and stamps finer than their spacing."""
     for name in FAST:
         if name in evidence.streams:
             stream = evidence.streams[name]
             if (line := stream.statistics.stamping) is not None:
-                yield CheckFinding('jitter', WARNING if line.word == IRREGULAR else NOTE, f"{NAMES[name]}: {line}; stamps by the sensor's own clock "
+                yield CheckFinding('jitter', WARNING if line.word == IRREGULAR else NOTE,
+                                   f"{NAMES[name]}: {line}; stamps by the sensor's own clock "
                                    'would be better')
             period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
             whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0 and step_ns < 0.5e9 * period
@@ -95,7 +103,7 @@ def jitter(evidence):
             yield CheckFinding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
 
 
-def clocks(evidence):
+def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """IMU and joints are stamped by one clock."""
     if not {'imu', 'joints'} <= evidence.streams.keys():
         return
@@ -109,5 +117,6 @@ def clocks(evidence):
         yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
                       f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on one computer')
     elif overlap < 0.9 * shorter:
-        yield CheckFinding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
+        yield CheckFinding('clocks', WARNING,
+                           f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
                       f'{"after" if late > 0 else "before"} the Imu: only what overlaps is used; are both stamped by one clock?')

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
+from imu_calibration.samples import SampleBlock
 from imu_calibration.segmentation.block_cleaning import MESSAGES
 from imu_calibration.segmentation.stamping import IRREGULAR, StampLine
 from imu_calibration.segmentation.window_cutter import dropped
@@ -59,26 +61,30 @@ class StreamWatch:
 
     """
 
-    def __init__(self, joints=True, temperature=False):
+    def __init__(self, joints: bool = True, temperature: bool = False):
         self._needed = {'imu': SILENT_AFTER} | ({'joints': SILENT_AFTER} if joints else {}) | ({'temperature': COLD_AFTER} if temperature else {})
         self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
         self._newest = {}
         self._arrived = {}
         self._period = {}
-        self._lost, self._lost_at, self._recent, self._apart_since = {}, None, {}, None
-        self._stamping, self._unstamped_at, self._notes = None, None, {}
+        self._lost, self._recent = {}, {}
+        self._lost_at: float | None = None
+        self._apart_since: float | None = None
+        self._stamping: Any = None
+        self._unstamped_at: float | None = None
+        self._notes: dict[str, int] = {}
 
     @property
-    def last_arrival(self):
+    def last_arrival(self) -> float | None:
         """When the last message came, s of the clock given to `note`; None before the first."""
         return max(self._arrived.values(), default=None)
 
     @property
-    def n_imu(self):
+    def n_imu(self) -> int:
         """Imu samples so far."""
         return self._count['imu']
 
-    def note(self, block, now):
+    def note(self, block: SampleBlock, now: float) -> None:
         """Take a SampleBlock that arrived at `now`, s of a steady clock."""
         for reason, count in (block.notes or {}).items():
             self._notes[reason], self._unstamped_at = self._notes.get(reason, 0) + count, now
@@ -92,7 +98,7 @@ class StreamWatch:
             self._count[name] += len(samples)
             self._newest[name], self._arrived[name] = last, now
 
-    def note_counts(self, counts, now):
+    def note_counts(self, counts: dict[str, int], now: float) -> None:
         """Take the counts of what became of the samples."""
         lost = dropped(counts)
         grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
@@ -100,7 +106,7 @@ class StreamWatch:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
-    def note_stamping(self, line):
+    def note_stamping(self, line: StampLine) -> None:
         """Take how the stamps of the IMU are (a StampLine), or None."""
         self._stamping = line
 
@@ -112,17 +118,17 @@ class StreamWatch:
         self._apart_since = now if self._apart_since is None else self._apart_since
         return now - self._apart_since
 
-    def state(self, now):
+    def state(self, now: float) -> StreamState:
         """Return the StreamState at `now`."""
-        values = {f'{name} messages': count for name, count in self._count.items()}
+        values: dict[str, Any] = {f'{name} messages': count for name, count in self._count.items()}
         values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
         values |= self._notes | ({'imu stamps': str(self._stamping)} if self._stamping else {})
         silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
         coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
         unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
-        return StreamState(*self._word(silent, now), values, silent, coming, {name: what for name, what in unusable.items() if what},
-                           self._stamping)
+        word, text = self._word(silent, now)
+        return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, self._stamping)
 
     def _recently(self, now, beginning=''):
         """Return what was dropped lately, of the reasons with that beginning; '' for nothing."""

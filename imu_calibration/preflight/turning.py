@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.preflight.chunks import Chunks
 from imu_calibration.reference.reference_motion import skew
 
 LARGEST_TURN = 0.7
@@ -31,12 +32,12 @@ class Turning:
     """Share of gravity's turns that it explains."""
 
     @property
-    def factor(self):
+    def factor(self) -> float:
         """True rate over measured rate: 1, or pi / 180 for deg/s."""
         return float(np.median(np.linalg.norm(self.matrix[:, self.seen], axis=0)))
 
 
-def relate_turns(chunks):
+def relate_turns(chunks: Chunks) -> Turning | None:
     """
     Return the `Turning` of Chunks, or None when gravity turns too little, or otherwise than any rates explain.
 

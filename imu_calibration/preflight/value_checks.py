@@ -1,9 +1,12 @@
 """Checks of the readings: units, axes, frozen and clipping outputs, gravity, resolution, temperature."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.axes import CLEAR, match_axes
+from imu_calibration.preflight.evidence import RecordingEvidence
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
 from imu_calibration.preflight.full_scale import FACTORS, nearest_power
 from imu_calibration.units import significant
@@ -29,7 +32,7 @@ ROUNDING = 1e-6
 """m/s^2, rad/s; no converter is that fine."""
 
 
-def force_unit(evidence):
+def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Specific force is in m/s^2."""
     length = evidence.length
     if length is None:
@@ -51,7 +54,7 @@ def _unit(check, text):
     return CheckFinding(check, REFUSE, text, key='nominal')
 
 
-def rate_unit(evidence):
+def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by what the rates add up to."""
     turning = evidence.turning
     largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
@@ -60,7 +63,8 @@ def rate_unit(evidence):
         ratio = 1.0 / turning.factor
         came = f'angular rates must be in rad/s, they are {significant(ratio)} times what turns the measured gravity: '
         if 0.6 < ratio * DEG < 1.6:
-            yield _unit('rate_unit', f'{came}they look like deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
+            yield _unit('rate_unit',
+                        f'{came}they look like deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
         elif 0.6 < ratio / DEG < 1.6:
             yield _unit('rate_unit', f'{came}they look as if converted from deg/s twice; convert once, or give a nominal scaling with '
                                      'gyroscope_scale 0.01745329')
@@ -76,17 +80,19 @@ def rate_unit(evidence):
                                  f'convert them in the driver or {scaling}')
 
 
-def full_scale(evidence):
+def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The driver converts for the full-scale range that is set: gravity goes from rest to rest as the rates add up."""
     factor = _full_scale(evidence)
     if factor is None:
         return
     came = f'angular rates are {factor:.3g} times those that turn gravity from one rest to the next'
     if abs(np.log2(factor)) % 1 == 0:
-        yield CheckFinding('full_scale', WARNING, f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
+        yield CheckFinding('full_scale', WARNING,
+                           f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
                       'setting (a calibration takes the factor up into the matrix, and is wrong once the setting is right)')
     else:
-        yield CheckFinding('full_scale', WARNING, f'{came}: the scale of the driver is far off; correct it, or check that the IMU rested where it seems to')
+        yield CheckFinding('full_scale', WARNING,
+                           f'{came}: the scale of the driver is far off; correct it, or check that the IMU rested where it seems to')
 
 
 def _full_scale(evidence):
@@ -98,7 +104,7 @@ def _full_scale(evidence):
     return factor if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1] else None
 
 
-def handedness(evidence):
+def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Accelerometer and gyroscope have the same axes: gravity turns the way the rates turn."""
     turning = evidence.turning
     if turning is None:
@@ -109,16 +115,18 @@ def handedness(evidence):
         if turning.seen.all():
             yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
         return
-    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j, sign in match.exchanges(seen))
+    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j,
+                     sign in match.exchanges(seen))
     if not what or match.agreement < CLEAR:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
     kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, the recording cannot tell')
-    yield CheckFinding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
+    yield CheckFinding('handedness', REFUSE,
+                       'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
                   f'{what} ({kind}); correct signs and order of the axes in the driver')
 
 
-def frozen(evidence):
+def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output stands still while its neighbours move."""
     chunks, range_ = evidence.chunks, evidence.chunks.range
     if not len(chunks):
@@ -127,12 +135,14 @@ def frozen(evidence):
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
-            yield CheckFinding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
+            yield CheckFinding('frozen', REFUSE,
+                               f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
                           'look at the sensor and its driver')
             continue
         for axis in np.flatnonzero(constant):
             if noisy.any():
-                yield CheckFinding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
+                yield CheckFinding('frozen', REFUSE,
+                                   f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
                               'look at the sensor and its driver')
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
@@ -140,7 +150,8 @@ def frozen(evidence):
             stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
-                yield CheckFinding('frozen', WARNING, f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
+                yield CheckFinding('frozen', WARNING,
+                                   f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
                               'and leave that time out', samples=int(stuck.sum() * chunks.size))
 
 
@@ -157,7 +168,7 @@ def _in_long_runs(flags):
     return kept
 
 
-def clipping(evidence):
+def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output piles up at the end of its range."""
     for sensor, part, unit in CHANNELS:
         fine = evidence.quiet_range[part] > FINE * evidence.resolution[part]
@@ -172,11 +183,12 @@ def clipping(evidence):
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
         if words:
             people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
-            yield CheckFinding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
+            yield CheckFinding('clipping', WARNING,
+                               f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
                           'what is beyond is lost, move less or choose a wider range', samples=total)
 
 
-def gravity(evidence):
+def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The accelerometer reads local gravity within 2 per cent."""
     rest = evidence.rest
     if rest is None or not 3.0 < evidence.length < 30.0:
@@ -188,21 +200,23 @@ def gravity(evidence):
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
-        yield CheckFinding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
+        yield CheckFinding('gravity', WARNING,
+                           f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
                       f'{100 * off:+.1f} %: scale or bias is far off, or the gravity given is that of another place')
     else:
         yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 
 
-def repeated_readings(evidence):
+def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
     share = evidence.n_repeated / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
-        yield CheckFinding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
+        yield CheckFinding('repeated_readings', WARNING,
+                           f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
                       'the sensor measures, and noise is underestimated; publish each measurement once')
 
 
-def resolution(evidence):
+def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The step of the converter is finer than the noise."""
     if evidence.rest is None:
         return
@@ -213,18 +227,20 @@ def resolution(evidence):
         if coarse.any():
             size = step[coarse].max()
             people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
-            yield CheckFinding('resolution', NOTE, f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
+            yield CheckFinding('resolution', NOTE,
+                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
                           'are rounded too')
 
 
-def temperature(evidence):
+def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Temperatures are in degrees Celsius."""
     if evidence.temperature_c is None:
         return
     low, high = evidence.temperature_c
     if low < -80 or high > 180:
         kelvin = ': kelvin?' if 200 < low and high < 450 else ''
-        yield CheckFinding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
+        yield CheckFinding('temperature', WARNING,
+                           f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
     else:
         yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
 

@@ -40,10 +40,10 @@ def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     words = {2: 'two', 3: 'three'}[count]
     if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
         raise InputError(f'table: {what} must be {words} numbers, got {value!r}; correct it')
-    return tuple(finite_number(item, what, None, None, f'give {words} numbers') for item in value)
+    return tuple(finite_number(item, what, None, high=None, advice=f'give {words} numbers') for item in value)
 
 
-def finite_number(value: Any, what: str, low: float | None, high: float | None, advice: str) -> float:
+def finite_number(value: Any, what: str, low: float | None, *, high: float | None, advice: str) -> float:
     """Return one finite number within [low, high], which default to what any number of a table can be."""
     low, high = -LARGEST if low is None else low, LARGEST if high is None else high
     # YAML 1.1 reads 1e-5, without a point, as text.

@@ -13,7 +13,7 @@ _SOMIGLIANA = 0.00193185265241
 _ROTATION_RATIO = 0.00344978650684  # m = omega^2 a^2 b / GM
 
 
-def normal_gravity(latitude_deg, height=0.0):
+def normal_gravity(latitude_deg: float, height: float = 0.0) -> float:
     """
     Return the normal gravity of the WGS 84 ellipsoid, m/s^2.
 
@@ -35,7 +35,7 @@ def normal_gravity(latitude_deg, height=0.0):
     return value if np.ndim(value) else float(value)
 
 
-def earth_rate_n(latitude_deg, azimuth_deg):
+def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:
     """
     Return the Earth's rate in the level frame n, rad/s, shape (3,).
 

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.reference.joint_motion import JointMotion
 
-def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):
+
+def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray) -> JointMotion:
     """
     Return the true motion behind encoders with a harmonic error, ``q_true = q + c cos(k q) + s sin(k q)``.
 
@@ -21,7 +23,8 @@ def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):
         Amplitudes c and s, rad.
 
     """
-    cos_amplitude, sin_amplitude = (np.broadcast_to(np.asarray(a, float), motion.position.shape[1:]) for a in (cos_amplitude, sin_amplitude))
+    cos_amplitude, sin_amplitude = (np.broadcast_to(np.asarray(a, float), motion.position.shape[1:]) for a in (cos_amplitude,
+                                                                                                               sin_amplitude))
     wrong = np.flatnonzero((cos_amplitude != 0) | (sin_amplitude != 0))
     if not len(wrong):
         return motion
@@ -38,7 +41,7 @@ def with_encoder_harmonics(motion, order, cos_amplitude, sin_amplitude):
     return replace(motion, **moved)
 
 
-def encoder_step(position):
+def encoder_step(position: np.ndarray) -> float:
     """
     Return the resolution of an encoder that shows in its readings, or 0.
 

@@ -159,8 +159,10 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
     what = f"of joint '{item.get('name')}'"
     range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])
     unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
-    ends = (None, None) if item.get(range_key) is None else (unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
-    return JointLimits(*ends, *(None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, None, 'give a number')
+    ends = (None,
+            None) if item.get(range_key) is None else (unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
+    return JointLimits(*ends, *(None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, high=None,
+                                                                                        advice='give a number')
                                 for key in others))
 
 
@@ -176,7 +178,7 @@ def _require_limits(limits: JointLimits, what: str) -> None:
 
 def _mimic(item: Any, name: str) -> Mimic:
     require_keys(item, ('joint', 'multiplier', 'offset'), f"mimic of joint '{name}'")
-    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'", None, None, 'give a number')
+    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'", None, high=None, advice='give a number')
                for key in ('multiplier', 'offset') if item.get(key) is not None}
     if not isinstance(item.get('joint'), str):
         raise InputError(f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME")

@@ -31,7 +31,7 @@ class JointCurve:
     bandwidth: np.ndarray
     """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint that stands still."""
 
-    def at(self, time, derivatives=3):
+    def at(self, time: np.ndarray, derivatives: int = 3) -> JointMotion:
         """
         Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than three of their periods.
 
@@ -39,14 +39,16 @@ class JointCurve:
         """
         time = np.asarray(time, float)
         values = np.zeros((4, len(time), self.pieces.shape[2]))
-        values[:derivatives + 1] = evaluate_pieces(self.knots, self.pieces, time, derivatives)
+        values[:derivatives + 1] = evaluate_pieces(self.knots, self.pieces, time, derivatives=derivatives)
         outside = (time < self.knots.start) | (time > self.knots.start + self.knots.step * self.knots.n_intervals)
         if outside.any():
             values[:, outside] = np.nan
         return JointMotion(time, *values)
 
 
-def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=JointSettings()):
+def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None, *,
+                    noise_sd: np.ndarray | float | None = None,
+                    settings: JointSettings = JointSettings()) -> JointCurve:
     """
     Return the smooth curve behind readings of the joints.
 
@@ -91,11 +93,12 @@ def fit_joint_curve(time, position, velocity=None, noise_sd=None, settings=Joint
     moving = np.flatnonzero(~still)
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = JointRows(knots, time)
-        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], settings.robustness)
+        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=settings.robustness)
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:
-                trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity[:, joint], trend.column(joint), settings)
+                trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint],
+                                                        trend=trend.column(joint), settings=settings)
             coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)

@@ -5,6 +5,8 @@ from math import factorial
 
 import numpy as np
 
+from imu_calibration.reference.joint_motion import JointMotion
+
 LINKED = 0.1
 """Between stamps further apart than this nothing is interpolated, s: other windows, other rests."""
 
@@ -12,7 +14,7 @@ BLOCK = 4096
 """Rows that are worked on at once, so that they stay in the processor's cache."""
 
 
-def shifted(motion, delay):
+def shifted(motion: JointMotion, delay: float) -> JointMotion:
     """
     Return the motion at ``time - delay``, with `time` left as it is: what the IMU felt when its stamps are `delay` late.
 

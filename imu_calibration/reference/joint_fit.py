@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import vstack
 
-from imu_calibration.reference.quintic_spline import design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
-from imu_calibration.reference.smoothing import PenalisedSpline, smooth
+from imu_calibration.reference.quintic_spline import Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
+from imu_calibration.reference.smoothing import PenalisedSpline, Smooth, smooth
 from imu_calibration.settings import setting
 
 
 class JointRows:
     """Rows of the design at the stamps, for positions and velocities."""
 
-    def __init__(self, knots, time):
+    def __init__(self, knots: Knots, time: np.ndarray):
         self.knots, self.time = knots, time
         self._position = self._make(0)
 
@@ -23,28 +23,29 @@ class JointRows:
             values = values * weight
         return design_matrix(self.knots, interval, values), normal_bands(self.knots, interval, values)
 
-    def positions(self):
+    def positions(self) -> PenalisedSpline:
         """Return the least squares of positions alone."""
         return PenalisedSpline(*self._position)
 
-    def both(self, weight):
+    def both(self, weight: np.ndarray) -> PenalisedSpline:
         """Return the least squares of positions, and below them velocities times `weight`."""
         design, bands = self._make(1, weight)
         return PenalisedSpline(vstack([self._position[0], design], format='csr'), self._position[1] + bands, n_kinds=2)
 
 
-def fit_with_velocity(rows, fit, position, velocity, trend, settings):
+def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend',
+                      settings: 'JointSettings') -> tuple[bool, Smooth]:
     """Return whether the velocities agree with the fit to the positions, and a fit to both when it is better for them."""
     pieces = piece_coefficients(fit.coefficients[:, None])
     trend.add_to(pieces, rows.knots)
-    _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, 2)[:, :, 0]
-    trusted, velocity_sd = check_velocity(velocity, rate, acceleration, fit.dof, settings)
+    _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
+    trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof, settings=settings)
     # What velocities add at the edge of the band, against the positions.
     if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
         return trusted, fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
     rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
-    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], settings.robustness)
+    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=settings.robustness)
     return trusted, better
 
 
@@ -58,7 +59,7 @@ class Trend:
     """Coefficients of the powers of time, shape (3, n_joints)."""
 
     @classmethod
-    def through(cls, time, position, still):
+    def through(cls, time: np.ndarray, position: np.ndarray, still: np.ndarray) -> 'Trend':
         """Return those of least squares (of lower degree for few stamps); constants for joints that are `still`."""
         centre = 0.5 * (time[0] + time[-1])
         degree = min(2, len(np.unique(time)) - 1)
@@ -69,18 +70,18 @@ class Trend:
         factors[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
         return cls(centre, factors)
 
-    def column(self, joint):
+    def column(self, joint: int) -> 'Trend':
         """Return the parabola of one joint."""
         return Trend(self.centre, self.factors[:, joint:joint + 1])
 
-    def at(self, time, derivative=0):
+    def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Return values or rates, shape (n, n_joints)."""
         time = (time - self.centre)[:, None]
         if derivative:
             return self.factors[1] + 2 * time * self.factors[2]
         return self.factors[0] + time * (self.factors[1] + time * self.factors[2])
 
-    def add_to(self, pieces, knots):
+    def add_to(self, pieces: np.ndarray, knots: Knots) -> None:
         """Add the parabolas to the polynomials between the knots, in place."""
         starts = knots.start + knots.step * np.arange(knots.n_intervals)
         pieces[0] += self.at(starts)
@@ -100,7 +101,8 @@ class JointSettings:
                                   'too large: late velocities look like a time offset of the IMU')
 
 
-def check_velocity(velocity, rate, acceleration, dof, settings):
+def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float,
+                   settings: JointSettings) -> tuple[bool, float]:
     """
     Compare a joint's velocities with those of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
 

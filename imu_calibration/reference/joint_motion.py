@@ -20,9 +20,9 @@ class JointMotion:
     jerk: np.ndarray
     """Third derivative, rad/s^3, shape (n, n_joints)."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.time)
 
-    def select(self, index):
+    def select(self, index: np.ndarray) -> 'JointMotion':
         """Return the motion at `index` (slice, mask or integer array)."""
         return JointMotion(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

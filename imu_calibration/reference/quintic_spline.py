@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, factorial
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -39,18 +40,18 @@ class Knots:
     """Number of intervals."""
 
     @property
-    def n_coefficients(self):
+    def n_coefficients(self) -> int:
         """Number of spline coefficients."""
         return self.n_intervals + DEGREE
 
-    def locate(self, time):
+    def locate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the interval of each instant (ends extended) and the place inside it, in steps."""
         scaled = (time - self.start) / self.step
         interval = np.clip(scaled.astype(np.intp), 0, self.n_intervals - 1)
         return interval, scaled - interval
 
 
-def design_values(knots, time, derivative=0):
+def design_values(knots: Knots, time: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return (interval, values): the six basis functions that are not zero at each instant, shape (6, n), or their derivative."""
     interval, place = knots.locate(time)
     matrix = PIECES
@@ -62,14 +63,14 @@ def design_values(knots, time, derivative=0):
     return interval, values
 
 
-def design_matrix(knots, interval, values):
+def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any:
     """Return the sparse design, shape (n, n_coefficients)."""
     columns = interval[:, None] + np.arange(ORDER)
     return csr_matrix((np.ascontiguousarray(values.T).ravel(), columns.ravel(), np.arange(0, columns.size + 1, ORDER)),
                       shape=(len(interval), knots.n_coefficients))
 
 
-def normal_bands(knots, interval, values):
+def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the lower bands of design.T @ design, shape (6, n_coefficients), as `scipy.linalg.solveh_banded` takes them."""
     size = knots.n_coefficients
     bands = np.zeros((ORDER, size))
@@ -79,7 +80,7 @@ def normal_bands(knots, interval, values):
     return bands
 
 
-def penalty_bands(weights):
+def penalty_bands(weights: np.ndarray) -> np.ndarray:
     """Return the lower bands of D.T @ diag(weights) @ D with D the third differences of the coefficients, shape (6, n_weights + 3)."""
     bands = np.zeros((ORDER, len(weights) + 3))
     for first in range(4):
@@ -88,13 +89,13 @@ def penalty_bands(weights):
     return bands
 
 
-def piece_coefficients(coefficients):
+def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
     """Return the polynomial of each interval in its place u, shape (6 powers, n_intervals, n_joints)."""
     windows = np.lib.stride_tricks.sliding_window_view(coefficients, ORDER, axis=0)
     return np.ascontiguousarray(np.moveaxis(windows @ PIECES.T, -1, 0))
 
 
-def evaluate_pieces(knots, pieces, time, derivatives):
+def evaluate_pieces(knots: Knots, pieces: np.ndarray, time: np.ndarray, *, derivatives: int) -> np.ndarray:
     """Return the values and the first `derivatives` derivatives at `time`, shape (derivatives + 1, n, n_joints)."""
     n_joints = pieces.shape[2]
     result = np.zeros((derivatives + 1, len(time), n_joints))

@@ -1,5 +1,6 @@
 """What a perfect sensor would feel: the true motion, as far as table and clock tell it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -26,10 +27,10 @@ class Reference:
     motion: object | None = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.time)
 
-    def select(self, index):
+    def select(self, index: np.ndarray | slice) -> 'Reference':
         """Return the reference at `index` (slice, mask or integer array)."""
         changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
         if self.motion is not None:
@@ -37,7 +38,7 @@ class Reference:
         return replace(self, **changed)
 
 
-def skew(vector):
+def skew(vector: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the cross-product matrices of vectors, shape (..., 3) to (..., 3, 3)."""
     vector = np.asarray(vector, float)
     matrix = np.zeros(vector.shape + (3,))
@@ -47,7 +48,7 @@ def skew(vector):
     return matrix
 
 
-def lever_matrix(rate_s, alpha_s):
+def lever_matrix(rate_s: np.ndarray, alpha_s: np.ndarray) -> np.ndarray:
     """
     Return W with ``f_point = f_ref + W @ r``: ``W = [alpha x] + [omega x]^2``, shape (n, 3, 3).
 

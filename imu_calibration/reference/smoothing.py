@@ -1,7 +1,9 @@
 """How much to smooth: noise and resolution of encoders, and the penalty that suits the data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -49,7 +51,7 @@ class PenalisedSpline:
 
     """
 
-    def __init__(self, design, bands, n_kinds=1):
+    def __init__(self, design: Any, bands: np.ndarray, n_kinds: int = 1):
         self.design, self.bands, self.penalty = design, bands, penalty_bands(np.ones(design.shape[1] - 3))
         self.n_rows, self.n_coefficients = design.shape
         # Splines are worst at the ends, which callers keep out: the ends have weight zero in the noise and the penalty.
@@ -62,12 +64,12 @@ class PenalisedSpline:
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
         self._symbols = self.symbols(self._theta)
 
-    def symbols(self, theta):
+    def symbols(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot."""
         normal = np.cos(theta[:, None] * np.arange(ORDER)) @ self._mean_bands
         return np.maximum(normal, 1e-6 * self.density), (2 - 2 * np.cos(theta)) ** 3
 
-    def fit(self, values, penalty, with_ends=False):
+    def fit(self, values: np.ndarray, penalty: float, with_ends: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficients for columns of `values`, and the mean squared residuals away from the ends."""
         unit = penalty_bands(self._end_weights(penalty)) if with_ends else self.penalty
         coefficients = solveh_banded(self.bands + penalty * unit, self.design.T @ values, lower=True, overwrite_ab=True,
@@ -93,7 +95,7 @@ class PenalisedSpline:
         distance = np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1]) - 2
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
-    def gains(self, penalty):
+    def gains(self, penalty: float) -> tuple[float, float]:
         """Return the mean gain of the fit over all frequencies (degrees of freedom per row), and of its square."""
         if penalty not in self._gains:
             normal, damping = self._symbols
@@ -102,13 +104,13 @@ class PenalisedSpline:
             self._gains[penalty] = least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
         return self._gains[penalty]
 
-    def bandwidth(self, penalty):
+    def bandwidth(self, penalty: float) -> float:
         """Return the frequency, rad per knot, below which more than half the amplitude passes."""
         normal, damping = self._symbols
         return self._theta[np.searchsorted(penalty * damping / normal, 1.0) - 1]
 
 
-def smooth(spline, values, noise_floor, robustness):
+def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray, *, robustness: float) -> list[Smooth]:
     """
     Return a `Smooth` per column of `values`, with the penalty that predicts best.
 

@@ -81,7 +81,7 @@ def _rest_run(time, force, force_error, rate_error):
     gravity = float(np.linalg.norm(force))
     attitude = _attitudes(force[None] / gravity)[0].T
     count = len(time)
-    return strapdown(time, np.tile(force + force_error, (count, 1)), np.tile(rate_error, (count, 1)), gravity, attitude)
+    return strapdown(time, np.tile(force + force_error, (count, 1)), np.tile(rate_error, (count, 1)), gravity=gravity, mat_ns0=attitude)
 
 
 def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Growth, dict[str, Growth]]:
@@ -155,12 +155,12 @@ def _moving_runs(result, window, length):
     truth = _at_origin(result.calibration, reference_motion(result.table, motion))
     reference_c = result.calibration.model.temperature_ref_c
     temperature = np.full(len(time), reference_c) if window.temperature_c is None else window.temperature_c[some]
-    corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], truth.alpha_s, temperature)
+    corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], alpha_s=truth.alpha_s, temperature_c=temperature)
     grid, start = np.linspace(0.0, length, STEPS), truth.mat_sn[0].T
-    true = strapdown(time, truth.force_s, truth.rate_s, truth.gravity, start)
+    true = strapdown(time, truth.force_s, truth.rate_s, gravity=truth.gravity, mat_ns0=start)
     growths = []
     for force, rate in ((window.force_s[some], window.rate_s[some]), (corrected.force, corrected.rate)):
-        run = strapdown(time, force, rate, truth.gravity, start)
+        run = strapdown(time, force, rate, gravity=truth.gravity, mat_ns0=start)
         errors = [np.linalg.norm(getattr(run, name) - getattr(true, name), axis=1) for name in ('velocity_n', 'position_n')]
         growths.append(Growth(grid, *(np.interp(grid, time - time[0], error) for error in errors)))
     return growths

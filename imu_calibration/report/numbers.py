@@ -29,7 +29,8 @@ def fixed(value: float, places: int) -> str:
 
 def pair(value: float, sd: float) -> tuple[str, str]:
     """Return (value, sd) as text with the digits that the sd supports."""
-    return tuple(part.replace('-', '−') for part in with_sd(value, sd))
+    shown, spread = (part.replace('-', '−') for part in with_sd(value, sd))
+    return shown, spread
 
 
 def people(value: float, sd: float, unit: str) -> tuple[str, str, str]:

@@ -19,7 +19,7 @@ def worked_sample(result: CalibrationResult) -> dict[str, Any]:
     calibration = result.calibration
     sample = _sample(result)
     force, rate, alpha = (getattr(sample, name) for name in ('force', 'rate', 'alpha'))
-    corrected = compensate(calibration, force[None], rate[None], alpha[None], sample.temperature)
+    corrected = compensate(calibration, force[None], rate[None], alpha_s=alpha[None], temperature_c=sample.temperature)
     inverses = {s: np.linalg.inv(calibration.of(s, Role.LINEAR)) for s in SENSORS}
     arms = arms_of(calibration)
     return {

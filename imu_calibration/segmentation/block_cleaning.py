@@ -14,7 +14,7 @@ MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> what people call its messages; reasons for which one was lost begin with that."""
 BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
-_KINDS: dict[str, type[ImuSamples | JointSamples | TemperatureSamples]] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+_KINDS: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,8 @@ class BlockCleaner:
     @property
     def n_buffered(self) -> int:
         """Samples held at the moment."""
-        return sum(len(part) for parts in self._raw.values() for part in parts) + sum(len(part) for parts in self._ready.values() for _, part in parts)
+        return sum(len(part) for parts in self._raw.values() for part in parts) + sum(len(part) for parts in self._ready.values() for _,
+                                                                                      part in parts)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -7,6 +7,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.special import ndtri
 
 from imu_calibration.reference.encoder import encoder_step
+from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class Phase(IntEnum):
@@ -31,7 +32,8 @@ REACH = RATE_SPAN / 2 + LONGEST_SPAN
 """Readings further away than this do not change a phase, s."""
 
 
-def joint_phases(time, position, settings, noise_rad=None):
+def joint_phases(time: np.ndarray, position: np.ndarray, settings: WindowSettings, *,
+                 noise_rad: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     Tell the phase of each joint reading of a stretch without gaps.
 

@@ -17,10 +17,10 @@ _GUARD = 0.05  # s kept out on both sides of a disturbance, whose first samples 
 class QuietFloor:
     """Running estimate of the quiet variances: the median over the last chunks, so that a noisy one does not set it."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._history = {}
 
-    def update(self, key, value):
+    def update(self, key: float, value: np.ndarray | None) -> np.ndarray | None:
         """Add the floor of one chunk (None: nothing was at rest) and return the running one, or None."""
         history = self._history.setdefault(key, deque(maxlen=9))
         if value is not None:
@@ -28,7 +28,8 @@ class QuietFloor:
         return np.median(np.array(history), axis=0) if history else None
 
 
-def quiet_samples(force_s, rate_s, period, ratio, longest, floor, resting=None):
+def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float, floor: QuietFloor,
+                  resting: np.ndarray | None = None) -> np.ndarray:
     """
     Tell which samples lie in a quiet span.
 
@@ -83,7 +84,7 @@ def _chunk_floor(variance, width, at_rest):
     return np.quantile(separate, 0.25, axis=0) if len(separate) >= 3 else None
 
 
-def least_variance(values):
+def least_variance(values: np.ndarray) -> float:
     """Return the variance, axes added, below which nothing counts: that of half a converter step, or of 1e-5 of the readings."""
     some = np.ascontiguousarray(values[:4000].T)
     change = np.abs(np.diff(some, axis=1))

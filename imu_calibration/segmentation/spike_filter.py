@@ -1,6 +1,9 @@
 """Single readings that no motion explains: a glitch on the bus, a corrupt message; dropped before anything is averaged."""
 
+
 import numpy as np
+
+from imu_calibration.samples import ImuSamples
 
 CHUNK = 32
 """Samples over which the noise is taken."""
@@ -34,7 +37,7 @@ class SpikeFilter:
     white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.dropped = 0
         self._begin()
 
@@ -42,7 +45,7 @@ class SpikeFilter:
         self._held, self._values, self._first = None, np.zeros((0, 6)), 0
         self._noise, self._n_noise, self._step = np.zeros((1, 6)), 0, np.full(6, np.inf)
 
-    def push(self, samples):
+    def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return the ImuSamples that are decided upon by now, in a list; the last `REACH` are held back."""
         passed = []
         for part in _without_breaks(samples):
@@ -53,7 +56,7 @@ class SpikeFilter:
             passed += self._decide(max(len(self._held) - REACH, 0) if self._first + len(self._values) > CHUNK else 0)
         return passed
 
-    def finish(self):
+    def finish(self) -> list[ImuSamples]:
         """Return what was held back, and begin anew."""
         rest = [] if self._held is None else self._decide(len(self._held))
         self._begin()

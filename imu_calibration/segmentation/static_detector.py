@@ -3,6 +3,7 @@
 import numpy as np
 
 from imu_calibration.errors import InputError
+from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.quiet_detector import SPANS, QuietFloor, least_variance, quiet_samples
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -13,7 +14,7 @@ _LARGEST_GROWTH = 4.0
 """Bias wander over a long rest adds less variance than this."""
 
 
-def find_still(imu, settings=WindowSettings()):
+def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> list[slice]:
     """
     Find the intervals in which the IMU alone shows rest.
 
@@ -46,7 +47,7 @@ def find_still(imu, settings=WindowSettings()):
     if not np.any(step > 0):
         return []
     period = np.median(step[step > 0]) / 1e9
-    quiet = quiet_samples(imu.force_s, imu.rate_s, period, settings.quiet_ratio, settings.static_minimum, QuietFloor())
+    quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=settings.quiet_ratio, longest=settings.static_minimum, floor=QuietFloor())
     found = [piece for piece in _intervals(imu.stamp_ns, quiet, period, settings) if _keeps_attitude(imu.force_s[piece], period)]
     return _not_turning(imu.rate_s, found)
 

@@ -1,13 +1,17 @@
 """Streams brought together, chunk by chunk of a fixed grid in time: the joints at the IMU's stamps and what they do."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.segmentation import joint_phases
 from imu_calibration.segmentation.joint_phases import LOST, STILL
 from imu_calibration.segmentation.joint_run import LEAST_READINGS, JointRun
-from imu_calibration.segmentation.quiet_detector import REACH, quiet_samples
+from imu_calibration.segmentation.quiet_detector import REACH, QuietFloor, quiet_samples
 from imu_calibration.segmentation.sample_buffer import SampleBuffer
 from imu_calibration.segmentation.window import PhasedSamples
+from imu_calibration.segmentation.window_settings import WindowSettings
 
 JOINT_WAIT = 60.0
 """The IMU or the joints may be ahead of each other by this much before the missing ones are given up, s."""
@@ -26,39 +30,39 @@ class MotionChunks:
     its margin (or are given up), so the cut of the streams into blocks plays no role. The waiting times bound the memory.
     """
 
-    def __init__(self, settings, noise_rad, floor):
+    def __init__(self, settings: WindowSettings, noise_rad: float | None, floor: QuietFloor):
         self.counts = {}
         self.time_origin = 0.0
         self._settings, self._noise_rad, self._floor = settings, noise_rad, floor
         self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
         self.margin = max(settings.overlap, _LEAST_MARGIN)
         self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
-        self._start_ns = None
-        self._first_joint_ns = None
+        self._start_ns: int | None = None
+        self._first_joint_ns: int | None = None
         self._chunk = 0
         self._previous_ns = None
         self._after_loss = False
 
     @property
-    def short_rest(self):
+    def short_rest(self) -> float:
         """Length of the rests that have a curve of the joints throughout, s."""
         return min(self._settings.settling + self._settings.static_minimum, self.margin)
 
-    def change(self, settings):
+    def change(self, settings: WindowSettings) -> None:
         """Work by other settings from the next chunk on; the length of the chunks and their margin stay."""
         self._settings = settings
 
     @property
-    def n_buffered(self):
+    def n_buffered(self) -> int:
         """Samples held, of all streams."""
         return sum(len(buffer) for buffer in (self._imu, self._joints, self._temperature))
 
     @property
-    def end_time(self):
+    def end_time(self) -> float:
         """Session time at the newest IMU sample, s."""
-        return self.time_origin if self._imu.newest_ns is None else self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
+        return self.time_origin if self._imu.newest_ns is None or self._start_ns is None else self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
 
-    def add(self, imu=None, joints=None, temperature=None):
+    def add(self, imu: ImuSamples | None = None, joints: JointSamples | None = None, temperature: TemperatureSamples | None = None) -> None:
         """Take cleaned samples, each stream in the order of its stamps."""
         if imu is not None and len(imu):
             if self._start_ns is None:
@@ -71,7 +75,7 @@ class MotionChunks:
         if temperature is not None and len(temperature):
             self._temperature.add(temperature)
 
-    def take(self, final=False):
+    def take(self, final: bool = False) -> Iterator[PhasedSamples]:
         """Yield the chunks that can be worked on (all with `final`) as `PhasedSamples` without those that have no joints."""
         if self._start_ns is not None:
             passed = np.inf if final else self._passed_ns()
@@ -82,7 +86,7 @@ class MotionChunks:
                     yield chunk
         self._forget()
 
-    def joints_left(self):
+    def joints_left(self) -> JointSamples:
         """Return the joint samples that are still held, or None."""
         return self._joints.between(-NEVER, NEVER)
 
@@ -138,8 +142,9 @@ class MotionChunks:
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
         runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
         phase, level, joint_step = self._phases(time, runs, final)
-        quiet = quiet_samples(imu.force_s, imu.rate_s, period, self._settings.quiet_ratio, self._settings.static_minimum, self._floor,
-                              phase == STILL)
+        quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=self._settings.quiet_ratio, longest=self._settings.static_minimum,
+                              floor=self._floor,
+                              resting=phase == STILL)
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
@@ -159,7 +164,7 @@ class MotionChunks:
         step = np.diff(time)
         joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
         bounds = np.concatenate([[0], np.flatnonzero(step > joint_limit) + 1, [len(time)]])
-        runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], self._settings, self._noise_rad)
+        runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], settings=self._settings, noise_rad=self._noise_rad)
                 for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= LEAST_READINGS]
         return runs, limit
 

@@ -1,6 +1,7 @@
 """One stream of stamped samples, cleaned: what cannot be used is dropped with a count, and the stamps are described."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class StreamCheck:
     of their own first (see `sample_times`).
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.counts = {}
         self.epoch = 0
         self._steps = StepHistogram()
@@ -42,22 +43,22 @@ class StreamCheck:
         self._spikes, self._filtered_epoch = SpikeFilter(), 0
 
     @property
-    def line(self):
+    def line(self) -> StampLine | None:
         """How the stamps of an IMU are (`stamping.StampLine`); None for other streams, and while too few came to tell."""
         return None if self._times is None else self._times.line
 
-    def push(self, samples):
+    def push(self, samples: Any) -> list[tuple[int, Any]]:
         """Return a list of (epoch, samples) that are accepted; a few are held while their times are open."""
         if samples is None or not len(samples):
             return []
         return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
 
-    def finish(self):
+    def finish(self) -> list[tuple[int, Any]]:
         """Return what was held, as `push` does."""
         held, self._held = self._held, None
         return self._without_spikes(([] if held is None else self._accept(held)) + self._end_epoch(), ended=True)
 
-    def statistics(self, gap=0.1):
+    def statistics(self, gap: float = 0.1) -> 'StreamStatistics':
         """
         Return the `StreamStatistics` of what was accepted until now.
 
@@ -207,7 +208,7 @@ class StreamStatistics:
     """Samples whose stamp was zero, so that the time of arrival was taken."""
 
     @property
-    def rate(self):
+    def rate(self) -> float:
         """Samples per second between gaps, 0 when unknown."""
         return 1.0 / self.period if self.period > 0 else 0.0
 
@@ -225,13 +226,13 @@ _FINE_STEP_NS = 100
 class StepHistogram:
     """Numbers and sums of steps in bins of equal ratio; adding pieces in any order gives the same numbers."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.common_step_ns = 0
         self._number = np.zeros(_N_BINS, np.int64)
         self._sum_ns = np.zeros(_N_BINS, np.int64)
         self._longest_ns = 0
 
-    def add(self, step_ns):
+    def add(self, step_ns: np.ndarray) -> None:
         """Add steps, int64, ns, all positive."""
         if not len(step_ns):
             return
@@ -242,7 +243,7 @@ class StepHistogram:
         if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
             self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
 
-    def median(self):
+    def median(self) -> float:
         """Return the median step to one per cent (exact when the steps are equal), s; 0 without steps."""
         total = self._number.sum()
         if total == 0:
@@ -250,7 +251,7 @@ class StepHistogram:
         middle = np.searchsorted(np.cumsum(self._number), (total + 1) // 2)
         return float(self._sum_ns[middle] / self._number[middle] / 1e9)
 
-    def longer_than(self, gap):
+    def longer_than(self, gap: float) -> tuple[int, float, float]:
         """Return number and total (s) of the steps longer than `gap` s, bin by bin, and the longest step (s)."""
         filled = np.maximum(self._number, 1)
         longer = self._sum_ns / filled > gap * 1e9

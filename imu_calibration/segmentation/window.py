@@ -55,16 +55,16 @@ class Window:
     joint_step: np.ndarray | None = None
     """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.time)
 
     @property
-    def period(self):
+    def period(self) -> float:
         """Median sampling period, s; 0 for one sample."""
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
 
     @property
-    def noise_sd(self):
+    def noise_sd(self) -> np.ndarray:
         """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion drops out."""
         second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
         return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)

@@ -1,9 +1,11 @@
 """From samples with phases to windows: short runs are joined, settling and knocks kept out, long windows cut."""
 
+
 import numpy as np
 
 from imu_calibration.segmentation.joint_phases import MOVING, STEADY, STILL
-from imu_calibration.segmentation.window import PhasedSamples, UnusedReason, WindowKind, make_window
+from imu_calibration.segmentation.window import PhasedSamples, UnusedReason, Window, WindowKind, make_window
+from imu_calibration.segmentation.window_settings import WindowSettings
 
 _KINDS, _REASONS = tuple(WindowKind), tuple(UnusedReason)
 UNUSED, STATIC, SPIN, DYNAMIC = range(len(_KINDS))
@@ -19,7 +21,7 @@ class WindowCutter:
     runs of one phase that are too short for it become motion, samples get a kind, runs of one kind become windows.
     """
 
-    def __init__(self, settings, short_rest, keep_unused=False):
+    def __init__(self, settings: WindowSettings, short_rest: float, keep_unused: bool = False):
         self.counts = {}
         self._settings, self._short_rest, self._keep_unused = settings, short_rest, keep_unused
         self._waiting = None
@@ -27,16 +29,16 @@ class WindowCutter:
         self._disturbed = self._ramped = -np.inf
         self._open = None
 
-    def change(self, settings, short_rest):
+    def change(self, settings: WindowSettings, short_rest: float) -> None:
         """Decide by other settings from now on."""
         self._settings, self._short_rest = settings, short_rest
 
     @property
-    def n_waiting(self):
+    def n_waiting(self) -> int:
         """Samples held."""
         return (0 if self._waiting is None else len(self._waiting)) + (0 if self._open is None else len(self._open[0]))
 
-    def push(self, samples, final=False):
+    def push(self, samples: PhasedSamples | None, final: bool = False) -> list[Window]:
         """Take the next samples (or None) and return the windows that are complete; with `final` all that is left."""
         windows = []
         if self._waiting is not None:
@@ -172,6 +174,6 @@ ACCEPTED = (*_KINDS[1:], *_REASONS[1:], 'edge of joints')
 """Counts of samples that arrived whole; the last five are kept out of windows on purpose."""
 
 
-def dropped(counts):
+def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int]:
     """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
     return {reason: int(count) for reason, count in sorted(counts.items()) if count and reason not in ACCEPTED}

@@ -1,12 +1,16 @@
 """Windows from streams: what comes in blocks goes out as static, spinning and dynamic windows with the joints' motion."""
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.samples import JointSamples
-from imu_calibration.segmentation.block_cleaning import STREAMS, BlockCleaner
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import JointSamples, NominalScaling, SampleBlock
+from imu_calibration.segmentation.block_cleaning import STREAMS, BlockCleaner, Watcher
 from imu_calibration.segmentation.quiet_detector import QuietFloor
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT, MotionChunks
+from imu_calibration.segmentation.window import UnusedReason, Window, WindowKind
 from imu_calibration.segmentation.window_cutter import WindowCutter
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -31,7 +35,8 @@ class MotionGatherer:
 
     """
 
-    def __init__(self, table, settings=WindowSettings(), keep_unused=False, *, nominal=None, watchers=()):
+    def __init__(self, table: Table, settings: WindowSettings = WindowSettings(), keep_unused: bool = False, *,
+                 nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
         self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)
         self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}
@@ -44,13 +49,13 @@ class MotionGatherer:
         self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
 
     @property
-    def n_buffered(self):
+    def n_buffered(self) -> int:
         """Samples held at the moment; stays bounded however long the session."""
         waiting = sum(len(part) for name in STREAMS for _, part in self._queue[name])
         return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
 
     @property
-    def counts(self):
+    def counts(self) -> dict[str | UnusedReason | WindowKind, int]:
         """
         Return reason -> number of samples.
 
@@ -63,7 +68,7 @@ class MotionGatherer:
             _add_counts(counts, source)
         return counts
 
-    def push(self, block):
+    def push(self, block: SampleBlock) -> list[Window]:
         """
         Take a block and return the windows that are complete now.
 
@@ -77,7 +82,7 @@ class MotionGatherer:
         self._enqueue(cleaned)
         return self._work() if cleaned else []
 
-    def finish(self):
+    def finish(self) -> list[Window]:
         """Return the remaining windows; after this nothing more may be pushed."""
         self._enqueue(self.cleaner.finish())
         windows = self._work()
@@ -85,7 +90,7 @@ class MotionGatherer:
             windows += self._next_epoch() + self._work()
         return windows + self._end_epoch() + self._cutter.push(None, final=True)
 
-    def change(self, settings):
+    def change(self, settings: WindowSettings) -> None:
         """
         Find windows by other settings from now on.
 
@@ -102,7 +107,7 @@ class MotionGatherer:
         self._chunks.change(settings)
         self._cutter.change(settings, self._chunks.short_rest)
 
-    def all_of(self, blocks):
+    def all_of(self, blocks: Iterable[SampleBlock]) -> list[Window]:
         """Return the windows of a whole recording."""
         return [window for block in blocks for window in self.push(block)] + self.finish()
 

@@ -52,14 +52,14 @@ class Attempt:
 
     """
 
-    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, effects: Sequence[Effect], *,
-                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None,
-                 progress: Callable | None = None):
+    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect],
+                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None):
         self.baseline, self.effects = baseline, effects
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
-        recording = reduce_recording(windows, table, model, values, make_bank(effects, self.constants, model, values), progress)
+        recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values),
+                                     progress=progress)
         used = baseline_parameters(baseline, model)
         if point is None:
             recording = _at_baseline(recording, baseline, used)
@@ -69,7 +69,7 @@ class Attempt:
         self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions), bias_processes)
         self.locked = locked_windows(recording.kind)
         self.evidence = WindowEvidence(self.space, self.noise, folds_of(recording.kind, self.locked))
-        self.search = Search(self.evidence, used, self.questions, encoder_step(windows))
+        self.search = Search(self.evidence, used, self.questions, encoder_step=encoder_step(windows))
 
     @property
     def recording(self) -> ReducedRecording:
@@ -118,7 +118,7 @@ class Attempt:
             return True
         used = self.search.used(chosen)
         at = [used.index(k) for k in question.parameters]
-        fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, self.space.prior_mean) for normal in self._halves]
+        fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean) for normal in self._halves]
         whole, covariance = self.evidence.fit(used)
         difference = (fits[0][0] - fits[1][0])[at]
         apart = _squared(difference, sum(fit[1] for fit in fits)[np.ix_(at, at)])
@@ -208,7 +208,7 @@ def _at_baseline(recording, baseline, used):
     for _ in range(2 if baseline.arms else 1):
         space = in_trusted_band(parameter_space(recording, baseline))
         values = recording.values.copy()
-        values[list(used)] += solve_normal(normal_matrix(space, first_noise(space)), used, space.prior_sd, space.prior_mean)[0]
+        values[list(used)] += solve_normal(normal_matrix(space, first_noise(space)), used, space.prior_sd, prior_mean=space.prior_mean)[0]
         recording = recording.rebased(values)
     return recording
 

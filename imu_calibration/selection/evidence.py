@@ -51,7 +51,7 @@ class Evidence(ABC):
     """
 
     def __init__(self, prior_sd: np.ndarray, prior_mean: np.ndarray):
-        self._prior, self._fits = (prior_sd, prior_mean), {}
+        self._prior, self._fits = {'prior_sd': prior_sd, 'prior_mean': prior_mean}, {}
 
     @abstractmethod
     def normal(self, number: int | None = None) -> np.ndarray:
@@ -73,7 +73,7 @@ class Evidence(ABC):
         """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""
         key = (tuple(used), number)
         if key not in self._fits:
-            self._fits[key] = solve_normal(self.normal(number), np.asarray(used), *self._prior)
+            self._fits[key] = solve_normal(self.normal(number), np.asarray(used), **self._prior)
         return self._fits[key]
 
 
@@ -97,7 +97,7 @@ class WindowEvidence(Evidence):
         white = {sensor: white_means(space, noise, sensor) for sensor in SENSORS}
         numbers = range(fold.max() + 1)
         self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
-        self._within = {s: [within_matrix(space, noise, fold == number, (s,)) for number in numbers] for s in SENSORS}
+        self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
         self._parts = [sum(part[s][number] for part in (self._means, self._within) for s in SENSORS) for number in numbers]
         self.total = sum(self._parts)
 

@@ -39,7 +39,7 @@ class Explained:
         self.n_means = 3.0 * self.chosen.sum()
         self.n_within = 3.0 * (recording.count - 1)[self.chosen & recording.moving].sum()
 
-    def excess(self, chosen: list[Question]) -> dict[str, tuple[float, float]]:
+    def excess(self, chosen: Sequence[Question]) -> dict[str, tuple[float, float]]:
         """Return sensor -> (excess of the means, excess within windows): losses above what noise leaves, on held-out windows."""
         losses = self.floor.heldout_parts(self.search.used(chosen))
         return {s: (means - self.n_means, within - self.n_within) for s, (means, within) in losses.items()}
@@ -49,7 +49,7 @@ class Explained:
         limits = (SIGNIFICANT_REST * np.sqrt(2 * self.n_means), SIGNIFICANT_REST * np.sqrt(2 * self.n_within))
         return sum(value for value, limit in zip(excess, limits) if value > limit)
 
-    def share(self, chosen: list[Question], question: Question) -> float:
+    def share(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the least share of the unexplained that the effect removes, over the sensors in which it shows."""
         with_it, without = self.excess(chosen), self.excess([q for q in chosen if q is not question])
         removed = {s: sum(without[s]) - sum(with_it[s]) for s in sensors_of(question.effect)}
@@ -60,7 +60,7 @@ class Explained:
         return min(value / (value + self.rest(with_it[s])) for s, value in removed.items() if value >= 0.2 * strongest)
 
 
-def pruned(chosen: Sequence[Question], share: Callable) -> list[Question]:
+def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
     """Return the choice without effects that remove too little, weakest first; `share(chosen, question)` says how much each removes."""
     chosen = list(chosen)
     while chosen:

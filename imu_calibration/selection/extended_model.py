@@ -16,7 +16,7 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.saturation import Saturation
 
 
-def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], baseline: SensorModel, chosen: Sequence[Question], *,
+def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], baseline: SensorModel, *, chosen: Sequence[Question],
                       saturations: Sequence[Saturation] = ()) -> Solution:
     """
     Return the Solution of the baseline extended by the chosen effects.
@@ -34,7 +34,8 @@ def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], basel
 
     """
     wide = space.recording.model
-    model = replace(baseline, point={**baseline.point, **wide.point}, temperature_ref_c=wide.temperature_ref_c, folded_arms=wide.folded_arms)
+    model = replace(baseline, point={**baseline.point, **wide.point}, temperature_ref_c=wide.temperature_ref_c,
+                    folded_arms=wide.folded_arms)
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
     weighed = {sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in SENSORS}

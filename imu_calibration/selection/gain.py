@@ -30,12 +30,12 @@ class Gain:
     """Windows that were held out."""
 
     @property
-    def reduction(self):
+    def reduction(self) -> float:
         """1 - after / before."""
         return 1.0 - self.heldout_rms_after / self.heldout_rms_before if self.heldout_rms_before > 0 else 0.0
 
 
-def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], sensors: Sequence[str]) -> Gain:
+def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
     Return the Gain of the choice `after` over the choice `before`.
 

@@ -42,17 +42,17 @@ class Investigation:
     """The last linearisation with its evidence."""
     explained: Explained
     """What noise leaves and what the choices leave."""
-    named: list[Question]
+    named: Sequence[Question]
     """Questions that became findings, in the order found."""
     limits: list[Saturation]
     """Saturations."""
     not_testable: list[dict]
     """Effects that could not be asked about."""
-    denied: list[Question] = field(default_factory=list)
+    denied: Sequence[Question] = field(default_factory=list)
     """Questions that would have become findings, but the halves of the recording disagree on them."""
 
 
-def investigate(windows: Sequence[Window], table: Table, model: SensorModel, progress: Callable | None = None, *,
+def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
                 bias_processes: dict | None = None) -> Investigation:
     """
     Ask every effect that a model lacks on held-out windows.
@@ -84,7 +84,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, pro
     used, limits = _without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, used)
     asked = without_saturation(effects)
-    attempted = partial(Attempt, used, table, model, asked, bias_processes=bias_processes)
+    attempted = partial(Attempt, used, table, model, effects=asked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.5 * share))
     chosen = attempt.search.run()
     for _ in range(LINEARISATIONS - 1):
@@ -136,7 +136,7 @@ def _that_help(attempt, named):
     if not attempt.recording.moving.all():
         return kept
     while kept:
-        least = [heldout_gain(attempt, [q for q in kept if q is not each], kept, sensors_of(each.effect)).ci95[0] for each in kept]
+        least = [heldout_gain(attempt, [q for q in kept if q is not each], kept, sensors=sensors_of(each.effect)).ci95[0] for each in kept]
         if not np.min(least) <= 0.0:
             break
         del kept[int(np.argmin(least))]
@@ -157,12 +157,12 @@ def _without_clipping(windows, table, model):
     noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
     kept = windows
     for _ in range(2):
-        predicted = predictions(windows, table, model, simple_fit(kept, table, model))
-        kept = without_clipped(windows, predicted, limits, noise_sd)
+        predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
+        kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
         if len(kept) < LEAST_WINDOWS:
             return windows, []   # what is always at its limit, or always near it, shows no limit
-    predicted = predictions(windows, table, model, simple_fit(kept, table, model))
-    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor) for sensor in suspects) if limit]
+    predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
+    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]
     if not found:
         return windows, []
-    return without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd), found
+    return without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd=noise_sd), found

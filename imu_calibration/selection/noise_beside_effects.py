@@ -40,7 +40,7 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
     noise, every = first_noise(space), np.arange(space.size)
     noise = {sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()}
     for look_along in (False, True):
-        values = solve_normal(normal_matrix(space, noise), every, space.prior_sd, space.prior_mean)[0]
+        values = solve_normal(normal_matrix(space, noise), every, space.prior_sd, prior_mean=space.prior_mean)[0]
         noise = {sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along) for sensor in SENSORS}
     return {sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
 
@@ -96,7 +96,8 @@ def _with_bias_process(space, sensor, noise, smooth):
     for axis in range(3):
         rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
     white = noise[sensor].mean_variance(recording.kind, recording.count)
-    likelihood = NoiseLikelihood(rows, white, recording.time, recording.sessions, _known_otherwise(space, sensor, noise, own),
+    likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
+                                 information=_known_otherwise(space, sensor, noise, own),
                                  known=noise[sensor].known)
     least = 0.0 if noise[sensor].known else natural_processes(noise[sensor], recording.period)[0].sd
     search = BiasProcessSearch(likelihood, least)

@@ -12,10 +12,11 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 
 def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None) -> np.ndarray:
     """Return the normal matrix of the windows `select` (mask; all where not given), shape (q + 1, q + 1)."""
-    return within_matrix(space, noise, select) + mean_matrix(space, {sensor: white_means(space, noise, sensor) for sensor in SENSORS}, select)
+    return within_matrix(space, noise, select) + mean_matrix(space, {sensor: white_means(space, noise, sensor) for sensor in SENSORS},
+                                                             select)
 
 
-def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None,
+def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None, *,
                   sensors: Sequence[str] = SENSORS) -> np.ndarray:
     """Return the part of the normal matrix that comes from within the windows."""
     total, kind = np.zeros((space.size + 1, space.size + 1)), space.recording.kind
@@ -43,5 +44,5 @@ def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str
     """Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1)."""
     recording, own = space.recording, noise[sensor]
     variance = own.mean_variance(recording.kind, recording.count) + own.offset_sd**2
-    return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, own.bias_processes)(rows[:, None])[:, 0]
+    return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, processes=own.bias_processes)(rows[:, None])[:, 0]
             for axis, rows in enumerate(space.mean[sensor])]

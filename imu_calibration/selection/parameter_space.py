@@ -59,7 +59,7 @@ class ParameterSpace:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
         return {sensor: [self.recording.mean(sensor) @ join for join in self.join[sensor]] for sensor in SENSORS}
 
-    def within_each(self, sensor: str, axis: int, rows: np.ndarray, part: str | None = None) -> np.ndarray:
+    def within_each(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
         """
         Return the products of the centred rows of each of the windows `rows` (mask), shape (k, q_a + 1, q_a + 1).
 
@@ -67,7 +67,7 @@ class ParameterSpace:
         """
         return self._joined(sensor, axis, part, lambda products: products[rows], np.flatnonzero(rows))
 
-    def within_sum(self, sensor: str, axis: int, rows: np.ndarray, part: str | None = None) -> np.ndarray:
+    def within_sum(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
         """Return the sum of `within_each`, shape (q_a + 1, q_a + 1)."""
         return self._joined(sensor, axis, part, lambda products: products[rows].sum(axis=0, keepdims=True), rows)[0]
 
@@ -149,7 +149,7 @@ def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray
     return np.concatenate(masks)
 
 
-def questions(space: ParameterSpace, effects: Sequence[Effect]) -> list[Question]:
+def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Question]:
     """Return a Question for each effect; one with a time constant gives one per time constant of the bank."""
     model, places, asked = space.recording.model, bank_places(space.recording), []
     for effect in effects:

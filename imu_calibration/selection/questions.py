@@ -30,12 +30,12 @@ class Question:
     """Effect name, for a warm-up with the number of the time constant."""
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Published name of the effect."""
         return self.effect.name
 
     @property
-    def sensor(self):
+    def sensor(self) -> str:
         """'accelerometer', 'gyroscope' or 'reference'."""
         return self.effect.sensor
 

@@ -108,7 +108,8 @@ class ReducedRecording:
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
         """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
         moved = replace(self, values=values)
-        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions', '_factors') if name in self.__dict__})
+        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions',
+                                                                      '_factors') if name in self.__dict__})
         return moved
 
     def accumulated(self, model: SensorModel) -> Accumulator:
@@ -120,7 +121,7 @@ class ReducedRecording:
         return accumulator
 
 
-def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, bank: dict[str, list[BankEntry]],
+def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray, bank: dict[str, list[BankEntry]],
                      progress: Callable | None = None) -> ReducedRecording:
     """
     Reduce windows with the columns of a model and a bank of time constants.
@@ -140,9 +141,10 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
 
     """
     def with_bank(model, sensor, table, motion, temperature_c=None, references: References | None = None):
-        references = references or References(model, table, motion, temperature_c)
+        references = references or References(model, table, motion, temperature_c=temperature_c)
         ref = references.at(sensor)
-        return np.concatenate([columns(model, sensor, table, motion, temperature_c, references), *(entry.columns(ref) for entry in bank[sensor])], axis=1)
+        return np.concatenate([columns(model, sensor, table, motion=motion, temperature_c=temperature_c, references=references),
+                               *(entry.columns(ref) for entry in bank[sensor])], axis=1)
 
     reduced = []
     for part in _pieces(windows):
@@ -150,7 +152,8 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
         if progress:
             progress(len(reduced) / len(windows))
     descriptions = [_describe(window) for window in windows]
-    return ReducedRecording(model, values, bank, tuple(reduced), {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
+    return ReducedRecording(model, values, bank, tuple(reduced),
+                            {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
 
 
 def _pieces(windows):

@@ -46,17 +46,18 @@ class Saturation:
     """The same with it."""
 
     @property
-    def p_value(self):
+    def p_value(self) -> float:
         """Chance that no sample passes a level that so many are expected beyond (Poisson)."""
         return float(np.exp(-self.n_expected))
 
 
-def predictions(windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def predictions(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
     motion, temperature = joined_motion(windows)
-    references = References(model, table, motion, temperature)
+    references = References(model, table, motion, temperature_c=temperature)
     edges = np.cumsum([len(window.motion) for window in windows])[:-1]
-    outputs = [columns(model, s, table, motion, temperature, references) @ coefficients(model, s, values) for s in SENSORS]
+    outputs = [columns(model, s, table, motion=motion, temperature_c=temperature,
+                       references=references) @ coefficients(model, s, values) for s in SENSORS]
     return list(zip(*(np.split(output, edges) for output in outputs)))
 
 
@@ -80,9 +81,9 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     picked = [_thinned(window) for window in windows]
     normal = np.zeros((len(values) + 1,) * 2)
     motion, temperature = joined_motion(picked)
-    references = References(model, table, motion, temperature)
+    references = References(model, table, motion, temperature_c=temperature)
     for sensor in SENSORS:
-        design = columns(model, sensor, table, motion, temperature, references)
+        design = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references)
         outputs = [measured(w, sensor) for w in picked]
         output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
         base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
@@ -90,7 +91,7 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
         for axis in range(3):
             rows = np.column_stack([design @ slope[:, axis], output[:, axis] - design @ base[:, axis]])
             normal += weight[axis] * rows.T @ rows
-    return values + solve_normal(normal, np.arange(len(values)), sd, prior - values)[0]
+    return values + solve_normal(normal, np.arange(len(values)), sd, prior_mean=prior - values)[0]
 
 
 def _thinned(window, most=50):
@@ -111,7 +112,7 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     return bool(at > 3 * repeats[-5:].max(initial=1))
 
 
-def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, sensor: str) -> Saturation | None:
+def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, *, sensor: str) -> Saturation | None:
     """
     Return the `Saturation` of a sensor, or None.
 
@@ -140,7 +141,8 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
     return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms)
 
 
-def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str, float], noise_sd: dict[str, np.ndarray]) -> list[Window]:
+def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str, float], *,
+                    noise_sd: dict[str, np.ndarray]) -> list[Window]:
     """
     Return the windows without samples that a limit spoils: those at it, and those predicted within a few standard deviations of it.
 

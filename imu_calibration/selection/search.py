@@ -38,12 +38,12 @@ class Score:
     """Whether the estimate is physically possible."""
 
     @property
-    def net(self):
+    def net(self) -> float:
         """Gain less the penalty for the parameters."""
         return self.gain - PENALTY * self.question.penalty
 
     @property
-    def significant(self):
+    def significant(self) -> bool:
         """Return whether the effect may be named."""
         return self.allowed and self.p_value < FAMILY_WISE and self.net > 0 and self.gain > LEAST_GAIN
 
@@ -51,7 +51,7 @@ class Score:
 class Search:
     """Forward selection with reconsideration over a fixed set of questions."""
 
-    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], encoder_step: float = 0.0):
+    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], *, encoder_step: float = 0.0):
         self.evidence, self.baseline, self.questions, self.encoder_step = evidence, tuple(baseline), questions, encoder_step
         self.history = []
 
@@ -59,7 +59,7 @@ class Search:
         """Return the parameters of the baseline and of the chosen effects."""
         return self.baseline + tuple(k for q in chosen for k in q.parameters)
 
-    def others(self, chosen: Sequence[Question]) -> list[Question]:
+    def others(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the questions about effects that are not chosen."""
         names = {q.name for q in chosen}
         return [q for q in self.questions if q.name not in names]
@@ -68,7 +68,7 @@ class Search:
         """Return the held-out cost of a choice, nats, penalties included."""
         return 0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
 
-    def score(self, chosen: list[Question], question: Question) -> Score:
+    def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
         smaller, larger = self.used(chosen), self.used(chosen + [question])
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
@@ -89,7 +89,7 @@ class Search:
         largest = question.effect.largest * (1.0 if question.effect.known_size else ABSURD)
         return bool(np.all(np.abs(value) - 3 * sd < largest))
 
-    def run(self) -> list[Question]:
+    def run(self) -> Sequence[Question]:
         """Return the chosen questions in the order in which they were found."""
         chosen = []
         for _ in range(2 * MOST_FINDINGS):
@@ -105,7 +105,7 @@ class Search:
                 break
         return chosen
 
-    def reconsidered(self, chosen: list[Question]) -> list[Question]:
+    def reconsidered(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the choice after dropping what is no longer needed and replacing what a better explanation replaces."""
         for _ in range(6):
             smaller = self._dropped(chosen)
@@ -140,7 +140,7 @@ class Search:
                     best, cost = trial, value
         return best
 
-    def class_mates(self, chosen: list[Question], question: Question) -> list[tuple[Question, float]]:
+    def class_mates(self, chosen: Sequence[Question], question: Question) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most two."""
         place, cost = chosen.index(question), self.cost(chosen)
         found = {}

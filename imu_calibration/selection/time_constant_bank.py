@@ -1,11 +1,14 @@
 """Effects with a time constant are asked about at each of a bank of time constants: there their columns are linear in the amplitudes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import effect_slopes
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.reference_motion import Reference
 
 WIDE = 10.0
 """
@@ -32,21 +35,21 @@ class BankEntry:
     """Effect name and number of the time constant."""
 
     @property
-    def param_names(self):
+    def param_names(self) -> list[str]:
         """Names of the amplitudes."""
         return [f'{self.label}.{component}' for component in self.effect.amplitudes(self.effect.components)]
 
     @property
-    def prior_sd(self):
+    def prior_sd(self) -> np.ndarray:
         """Standard deviations of the amplitudes before any data."""
         return WIDE * self.effect.amplitudes(self.effect.prior_sds())
 
-    def columns(self, ref):
+    def columns(self, ref: Reference) -> np.ndarray:
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
         return np.concatenate([group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1)
 
 
-def make_bank(effects, constants, model, values):
+def make_bank(effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray) -> dict[str, list[BankEntry]]:
     """Return sensor -> list of BankEntry for those of `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
     bank = {sensor: [] for sensor in SENSORS}
     for effect in effects:

@@ -26,9 +26,10 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
         at_rest = np.zeros(3) if rest is None else rest[0] * np.maximum(rest[1], 1.0)
         slow_only[sensor], slow_variance[sensor] = np.zeros(3, bool), np.zeros(3)
         for axis in range(3):
-            (left, rank), (left_slow, rank_slow) = (least_misfit(space.within_sum(sensor, axis, moving, part)) for part in ('within', 'slow'))
+            (left, rank), (left_slow,
+                           rank_slow) = (least_misfit(space.within_sum(sensor, axis, moving, part=part)) for part in ('within', 'slow'))
             dofs = (recording.count[moving] - 1).sum() - rank, n_slow[moving].sum() - rank_slow
-            found = band_misfit(np.full(3, left), dofs[0], np.full(3, left_slow), dofs[1])
+            found = band_misfit(np.full(3, left), dofs[0], np.full(3, left_slow), dof_slow=dofs[1])
             if found.apart[0] and found.fast[0] >= 2.0 * at_rest[axis]:
                 slow_only[sensor][axis], slow_variance[sensor][axis] = True, found.slow[axis]
     return replace(space, slow_only=slow_only, slow_variance=slow_variance)

@@ -87,16 +87,17 @@ class LiveSimulation:
         temperature = temperature_at(time, self.options)
         outputs = []
         figures = ((noise.accel_density, noise.accel_resolution), (noise.gyro_density, noise.gyro_resolution))
-        for sensor, output, wander, (density, resolution) in zip(SENSORS, predict(self.model, self.values, self.table, motion, temperature),
+        for sensor, output, wander, (density, resolution) in zip(SENSORS, predict(self.model, self.values, self.table, motion=motion,
+                                                                                  temperature_c=temperature),
                                                                  self._wander, figures):
             white = self._rng.normal(0.0, density * np.sqrt(self.options.imu_rate), output.shape)
-            outputs.append(clip(self.model, sensor, self.values, quantise(output + white + wander.take(len(output)), resolution)))
+            outputs.append(clip(self.model, sensor, self.values, output=quantise(output + white + wander.take(len(output)), resolution)))
         jitter = np.round(self._rng.normal(0.0, noise.stamp_jitter * 1e9, len(time))).astype(np.int64) if noise.stamp_jitter else 0
         stamps = self._stamps(time) + jitter
         return ImuSamples(stamps, *outputs, self.options.frame_id), self._truth(stamps, motion)
 
     def _truth(self, stamps, motion):
-        felt = [warped_reference(self.model, sensor, self.table, motion) for sensor in SENSORS]
+        felt = [warped_reference(self.model, sensor, self.table, motion=motion) for sensor in SENSORS]
         force = felt[0].force_s
         arm = self.model.value('accelerometer', Role.ARM, self.values)
         if arm is not None:

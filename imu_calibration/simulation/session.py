@@ -102,7 +102,7 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     time = np.arange(n_imu) / options.imu_rate
     outputs = _outputs(model, values, table, profile, time, options)
     force, rate = add_imu_noise(outputs[0], outputs[1], options.noise, sample_rate=options.imu_rate, rng=rng)
-    force, rate = (clip(model, sensor, values, output) for sensor, output in zip(SENSORS, (force, rate)))
+    force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, (force, rate)))
     stamps = jitter_stamps(START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
     joint_time = (np.arange(n_joint) + 0.5) / options.joint_rate
@@ -117,7 +117,7 @@ def _outputs(model, values, table, profile, time, options):
     parts = []
     for start in range(0, len(time), BLOCK):
         now = time[start:start + BLOCK]
-        parts.append(predict(model, values, table, profile.at(now), temperature_at(now, options)))
+        parts.append(predict(model, values, table, motion=profile.at(now), temperature_c=temperature_at(now, options)))
     return tuple(np.concatenate(sensor) for sensor in zip(*parts))
 
 

@@ -109,7 +109,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     if earlier is not None and table is None:
         raise InputError('an earlier calibration must be compared on a table, none came; give its description', key='table')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    table = None if table is None else table_of(table, recordings, topics, choices.get('gravity'))
+    table = None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))
     for path in recordings:
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=table is not None).close()

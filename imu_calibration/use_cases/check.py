@@ -73,7 +73,7 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         raise InputError('a calibration must be checked against a reference, none came; give the description of the table', key='table')
     if not isinstance(recording, SampleBlock):
         open_bag(recording, topics, want_joints=True).close()
-    table = table_of(table, [recording], topics, choices.get('gravity'))
+    table = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, table.joint_names)
     return Checked(check_on_table([source], table, calibration, options, names=[name_of(recording)]), _notes(recording, calibration))
 

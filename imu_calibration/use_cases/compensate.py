@@ -1,5 +1,6 @@
 """From a recording and a calibration to corrected samples, in memory or in a new bag."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -38,8 +39,8 @@ class Compensated:
 
 def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration: Calibration | str | PathLike, *,
                output: str | PathLike | None = None, corrected_topic: str = CORRECTED_TOPIC, target_frame: str = '',
-               target_xyz=(0.0, 0.0, 0.0), target_rpy=(0.0, 0.0, 0.0), correct_stamps: bool = False, anyway: bool = False,
-               noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
+               target_xyz: Sequence[float] = (0.0, 0.0, 0.0), target_rpy: Sequence[float] = (0.0, 0.0, 0.0), correct_stamps: bool = False,
+               anyway: bool = False, noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
                temperature_topic: str | None = None) -> Compensated:
     """
     Take the calibrated errors out of a recording.
@@ -97,8 +98,9 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
             parts = [_corrected(block.imu, correct(block.imu), transfer, late) for block in bag.blocks() if block.imu is not None]
             return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost)
         from msg_adapters.copying import copy_with_corrected
-        lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic, correct, stream.propagate, target_frame or None,
-                                   None if transfer is None else transfer.mat_ts, late)
+        lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic=corrected_topic, correct=correct,
+                                   propagate=stream.propagate, frame_id=target_frame or None,
+                                   mat_ts=None if transfer is None else transfer.mat_ts, late_ns=late)
         return _outcome(None, stream, lost)
 
 

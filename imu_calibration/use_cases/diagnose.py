@@ -10,13 +10,12 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
-from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import provenance_of, source_of
-from imu_calibration.use_cases.stand import table_of
+from imu_calibration.use_cases.stand import Stand, table_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ class Diagnosed:
         return ''.join(f'<p>{escape(line)}</p>' for line in self.result.lines)
 
 
-def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Table | None = None, **choices: Unpack[Choices]) -> Diagnosed:
+def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> Diagnosed:
     """
     Say what the model gets wrong on a recording and why, and extend it.
 
@@ -98,11 +97,11 @@ def diagnose(recording: str | PathLike | SampleBlock, table: str | PathLike | Ta
     check_names(choices)
     options = calibration_options(choices)
     topics = topics_of(choices)
-    table = None if table is None else table_of(table, [recording], topics, choices.get('gravity'))
+    table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
     names = None if table is None else table.joint_names
     source = source_of(recording, topics, names, want_joints=table is not None)
     provenance = provenance_of([recording], kept(choices))
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:
-            return Diagnosed(diagnose_without_table(source, options, provenance, advance))
-        return Diagnosed(diagnose_recording(source, table, options, provenance, advance))
+            return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))
+        return Diagnosed(diagnose_recording(source, table, options, provenance=provenance, progress=advance))

@@ -47,13 +47,13 @@ class Look:
         return 3 if self.refused or self.lost or dropped or unusable(self.findings) else 0
 
 
-def imu_topics_of(bag: PathLike, topics: Topics) -> list[Topics]:
+def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """Return the topics with the Imu topic that was asked for, or with each one that the recording has."""
-    names = [topics.imu] if topics.imu is not None else imu_topics(list_topics(bag)) or [None]
-    return [topics._replace(imu=name) for name in names]
+    names = [topics.imu] if topics.imu is not None else imu_topics(list_topics(bag)) 
+    return [topics._replace(imu=name) for name in names] or [topics]
 
 
-def inspect(bag: PathLike, topics: Iterable[Topics], table: Table | None, options: CalibrationOptions) -> list[Look]:
+def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[Look]:
     """Look at each Imu topic of a recording, with the joints and temperatures that go with it."""
     return [_look(bag, each, table, options) for each in topics]
 

@@ -2,19 +2,21 @@
 
 import multiprocessing
 import os
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any
 
 from imu_calibration.errors import InputError
 
 
-def jobs_for(asked, n_items):
+def jobs_for(asked: int | None, n_items: int) -> int:
     """Return the number of processes: what was asked for, else one per processor; never more than there are items."""
     if asked is not None and asked < 1:
         raise InputError(f'at least one process must work, got {asked}; leave the number out to use every processor', key='jobs')
     return max(1, min(asked or os.cpu_count() or 1, n_items))
 
 
-def process_mapper(jobs, done=lambda item: None):
+def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
     """
     Return a function like `map` that runs in `jobs` processes and returns a list in the order of the items.
 
@@ -51,7 +53,7 @@ def _in_order(futures, as_completed, done, pool):
     return [future.result() for future in futures]
 
 
-def cluster_mapper(address, done=lambda item: None):
+def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: None) -> Callable:
     """
     Return a function like `map` that runs on the workers of a dask scheduler; they must see the same paths and have this package.
 

@@ -1,11 +1,12 @@
 """A progress bar on standard error, only on a terminal."""
 
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
 @contextmanager
-def progress_bar(label, total, unit='samples'):
+def progress_bar(label: str, total: int, unit: str = 'samples') -> Iterator[Callable]:
     """Give a function that is called with the number of items done since the last call."""
     if not sys.stderr.isatty() or not total:
         yield lambda count: None

@@ -29,6 +29,10 @@ class Topics(NamedTuple):
     temperature: str | None = None
     """sensor_msgs/Temperature, default /imu/temperature."""
 
+    def chosen(self) -> dict[str, str | None]:
+        """Return them as arguments of `msg_adapters.bag.open_recording`."""
+        return {f'{name}_topic'.replace('joints', 'joint'): topic for name, topic in self._asdict().items()}
+
 
 def existing(path: str | PathLike) -> Path:
     """Return the path of a bag that is there."""
@@ -39,13 +43,13 @@ def existing(path: str | PathLike) -> Path:
 
 def open_bag(path: str | PathLike, topics: Topics, *, want_joints: bool | str = True, want_temperature: bool | str = True) -> Recording:
     """Open a recording with the topics that were chosen; the rest as for `msg_adapters.bag.open_recording`."""
-    return open_recording(existing(path), *topics, want_joints=want_joints, want_temperature=want_temperature)
+    return open_recording(existing(path), **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
 
 
-def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, want_joints: bool | str, want_temperature: bool | str,
+def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *, want_joints: bool | str, want_temperature: bool | str,
                 quiet: bool) -> Iterator[SampleBlock]:
     """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
-    recording = open_recording(path, *topics, want_joints=want_joints, want_temperature=want_temperature)
+    recording = open_recording(path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
     total = 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)
     with recording, progress_bar(Path(path).name, total) as advance:
         with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
@@ -66,7 +70,8 @@ def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics()
     """
     if isinstance(recording, SampleBlock):
         return partial(iter, (recording if want_joints else SampleBlock(recording.imu, None, recording.temperature),))
-    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints, want_temperature, quiet)
+    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints=want_joints, want_temperature=want_temperature,
+                   quiet=quiet)
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
-from imu_calibration.samples import SampleBlock
+from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
@@ -42,7 +43,7 @@ class Simulated:
         """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
         from msg_adapters.write import write_session
         samples, packed = self.samples, {} if compression == 'none' else {'compression': compression}
-        write_session(path, samples.imu, samples.joints, samples.temperature, storage=storage, **packed)
+        write_session(path, cast(ImuSamples, samples.imu), samples.joints, temperature=samples.temperature, storage=storage, **packed)
         files.write_text(Path(path) / 'truth.yaml', calibration_to_text(self.truth))
         files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
 

@@ -41,7 +41,7 @@ Stand = str | PathLike | Table | Arm
 """A table description or a robot description (file), a table, or an arm."""
 
 
-def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = (), topics: Topics = Topics(),
+def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = (), topics: Topics = Topics(), *,
              gravity: float | None = None) -> Table:
     """
     Return the chain of joints that a stand comes to.

@@ -76,7 +76,7 @@ def oracle(recording, effect):
     search = found.attempt.search
     best = min(told, key=lambda q: search.evidence.loss(search.used([q])))
     sensors = sensors_of(best.effect)
-    pair = [heldout_gain(found.attempt, [], choice, sensors) for choice in (found.named, [best])]
+    pair = [heldout_gain(found.attempt, [], choice, sensors=sensors) for choice in (found.named, [best])]
     alike = (pair[0].measure, pair[0].sensor) == (pair[1].measure, pair[1].sensor)
     return pair[0].heldout_rms_after / pair[1].heldout_rms_after if alike else None
 

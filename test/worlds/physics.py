@@ -152,7 +152,7 @@ def write_bag(session, path, **options):
     from msg_adapters.write import write_session
     if session.covariance is not None:
         options.update({f'{name}_cov': variance * np.eye(3) for name, variance in session.covariance.items()})
-    write_session(path, session.imu, session.joints, session.temperature, **options)
+    write_session(path, session.imu, session.joints, temperature=session.temperature, **options)
 
 
 def _noise_model(noise, grade, encoder_resolution):

@@ -1,10 +1,11 @@
 """What the model of a calibration by hand gets wrong: the same search, on poses and turns instead of windows on a table."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import HandCalibration, solve_by_hand
+from imu_calibration.by_hand.calibrate import HandCalibration, HandData, solve_by_hand
 from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
@@ -44,7 +45,7 @@ class _Inquiry:
     def __init__(self, blocks, space, questions, baseline):
         smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
         self.blocks, self.space, self.questions = blocks, space, questions
-        self.evidence = HandEvidence(blocks, space, smooth, baseline)
+        self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
 
     def without(self, poses):
@@ -68,7 +69,7 @@ class _Inquiry:
         return removed / (removed + rest) if removed > 0 else 0.0
 
 
-def diagnose_by_hand(data, options=HandOptions(), progress=None):
+def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandDiagnosis:
     """
     Say what a calibration by hand gets wrong, and why.
 
@@ -104,7 +105,7 @@ def diagnose_by_hand(data, options=HandOptions(), progress=None):
     baseline = solve_by_hand(data, options)
     effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
     constants = time_constants(float(poses.time[-1]))
-    blocks, space = build_rows(baseline, data.turns, effects, constants)
+    blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
     base = tuple(np.flatnonzero(~_held(baseline)))
     questions = _questions(effects, blocks, space, base, not_testable)
@@ -146,7 +147,7 @@ def _why_not(effect, poses, turns):
 def _questions(effects, blocks, space, base, not_testable):
     """Return the questions; an effect that the baseline imitates in these poses is moved to those not testable."""
     by_name, asked = {e.name: e for e in effects}, []
-    probe = HandEvidence(blocks, space, (), base)
+    probe = HandEvidence(blocks, space, (), baseline=base)
     for label in space.names:
         part, name = space.parts[label], label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))
@@ -154,7 +155,8 @@ def _questions(effects, blocks, space, base, not_testable):
         if rank:
             asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
     lacking = sorted(by_name.keys() - {q.name for q in asked})
-    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it', 'needs': 'more poses, in steps of 30 degrees about each axis'}
+    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it',
+                      'needs': 'more poses, in steps of 30 degrees about each axis'}
                      for name in lacking]
     return asked
 
@@ -223,9 +225,10 @@ def _assembled(baseline, hand, inquiry, named, held_out, not_testable):
     def gain_of(place):
         return _gain(inquiry, held_out, named[:place], named[:place + 1], named[place].sensor)
 
-    findings = tuple(finding(inquiry.search, named, place, after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
+    findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
                      for place in range(len(named)))
     gain = _gain(inquiry, held_out, [], named, named[0].sensor) if named else None
     count = len(baseline.poses.start)
-    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, s) for s in SENSORS}, candidates_of(inquiry.search, named), tuple(not_testable), before, after,
+    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, sensor=s) for s in SENSORS}, candidates_of(inquiry.search, named),
+                     tuple(not_testable), before, after,
                      gain, traces_of(baseline, hand), count, count if named else 0)

@@ -44,7 +44,7 @@ class HandEvidence(Evidence):
 
     """
 
-    def __init__(self, blocks: Sequence[Block], space: HandSpace, smooth: Sequence[int], baseline: Sequence[int]):
+    def __init__(self, blocks: Sequence[Block], space: HandSpace, smooth: Sequence[int], *, baseline: Sequence[int]):
         super().__init__(space.prior_sd, np.zeros(space.size))
         self.blocks, self.space = blocks, space
         self._noise = [_noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))]) for block in blocks]
@@ -58,7 +58,7 @@ class HandEvidence(Evidence):
         white = []
         for block, (variance, processes), fold in zip(self.blocks, self._noise, self.folds):
             kept = fold != number
-            whitening = Whitening(variance[kept], block.time[kept], [np.arange(kept.sum())], processes)
+            whitening = Whitening(variance[kept], block.time[kept], [np.arange(kept.sum())], processes=processes)
             white.append(whitening(block.rows[kept]).reshape(-1, self.space.size + 1))
         return white
 
@@ -135,7 +135,7 @@ def _noise(block, used):
     count, axes, width = block.rows.shape
     basis = _basis(block.rows.reshape(-1, width)[:, used])
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
-    likelihood = NoiseLikelihood(rows, block.known, block.time, [np.arange(count)])
+    likelihood = NoiseLikelihood(rows, block.known, block.time, sessions=[np.arange(count)])
     biases = [(share, time) for share in BIASES[1:] for time in TIMES] if block.name == 'poses' else []
     shapes = [(offset, share * max(offset, 1.0), time) for offset in OFFSETS for share, time in [(0.0, TIMES[0]), *biases]]
     offset, bias, time = min(shapes, key=likelihood.loss)

@@ -1,15 +1,19 @@
 """What a diagnosis by hand hands back besides its findings: solutions, residuals of the poses, and what stays unexplained."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.questions import Question
 
 
-def as_solution(hand):
+def as_solution(hand: HandCalibration) -> Solution:
     """Return a HandCalibration as the `Solution` that documents and reports know."""
     model = hand.model.model
     order = [hand.param_names.index(name) for name in model.param_names]
@@ -33,17 +37,17 @@ def _rates_left(hand):
     return poses.rate - hand.gyroscope[0] - more
 
 
-def traces_of(baseline, hand):
+def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
     poses = hand.poses
     true = hand.gravity * hand.state.up
     errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': _rates_left(h)} for h in (baseline, hand)]
     count = len(poses.start)
-    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, *errors,
-                  (poses.stop - poses.start).astype(float), None)
+    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, errors[0],
+                  errors[1], (poses.stop - poses.start).astype(float), None)
 
 
-def rest_of(hand, inquiry, named, sensor):
+def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, sensor: str) -> Unexplained:
     """Return what stays unexplained of one sensor: its rows at rest and its turns against what noise leaves."""
     used = list(inquiry.search.used(named))
     residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
@@ -75,4 +79,5 @@ def _explanations(hand):
     every = np.ones(len(up), bool)
     yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
     yield 'direction of gravity', up, every
-    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2], up[:, 0] * up[:, 2]], axis=1), every
+    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
+                                            up[:, 0] * up[:, 2]], axis=1), every

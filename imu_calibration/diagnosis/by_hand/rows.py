@@ -1,13 +1,15 @@
 """A recording without a table as rows of linear equations: norms of gravity in poses, rates at rest, directions after turns."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.by_hand.equations import tangent
+from imu_calibration.by_hand.calibrate import HandCalibration
+from imu_calibration.by_hand.equations import TurnData, tangent
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.reference.reference_motion import skew
 from imu_calibration.selection.bias_process_search import NATURAL
@@ -51,7 +53,8 @@ class HandSpace:
     """Number of parameters."""
 
 
-def build_rows(hand, turns, effects, constants):
+def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequence[Effect], *,
+               constants: np.ndarray) -> tuple[list[Block], HandSpace]:
     """
     Return (blocks, HandSpace).
 
@@ -67,7 +70,7 @@ def build_rows(hand, turns, effects, constants):
         Time constants at which warm-ups are asked about, s.
 
     """
-    sets = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
+    sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
     sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
     base = hand.model.size
     sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
@@ -75,7 +78,8 @@ def build_rows(hand, turns, effects, constants):
     space = HandSpace(tuple(label for _, label, _ in sets), {s[1]: slice(a, b) for s, a, b in zip(sets, ends, ends[1:])},
                       np.concatenate([1e3 * hand.model.priors, *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))]), int(ends[-1]))
     at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
-                               hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label, tau in sets}
+                               hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label,
+               tau in sets}
     sensor_of = {label: effect.sensor for effect, label, _ in sets}
     moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
     blocks = [_norm_block(hand, space, at_rest, sensor_of), _rest_block(hand, space, at_rest, sensor_of)]
