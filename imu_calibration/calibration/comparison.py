@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from imu_calibration.calibration.status import HELD
+from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 
 LEVEL = 0.01
@@ -78,7 +79,8 @@ def compare(first, second):
     groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
     rejected = _holm(groups)
     lines = notes + [f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}' for name, chi2, k, p in groups if name in rejected]
-    if any(name.endswith('.matrix') for name in rejected) and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
+    linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
+    if rejected & linear and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append('off-diagonal terms of a matrix include how the IMU was mounted on the table: mounted anew they differ without a change of the IMU')
     if held.any():
         lines.append(f'{int(held.sum())} parameters are held in one of them and were not compared')
