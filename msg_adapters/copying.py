@@ -75,8 +75,8 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
 def _check(recording, corrected_topic):
     bag, name = recording.source, recording.imu_topic
     if bag.ros1:
-        raise InputError(f"{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with "
-                         f"'rosbags-convert --src {recording.path} --dst NEW' (pip install rosbags)")
+        raise InputError(f"{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the command "
+                         "'rosbags-convert' (pip install rosbags)")
     if not is_standard(IMU_TYPE, *bag.definitions.get(IMU_TYPE, ('', ''))):
         raise InputError(f'{recording.path} must be a rosbag2 recording with the standard Imu definition; convert it first')
     foreign = [topic.name for topic in recording.topics if ' ' in topic.type]

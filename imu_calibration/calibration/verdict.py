@@ -206,7 +206,7 @@ def _adopted(calibration):
     """Return notes on what the recording did to the model."""
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, f'added to the model, because the recording demands it: {", ".join(_with_size(calibration, name) for name in added)}',
-                    "see 'imu_calibration diagnose' for the evidence; --model-as-asked leaves it out")] if added else []
+                    "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
     notes += [Reason(NOTE, f'the halves of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
     return notes + [Reason(NOTE, f'{name}: {why}', '') for name, why in (calibration.statistics.get('not_believed') or {}).items()]
