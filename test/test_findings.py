@@ -69,3 +69,16 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
 def test_both_diagnoses_put_findings_together_in_one_place():
     assert on_a_table.finding is by_hand.finding is finding
     assert on_a_table.candidates_of is by_hand.candidates_of is candidates_of
+
+
+def test_what_explains_much_but_leaves_most_is_said():
+    """An effect that explains thousands of nats is not passed over in silence because it may not be named."""
+    from imu_calibration.diagnosis.result import Candidate
+    from imu_calibration.diagnosis.sentences import LEAVES_MOST
+    from imu_calibration.diagnosis.workflow import nothing_named
+
+    class Told:
+        candidates = (Candidate('time_offset', 'reference', 4321.0, 0.0, 4321.0, 0.0, LEAVES_MOST),)
+    assert 'time_offset explains much (4321 nats' in nothing_named(Told)
+    Told.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
+    assert nothing_named(Told).startswith('nothing found')

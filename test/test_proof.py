@@ -67,6 +67,7 @@ def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
     for k, block in enumerate(dealt.blocks):
         if k % held_out.FOLDS != 2:
             rest.merge(block.accumulator)
+    assert not rest.blocks   # memory that nobody needs
     again = solve(rest, result.model, noise=result.solution.noise)
     free = ~(result.solution.held | again.held)
     step, wanted = ((values - result.solution.values)[free] / result.solution.sd[free] for values in (without[2], again.values))

@@ -13,6 +13,7 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import restrict
+from imu_calibration.estimation.shrinkage import shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.preflight.joint_checks import check_units
 
@@ -89,7 +90,7 @@ def solve_gathered(gathered, model, options=CalibrationOptions()):
     if options.accelerometer_model is None and _size_effect_unseen(solution):
         smaller = narrow.without_arms()
         solution = solve(restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes)
-    return solution
+    return shrunk(solution, _by_default(solution.model, options))
 
 
 def conclude(solution, gathered, model, table, options=CalibrationOptions(), provenance=None, changes=ModelChanges()):
@@ -100,6 +101,13 @@ def conclude(solution, gathered, model, table, options=CalibrationOptions(), pro
     calibration = document(solution, tolerances, table, gathered, needed, provenance, proof, changes)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
+
+
+def _by_default(model, options):
+    """Return the parameters of each effect that is in the model unasked: levelling, the Earth's rate, arms of the accelerometers."""
+    arms = options.accelerometer_model is None
+    return [model.slices[effect.key] for effect in model.effects if effect.role is Role.ARMS and arms
+            or effect.sensor == 'reference' and effect.nuisance and options.reference_model is None and effect.key not in options.added]
 
 
 def _size_effect_unseen(solution):

@@ -74,6 +74,8 @@ def statistics(solution, gathered):
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
         if sensor in solution.session_biases:
             result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
+    if solution.not_believed:
+        result['not_believed'] = dict(solution.not_believed)
     accumulator = gathered.accumulator
     result['windows'] = dict(sorted(accumulator.windows.items()))
     result['samples_used'] = dict(sorted(accumulator.samples.items()))

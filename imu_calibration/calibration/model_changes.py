@@ -11,9 +11,7 @@ class ModelChanges:
     """Taken into the model because the recording demands them."""
     denied: tuple[str, ...] = ()
     """Not taken in because the halves of the recording disagree on them; the standard deviations allow for them."""
-    held: dict[str, str] | None = None
-    """Effect or parameter -> why it has no value of its own although the recording seems to give it one."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        return {name: value for name, value in (('added', list(self.added)), ('denied', list(self.denied)), ('not_believed', dict(self.held or {}))) if value}
+        return {name: value for name, value in (('added', list(self.added)), ('denied', list(self.denied))) if value}

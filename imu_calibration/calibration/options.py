@@ -23,7 +23,7 @@ class CalibrationOptions:
     gyroscope_model: str | None = None
     """The same; None: bias+matrix."""
     reference_model: str | None = None
-    """Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when latitude or azimuth is unknown."""
+    """Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when only the azimuth is unknown."""
     tolerances: dict = field(default_factory=dict)
     """{section: {effect: tolerance}}."""
     windows: WindowSettings = WindowSettings()

@@ -209,7 +209,14 @@ def _adopted(calibration):
                     "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
     notes += [Reason(NOTE, f'the halves of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
-    return notes + [Reason(NOTE, f'{name}: {why}', '') for name, why in (calibration.statistics.get('not_believed') or {}).items()]
+    strange = calibration.statistics.get('not_believed') or {}
+    return notes + ([Reason(NOTE, f'held, because only what the model misses gives them a value, and one that no sensor has: {_strange(strange)}',
+                            'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
+
+
+def _strange(values):
+    """Return names with the values they would have had; of many, the first ones."""
+    return ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES]) + (' ...' if len(values) > SHOWN_NAMES else '')
 
 
 def _with_size(calibration, name):

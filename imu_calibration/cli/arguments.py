@@ -43,7 +43,7 @@ def add_model_arguments(parser: ArgumentParser) -> _ArgumentGroup:
                        'and accel_size_effect when the recording holds rotation that shows it')
     group.add_argument('--gyroscope-model', metavar='MODEL', help='the same for the gyroscope; default bias+matrix')
     group.add_argument('--reference-model', metavar='MODEL', help="effects of table and clock joined by +, or 'none'; default table_tilt, "
-                       'and earth_rate when latitude or azimuth is unknown')
+                       'and earth_rate when only the azimuth is unknown')
     group.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
     group.add_argument('--nominal', metavar='FILE', help='YAML with accelerometer_offset, accelerometer_scale, gyroscope_offset, '
                        'gyroscope_scale for recordings in volts or counts')

@@ -24,6 +24,10 @@ class FittedErrors(Protocol):
         """Their covariance, shape (n_params, n_params)."""
 
     @property
+    def status(self) -> tuple[str, ...]:
+        """How well each parameter is known: 'determined', 'weak' or 'held'."""
+
+    @property
     def frame_id(self) -> str:
         """Frame of the messages that it was made from."""
 

@@ -20,6 +20,9 @@ from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.gain import Gain, heldout_gain
 from imu_calibration.selection.investigation import Investigation, investigate
 
+MATE = 0.5
+"""What would do as well as a finding takes at least this share of what the finding takes off the residual of the sensor that shows it."""
+
 
 def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
              bias_processes: dict | None = None) -> Diagnosis:
@@ -77,12 +80,17 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     def gain_of(place):
         return heldout_gain(attempt, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
 
+    def shows(place, mate, gain):
+        return gain.sensor in sensors_of(mate.effect) and MATE * gain.reduction <= heldout_gain(
+            attempt, named[:place], [*named[:place], mate], sensors=[gain.sensor]).reduction
+
     def motion_of(question, mate):
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
-    findings += [finding(attempt.search, named, place, solution=told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of)
+    findings += [finding(attempt.search, named, place, solution=told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
+                         shows=shows)
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named),

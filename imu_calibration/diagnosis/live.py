@@ -10,7 +10,7 @@ from imu_calibration.calibration.by_evidence import baseline_model
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.result import Diagnosis
-from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words
+from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words, nothing_named
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.estimation.window_store import owned_window
@@ -139,8 +139,7 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
     values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor)
                for sensor, found in diagnosis.unexplained.items() if found.significant}
     if not diagnosis.findings:
-        nothing = 'nothing found: no effect of the catalogue explains more than noise does'
-        return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing, values)
+        return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
     first = diagnosis.findings[0]
     message = f'{first.effect}: {first.explanation}'
     if first.indistinguishable_from:

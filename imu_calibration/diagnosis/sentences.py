@@ -20,6 +20,9 @@ READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), '
             '(rad/s)/(m/s^2)': (DEG / STANDARD_GRAVITY, 'deg/s/g')}
 """SI unit -> (size of the readable unit in SI, its name)."""
 
+LEAVES_MOST = 'refused: it leaves most of the unexplained where it was'
+"""Verdict on an effect that is significant, but removes too small a share."""
+
 
 def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
     """
@@ -100,7 +103,7 @@ def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collecti
     if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
         return 'refused: its size is impossible, or within the steps of the encoders'
     if beside is not None and beside.significant:
-        return 'refused: it leaves most of the unexplained where it was'
+        return LEAVES_MOST
     if alone.significant:
-        return 'not needed beside the findings' if found else 'refused: it leaves most of the unexplained where it was'
+        return 'not needed beside the findings' if found else LEAVES_MOST
     return 'no evidence'

@@ -16,11 +16,15 @@ from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
+from imu_calibration.diagnosis.sentences import LEAVES_MOST
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.units import for_people, significant
+
+MUCH = 100.0
+"""Gain of held-out log likelihood from which an effect that is refused is worth a word, nats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +138,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
         if finding.indistinguishable_from:
             lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
     if not diagnosis.findings:
-        lines.append('nothing found: no effect of the catalogue explains more than noise does')
+        lines.append(nothing_named(diagnosis))
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
@@ -142,6 +146,15 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
+
+
+def nothing_named(diagnosis: Diagnosis) -> str:
+    """Return why nothing was named: nothing explains more than noise, or what explains much leaves most of the rest."""
+    much = [row for row in diagnosis.candidates if row.verdict == LEAVES_MOST and row.gain_alone > MUCH]
+    if not much:
+        return 'nothing found: no effect of the catalogue explains more than noise does'
+    return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), but leaves most of the rest, '
+            'so that something else may be the cause of both')
 
 
 def in_words(value: float, sensor: str) -> str:

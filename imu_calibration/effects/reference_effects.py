@@ -79,8 +79,10 @@ def _earth(values, point):
 
 
 def _earth_known(table):
-    """Return why the Earth's rate cannot be asked about: it is in the reference."""
-    if table.latitude is None or table.azimuth_deg is None:
+    """Return why the Earth's rate cannot be asked about: nobody says where the table stands, or it is in the reference."""
+    if table.latitude is None:
+        return 'the table gives no latitude, so the rotation of the Earth is not modelled', 'give latitude and height in the table description'
+    if table.azimuth_deg is None:
         return None
     return 'the reference holds the rotation of the Earth already, from latitude and azimuth', 'leave the azimuth out of the table description'
 

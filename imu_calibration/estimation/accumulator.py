@@ -91,12 +91,15 @@ class Accumulator(_CentredRows):
     """The centred rows once more, part by part in order of time."""
     block_length: int = 1
     """Windows per block."""
+    in_blocks: bool = True
+    """Whether blocks are kept; without them standard deviations are those of noise alone."""
 
     def add(self, window: WindowStatistics) -> None:
         """Take one window (WindowStatistics)."""
         self._stack_window(window)
         self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + window.sensors[SENSORS[0]].slow_rows
-        self._add_to_blocks(window)
+        if self.in_blocks:
+            self._add_to_blocks(window)
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
         if len(self.rows) > CAPACITY:
@@ -105,7 +108,8 @@ class Accumulator(_CentredRows):
     def copy(self) -> 'Accumulator':
         """Return an accumulator that goes its own way; rows and factors are never changed in place."""
         maps = (dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows'))
-        return Accumulator(list(self.rows), *maps, [block.copy() for block in self.blocks], self.block_length)
+        return Accumulator(list(self.rows), *maps, [block.copy() for block in self.blocks], self.block_length,
+                           self.in_blocks)
 
     def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
@@ -115,7 +119,7 @@ class Accumulator(_CentredRows):
         self.rows.extend(other.rows)
         for kind, count in other.samples.items():
             self._count(kind, count, other.windows[kind])
-        self.blocks.extend(block.copy() for block in other.blocks)
+        self.blocks.extend(block.copy() for block in other.blocks if self.in_blocks)
         self.block_length = max(self.block_length, other.block_length)
         self._join_blocks()
         while len(self.rows) > CAPACITY:
@@ -154,9 +158,11 @@ class Accumulator(_CentredRows):
                 thinned.append(first)
                 index += 1
                 continue
-            place = int(self.block_of(np.array([first.session]), np.array([first.time]))[0])
+            parts = [self.within]
+            if self.blocks:
+                parts.append(self.blocks[int(self.block_of(np.array([first.session]), np.array([first.time]))[0])].within)
             for sensor in SENSORS:
-                for factors in (self.within, self.blocks[place].within):
+                for factors in parts:
                     stack(factors, (sensor, first.kind), _difference(first, second, sensor))
             thinned.append(_joined(first, second))
             index += 2
@@ -211,7 +217,7 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
     small.within, small.slow = (_chosen(factors, chosen) for factors in (accumulator.within, accumulator.slow))
     small.blocks = [replace(block, within=_chosen(block.within, chosen), slow=_chosen(block.slow, chosen)) for block in accumulator.blocks]
-    small.block_length = accumulator.block_length
+    small.block_length, small.in_blocks = accumulator.block_length, accumulator.in_blocks
     small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
     return small
 

@@ -44,6 +44,10 @@ class ModelError:
         """Return the covariance that noise alone gives, grown by what the model misses."""
         return covariance * np.outer(self.factor, self.factor) + np.diag(self.added_variance)
 
+    def without(self, covariance: np.ndarray) -> np.ndarray:
+        """Return what noise alone gives, from a covariance that has grown."""
+        return (covariance - np.diag(self.added_variance)) / np.outer(self.factor, self.factor)
+
 
 def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray) -> ModelError:
     """

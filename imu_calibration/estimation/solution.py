@@ -1,6 +1,6 @@
 """What a solve hands back: parameters, covariance, noise, quality of the fit."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +34,13 @@ class Solution:
 
     model_error: ModelError | None = None
     """What the covariance has grown by, beyond what noise gives."""
+
+    not_believed: dict[str, float] = field(default_factory=dict)
+    """Held parameter -> the value that it would have had, beyond what is known of any sensor and within what misfit can feign."""
+
+    def at(self, values: np.ndarray) -> 'Solution':
+        """Return the same with other values, shape (n_params,)."""
+        return replace(self, values=values)
 
     @property
     def param_names(self) -> list[str]:

@@ -12,6 +12,7 @@ from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.unbelievable import unbelievable
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
 
@@ -72,14 +73,22 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     values = _minimised(system, values, factors, free)
     held = _undetermined(system, values, factors, free)
     _refuse(held | ~free, held, model, allow_holding)
-    if held.any():
-        values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
-    data = system.jacobian(values, factors)
-    covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
+    not_believed: dict[str, float] = {}
+    while True:
+        if held.any():
+            values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
+        data = system.jacobian(values, factors)
+        covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
+        strange = unbelievable(system, values, sd=np.sqrt(np.diag(covariance)), noises=noises, free=free & ~held)
+        if not allow_holding or not strange.any() or (held | strange | ~free).all():
+            break
+        not_believed |= {name: float(value) for name, value, flag in zip(model.param_names, values, strange) if flag}
+        held |= strange
     error = model_error(system, values, noises, free=free & ~held)
     covariance = error.added(covariance)
     chi2, rms = _fit_quality(system, values, noises)
-    return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error)
+    return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
+                    not_believed)
 
 
 def _refuse(without, held, model, allow_holding):

@@ -28,6 +28,8 @@ from imu_calibration.selection.saturation import (
 
 LINEARISATIONS = 3
 """Times that the columns are taken anew, at most."""
+LEAST_REDUCTION = 0.01
+"""Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of the locked windows, for sure."""
 LEAST_WINDOWS = 8
 """Fewer windows leave none to hold out."""
 
@@ -96,14 +98,14 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     chosen = [question for question in chosen if '@' not in question.label]
     report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
-    named, denied = _agreed(attempt, _that_help(attempt, pruned(chosen, explained.share)))
+    named, denied = _agreed(attempt, explained, _that_help(attempt, explained, pruned(chosen, explained.share)))
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
         attempt = attempted(point=attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
         again, denied = ([next(q for q in attempt.questions if q.label == question.label) for question in some] for some in (named, denied))
-        named = _that_help(attempt, pruned(again, explained.share))
+        named = _that_help(attempt, explained, pruned(again, explained.share))
     return Investigation(used, attempt, explained, named, limits, not_testable, denied)
 
 
@@ -113,19 +115,19 @@ def too_few_windows(count: int) -> NotObservableError:
                               f'{count} were found; rest in more poses, or spin and swing the table')
 
 
-def _agreed(attempt, named):
+def _agreed(attempt, explained, named):
     """Return (findings on which both halves of the recording agree, those on which they do not), the worst taken out first."""
     denied = [question for question in named if not attempt.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in denied]
-    return _that_help(attempt, kept) if denied else kept, denied
+    return _that_help(attempt, explained, kept) if denied else kept, denied
 
 
-def _that_help(attempt, named):
+def _that_help(attempt, explained, named):
     """
     Return the findings that are possible and predict the locked windows better, one at a time the least helpful taken out.
 
-    Without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes evidence of anything that
-    goes with it: there the plain residual of the locked windows must fall.
+    Likelihood alone is not enough: without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes
+    evidence of anything that goes with it. So the plain residual of the locked windows, in the unit of the sensor, must fall too.
     """
     kept = [question for question in named if attempt.search.allowed(named, question)]
     while kept:
@@ -133,14 +135,25 @@ def _that_help(attempt, named):
         if min(helps) >= 0.0:
             break
         del kept[int(np.argmin(helps))]
-    if not attempt.recording.moving.all():
-        return kept
     while kept:
-        least = [heldout_gain(attempt, [q for q in kept if q is not each], kept, sensors=sensors_of(each.effect)).ci95[0] for each in kept]
-        if not np.min(least) <= 0.0:
+        least = [_sure_reduction(attempt, kept, each) for each in kept]
+        short = [paid <= _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]
+        if not any(short):
             break
-        del kept[int(np.argmin(least))]
+        del kept[int(np.argmin(np.where(short, least, np.inf)))]
     return kept
+
+
+def _needed_reduction(attempt, explained, chosen, question):
+    """Return what the residual must fall by: at all, and plainly where misfit stays that nobody explains or where nothing tells it from noise."""
+    excess = explained.excess(chosen)
+    clear = not attempt.recording.moving.all() and not any(explained.rest(excess[sensor]) > 0 for sensor in sensors_of(question.effect))
+    return 0.0 if clear else LEAST_REDUCTION
+
+
+def _sure_reduction(attempt, chosen, question):
+    """Return the lower end of the interval of what an effect takes off the residual of the locked windows, in the sensor's own unit."""
+    return heldout_gain(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
 
 
 def with_joints_of(model: SensorModel, table: Table) -> SensorModel:

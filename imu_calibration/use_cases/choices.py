@@ -32,7 +32,7 @@ class Choices(TypedDict, total=False):
     gyroscope_model: str | None
     """The same for the gyroscope; default bias+matrix."""
     reference_model: str | None
-    """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when latitude or azimuth is unknown."""
+    """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when only the azimuth is unknown."""
     gravity: float | None
     """Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity with its uncertainty."""
     model_as_asked: bool

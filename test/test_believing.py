@@ -1,0 +1,133 @@
+"""Values that only misfit gives are held and named; values of effects that nobody asked for shrink; weak ones are applied where that helps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.compensation.compensate import invertible_values
+from imu_calibration.compensation.weak_values import applied_values
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.named_models import parse_reference
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.shrinkage import shrunk
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import reduce_windows
+from imu_calibration.reference.table import Table
+
+from worlds.misfit_coverage import calibrated
+from worlds.misfit_worlds import SHAFT, make_pair
+from worlds.physics import TABLES
+
+UPRIGHT = {**SHAFT, 'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
+
+
+def solved(windows, model, table):
+    """Return the Solution."""
+    accumulator = Accumulator()
+    for row in reduce_windows(windows, model, table):
+        accumulator.add(row)
+    return solve(accumulator, model)
+
+
+@pytest.fixture(scope='module')
+def upright():
+    """Windows on a vertical shaft, where gravity never acts along x and y: readings of a perfect sensor."""
+    found = calibrated(make_pair(None, 41, table=UPRIGHT, profile='sweeps').first)
+    return found.windows, Table.from_mapping(UPRIGHT)
+
+
+def read(windows, table, model, values, *, ripple=0.0, seed=1):
+    """Return the windows with what a sensor of these parameters reads, noise, and a force on x in turns, as no effect has it."""
+    rng, made = np.random.default_rng(seed), []
+    for window in windows:
+        force, rate = predict(model, values, table, motion=window.motion)
+        moves, turns = (np.broadcast_to(part[:, 0], len(window.time)) for part in (window.motion.position, window.motion.rate))
+        force = force + ripple * np.outer((np.abs(turns) > 1.0) * (1.0 + np.sin(7 * moves)), [1.0, 0.0, 0.0])
+        made.append(replace(window, force_s=force + rng.normal(0, 0.02, (len(window.time), 3)), rate_s=rate + rng.normal(0, 2e-3, (len(window.time), 3))))
+    return made
+
+
+def test_a_scale_that_only_misfit_gives_is_held_and_named(upright):
+    """Gravity never acts along x; where the sensor sits, 10 mm off the axis, brings some mm/s^2 there in step with the motion, and so does misfit."""
+    windows, table = upright
+    table = replace(table, mount_xyz=np.array([0.01, 0.0, 0.0]))
+    model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
+    found = solved(read(windows, table, model, model.start(), ripple=0.5), model, table)
+    names = [name for name in found.not_believed if name.startswith('accelerometer.matrix')]
+    assert names and all(found.held[model.param_names.index(name)] for name in names)
+    assert all(found.values[model.param_names.index(name)] == float(name[-1] == name[-2]) for name in names)
+
+
+def test_a_wrong_full_scale_setting_is_no_misfit():
+    """A gyroscope that reads twice the rate keeps its factor: it fits."""
+    session = make_pair(None, 11).first
+    table, found = Table.from_mapping(TABLES['three_axis']), calibrated(session)
+    model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
+    doubled = solved([replace(window, rate_s=2 * window.rate_s) for window in found.windows], model, table)
+    assert not doubled.not_believed
+    np.testing.assert_allclose(np.diag(doubled.value('gyroscope', 'matrix').reshape(3, 3)), 2.0, atol=0.05)
+
+
+def test_the_earth_turns_only_where_the_table_says_where_it_stands():
+    """Without a latitude the Earth's rate is not modelled; with one and without an azimuth it is."""
+    table = Table.from_mapping({**TABLES['three_axis'], 'latitude': None, 'gravity': 9.81})
+    somewhere = Table.from_mapping({**TABLES['three_axis'], 'latitude': 50.0, 'height': 0.0, 'azimuth_deg': None})
+    assert 'earth_rate' not in parse_reference(None, table)
+    assert 'earth_rate' in parse_reference(None, somewhere)
+
+
+def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
+    """Arms that are not there go most of the way to zero, plain ones stay, and the standard deviations are what they were."""
+    windows, table = calibrated(make_pair(None, 11).first).windows, Table.from_mapping(TABLES['three_axis'])
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(table.joint_names))
+    part = model.slices['accelerometer', 'accel_size_effect']
+    moved = []
+    for size in (0.0, 0.02):
+        values = model.start()
+        values[part] = size * np.linspace(-1, 1, 9)
+        before = solved(read(windows, table, model, values), model, table)
+        after = shrunk(before, [part])
+        np.testing.assert_array_equal(after.covariance, before.covariance)
+        moved.append(np.linalg.norm(after.values[part]) / np.linalg.norm(before.values[part]))
+        assert np.abs((after.values - values) / after.sd).max() < 4.5
+    assert moved[0] < 0.7 and moved[1] > 0.99
+
+
+def test_weak_values_are_applied_where_that_lowers_the_expected_error():
+    """Below one standard deviation from the prior a weak value goes there, and what is correlated with it follows; all else stays."""
+    calibration = calibrated_document()
+    weak, other = calibration.param_names.index('accelerometer.bias.x'), calibration.param_names.index('accelerometer.matrix.xy')
+    covariance = np.diag(calibration.sd**2)
+    covariance[weak, weak], covariance[weak, other] = 0.25, 0.5 * calibration.sd[other] * 0.9
+    covariance[other, weak] = covariance[weak, other]
+    status = tuple('weak' if k == weak else 'determined' for k in range(len(calibration.values)))
+    for size, applied in ((0.2, 0.0), (1.2, 1.2)):
+        values = calibration.values.copy()
+        values[weak] = size
+        given = replace(calibration, values=values, covariance=covariance, status=status)
+        found = applied_values(given)
+        assert found[weak] == pytest.approx(applied, abs=1e-12)
+        follows = covariance[other, weak] / covariance[weak, weak] * (applied - size)
+        assert found[other] == pytest.approx(values[other] + follows, abs=1e-15)
+        inverted, used = invertible_values(given)
+        assert used[inverted.slices['accelerometer', 'bias']][0] == found[weak]
+
+
+def calibrated_document():
+    """Return a Calibration of a clean session."""
+    import imu_calibration as imu
+    pair = make_pair(None, 11)
+    return imu.calibrate(pair.first.block, Table.from_mapping(pair.table), model_as_asked=True).calibration
+
+
+def test_options_know_what_is_there_unasked():
+    """A size effect that was asked for does not shrink."""
+    from imu_calibration.calibration.calibrate import _by_default
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), reference=('table_tilt', 'time_offset'))
+    asked = CalibrationOptions(accelerometer_model='size_effect', reference_model='table_tilt+time_offset')
+    assert _by_default(model, asked) == []
+    unasked = CalibrationOptions(added=(('reference', 'time_offset'),))
+    assert _by_default(model, unasked) == [model.slices['accelerometer', 'accel_size_effect'], model.slices['reference', 'table_tilt']]
