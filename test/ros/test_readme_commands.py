@@ -110,9 +110,17 @@ def test_the_readme_has_commands_and_asks_of_each_kind():
     assert asked and all(any(key in command for key in ANSWERS) for command in asked), asked
 
 
+def lists(terminal, name):
+    """Whether a command that ends by itself has listed a name."""
+    assert terminal.process.wait(PATIENCE) == 0, terminal.shown()
+    return name in terminal.shown().split()
+
+
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
     calibrator.wait('Imu messages come on /imu/data_raw from /simulator_node', 'JointState messages come', 'first window gathered')
+    while not lists(terminals('ros2 node list'), '/calibration_node'):   # the daemon that ros2 starts finds the nodes after a while
+        pass
     for command in commands():
         if starts(command):
             continue
