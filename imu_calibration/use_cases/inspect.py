@@ -67,7 +67,7 @@ def _look(bag, topics, table, options):
             calibrated = calibrate([source_of(bag, topics, table.joint_names)], table, options, mapper=_watched_by(preflight))
         except ImuCalibrationError as error:
             calibrated = error
-    if preflight.streams is None:   # not read to its end: nothing to calibrate from
+    if not preflight.streams:   # not read to its end: nothing to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False)
         source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
         deque(BlockCleaner(nominal=options.nominal, watchers=[preflight]).all_of(source()), maxlen=0)
@@ -77,7 +77,7 @@ def _look(bag, topics, table, options):
 def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[Gathered]]:
     """Return the map step of one recording that shows it to the checks, when it is read for the first time."""
     def mapper(step, numbered):
-        if preflight.streams is not None:
+        if preflight.streams:
             return map(step, numbered)
         return [step.read(source(), session, preflight) for session, source in numbered]
     return mapper
