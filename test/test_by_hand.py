@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
-from imu_calibration.by_hand.poses import g_sensitivity_evidence
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.variance_components import estimate_group_variances
@@ -242,7 +242,7 @@ def test_clipped_and_torn_turns_are_left_out():
 # further effects
 
 def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
-    imu, ranges, truth = simulate(13, sensitivity=5e-4, drift_sd=1e-4)
+    imu, ranges, truth = simulate(13, sensitivity=5e-4, drift_sd=1e-4, n_poses=15)
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     assert 'gyroscope.gyro_g_sensitivity.xx' in found.param_names
     error, covariance = differences(found, truth)
@@ -256,10 +256,10 @@ def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
 def test_g_sensitivity_test_keeps_its_level():
     rng = np.random.default_rng(14)
     values = []
-    for _ in range(2000):
+    for _ in range(500):
         poses = Poses(rng.normal(0, 6, (15, 3)), rng.normal(0, 1e-4, (15, 3)), None, None, None, None)
         values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
-    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.02  # four sd of 2000 trials
+    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.04  # four sd of 500 trials
 
 
 def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_see():

@@ -1,18 +1,25 @@
 """Recordings by hand as they really are: wrong full-scale settings, clipped turns, late stamps, slow turns, warm-up, creeping poses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.poses import average_poses
 from imu_calibration.by_hand.turns import at_range_end, rising
 from imu_calibration.by_hand.workflow import read_by_hand
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.samples import SampleBlock
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.static_detector import find_still
 
-from worlds.hand_sessions import GRAVITY
-from worlds.physics_hand import clipped, hold_and_turn, with_stamp_jitter, with_wrong_full_scale
+from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
+from worlds.physics_hand import clipped, drifting, hold_and_turn, warmed_up, with_slow_turn, with_stamp_jitter, with_wrong_full_scale
 
 ANGULAR = np.random.default_rng(0).normal(0, 1, (300, 3))
 
@@ -92,6 +99,94 @@ def test_ranges_of_two_s_complement_end_one_step_apart():
     step, rng = 1e-3, np.random.default_rng(5)
     rate = np.clip(np.round(rng.normal(0, 1.0, (2000, 3)) / step), -2500, 2499) * step
     assert at_range_end(rate).sum() == np.count_nonzero((rate >= 2.499 - 1e-9).any(axis=1) | (rate <= -2.5 + 1e-9).any(axis=1)) > 2
+
+
+# slow turns
+
+def test_a_slow_turn_about_the_vertical_is_no_pose():
+    """At 1.7 deg/s gravity stays where it is and the gyroscope is as quiet as at rest: only its mean tells."""
+    imu, _, turn = with_slow_turn(6)
+    covered = sum(max(min(piece.stop, turn.stop) - max(piece.start, turn.start), 0) for piece in find_still(imu))
+    assert covered == 0 and len(find_still(imu)) >= 14
+
+
+def test_poses_of_a_gyroscope_that_warms_up_stay_poses():
+    imu, ranges, _ = hold_and_turn(7)
+    for time_constant in (10.0, 60.0):
+        assert len(find_still(warmed_up(imu, 1, rate=0.03, time_constant=time_constant)[0])) >= len(ranges) - 1
+
+
+# biases that move
+
+def test_a_warm_up_is_not_sold_as_g_sensitivity():
+    imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
+    warm, temperature_c = warmed_up(imu, 2, rate=0.02, time_constant=20.0)
+    for temperature in (None, temperature_c):
+        found = calibrate_by_hand(warm, HandOptions(GRAVITY), ranges, temperature_c=temperature)
+        assert not any('g_sensitivity' in name for name in found.param_names)
+
+
+def test_g_sensitivity_is_seen_beside_a_warm_up():
+    truth = random_truth(np.random.default_rng(9), 3e-4)
+    imu, ranges, _ = hold_and_turn(9, n_poses=20, rate_hz=50.0, still=2.0, truth=truth)
+    warm, _ = warmed_up(imu, 2, rate=0.02, time_constant=20.0)
+    assert shown(g_sensitivity_evidence(average_poses(warm, [(r.start, r.stop) for r in ranges])))
+
+
+def test_biases_that_drift_carry_it_in_their_sd_and_a_note_with_its_size():
+    imu, ranges, truth = hold_and_turn(10, n_poses=24, rate_hz=50.0, still=3.0)
+    moved = drifting(imu, force=0.0981, rate=0.004)
+    still, found = (calibrate_by_hand(samples, HandOptions(GRAVITY), ranges) for samples in (imu, moved))
+    assert still.statistics['bias_moved'] == {}
+    assert found.statistics['bias_moved'] == {'accelerometer': pytest.approx(0.0981, rel=0.15), 'gyroscope': pytest.approx(0.004, rel=0.15)}
+    first, = (note.text for note in notes(found.statistics['bias_moved'], 600.0) if note.text.startswith('accelerometer'))
+    assert 'accelerometer bias moved by' in first and 'mg in 10 minutes' in first
+    for name, change in (('accelerometer.bias.x', 0.0981), ('gyroscope.bias.x', 0.004)):
+        middle = truth[PARAM_NAMES.index(name)] + change / 2
+        assert abs(found.value(name) - middle) < 0.1 * change and found.sd_of(name) > 0.4 * change
+    assert found.sd_of('accelerometer.bias.y') < 0.1 * found.sd_of('accelerometer.bias.x')
+    error = np.abs(np.array([found.value(name) - truth[PARAM_NAMES.index(name)] for name in PARAM_NAMES[3:9]]))
+    assert np.all(error < 4.5 * np.array([found.sd_of(name) for name in PARAM_NAMES[3:9]]))
+
+
+# what does not belong to the others
+
+def test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out():
+    """Somebody leans on the IMU in one pose, turns it slowly in another, and a glitch of a tenth of a second is in one turn."""
+    imu, ranges, truth = hold_and_turn(0, rate_hz=50.0, still=2.0)
+    force, rate = imu.force_s.copy(), imu.rate_s.copy()
+    force[ranges[5], 0] += 0.3
+    rate[ranges[8], 2] += 0.02
+    rate[ranges[3].stop + 20:ranges[3].stop + 25, 1] += 2.0
+    clean, found = (calibrate_by_hand(samples, HandOptions(GRAVITY), ranges) for samples in (imu, replace(imu, force_s=force, rate_s=rate)))
+    assert clean.statistics['left_out'] == {}
+    assert found.statistics['left_out'] == {'outlying pose': 1, 'outlying drift': 1, 'outlying turn': 1}
+    assert rate_error(found, truth) < 3 * rate_error(clean, truth)
+    assert np.max(np.abs(found.values - clean.values)[:3]) < 0.01
+
+
+def six_faces(seed=1):
+    return hold_and_turn(seed, n_poses=6, attitudes=[Rotation.align_vectors([[0, 0, 1]], [up])[0] for up in FACES], still=4.0)
+
+
+def test_six_faces_give_what_they_determine():
+    imu, ranges, truth = six_faces()
+    found = calibrated(imu)
+    status = dict(zip(found.param_names, found.statuses))
+    for name in (*(f'accelerometer.bias.{axis}' for axis in 'xyz'), *(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz')):
+        assert status[name] == 'determined' and abs(found.value(name) - truth[PARAM_NAMES.index(name)]) < 5 * found.sd_of(name)
+
+
+def test_faces_without_the_turns_between_them_give_bias_and_scale():
+    """A recorder that was stopped for each turn and went on with the next stamp: gravity jumps, the rates know nothing of it."""
+    imu, ranges, _ = six_faces()
+    cut = ImuSamples.concatenate([imu.select(piece) for piece in ranges])
+    cut = replace(cut, stamp_ns=imu.stamp_ns[:len(cut)])
+    found = calibrated(cut)
+    assert found.statistics['left_out'] == {'contradicted by gravity': 5} and found.statistics['poses'] == 6
+    status = dict(zip(found.param_names, found.statuses))
+    assert {status[f'accelerometer.{name}'] for name in ('bias.x', 'bias.y', 'bias.z', 'matrix.xx', 'matrix.yy', 'matrix.zz')} <= {'determined', 'weak'}
+    assert status['gyroscope.bias.x'] == 'determined' and status['gyroscope.matrix.xx'] == 'held'
 
 
 # late stamps

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.by_hand.advice import missing_motion
+from imu_calibration.by_hand.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.full_scale import full_scale_factor
+from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
-from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, g_sensitivity_evidence, noise_statistics
+from imu_calibration.by_hand.outliers import possible_turns, without_outliers
+from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.by_hand.solver import first_state, solve_joint
 from imu_calibration.by_hand.turns import collect_turns, known_turn_data, rising
 from imu_calibration.calibration.status import DETERMINED, statuses
@@ -28,11 +31,9 @@ PUBLISHED = tuple(SensorModel().param_names)
 POSES_LEAST = 4
 """Fewer attitudes leave even the accelerometer's biases to the prior."""
 PASSES = 4
-"""Solutions at most, when the columns of a warm-up have to be taken anew."""
+"""Solutions at most, when the columns of a warm-up have to be taken anew or poses and turns are left out."""
 SETTLED = 0.03
 """Relative change of a time constant below which its columns stay."""
-G_SENSITIVITY_P = 1e-3
-"""The response of the gyroscope to attitude enters the model when chance would show it less often."""
 POSES_FULL = 9
 """The nine accelerometer parameters take one equation per attitude."""
 
@@ -179,18 +180,30 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
                           catalogue=options.catalogue)
     model = HandModel(sensors, options.gravity)
     _check_temperature(model, poses)
-    model = replace(model, gyro_factor=full_scale_factor(first_state(model, poses), poses, turns))
+    state = first_state(model, poses)
+    model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
+    turns, contradicted = possible_turns(model, state, poses, turns)
+    left = {'contradicted by gravity': contradicted} if contradicted else {}
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
-        if settled:
+        poses, turns, out = without_outliers(model, found, poses, turns)
+        left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
+        if settled and not out:
             break
+    movements = bias_movements(model, found.state.values, poses)
+    if 'accelerometer' in movements:
+        poses = without_movement(poses, movements)
+        found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
+    found = replace(found, covariance=with_movement(found.covariance, model, movements))
+    poses = data.poses   # as they are: what was left out, or moved, is for everybody to see
     goals = model.tolerances(options.tolerances)
     status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
     advice = missing_motion(model, found.factor, found.state.values, status, goals, pose_sd, turn_sd)
-    statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, **_statistics(model, found, poses, turns)}
+    statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
+                  'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()}, **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
     index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
@@ -222,8 +235,7 @@ def _gyroscope_effects(poses, settings):
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
         raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
     evidence = g_sensitivity_evidence(poses)
-    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P
-                                                and evidence['g_sensitivity_heldout_ratio'] < 1)
+    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and shown(evidence))
     return G_SENSITIVE if wanted else BASE, evidence
 
 

@@ -3,7 +3,6 @@
 from typing import Sequence
 
 import numpy as np
-from scipy.special import fdtrc
 
 from imu_calibration.by_hand.equations import Poses
 from imu_calibration.effects.base import SENSORS
@@ -63,34 +62,3 @@ def distinct_attitudes(force, apart):
         if all(np.arccos(np.clip(direction @ other, -1, 1)) > apart for other in kept):
             kept.append(direction)
     return len(kept)
-
-
-def g_sensitivity_evidence(poses):
-    """
-    Test whether the gyroscope's readings at rest follow the direction of gravity, beyond their scatter from pose to pose.
-
-    Returns
-    -------
-    dict
-        `g_sensitivity_p_value` of the F test of ``rate = bias + sensitivity @ force`` against the bias alone, and
-        `g_sensitivity_heldout_ratio`, the rms with over that without it for poses left out one at a time.
-
-    """
-    count = len(poses.force)
-    if count < 8:
-        return {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
-    full = np.column_stack([np.ones(count), poses.force])
-    (kept, kept_out), (rest, rest_out) = _residuals(poses.rate, full), _residuals(poses.rate, full[:, :1])
-    scale = np.sqrt(np.mean(rest**2, axis=0)) + 1e-300
-    square = [np.sum((r / scale)**2) for r in (kept, rest)]
-    dof = 3 * (count - 4)
-    ratio = (square[1] - square[0]) / 9 / max(square[0] / dof, 1e-300)
-    heldout = np.sqrt(np.sum((kept_out / scale)**2) / np.sum((rest_out / scale)**2))
-    return {'g_sensitivity_p_value': float(fdtrc(9, dof, ratio)), 'g_sensitivity_heldout_ratio': float(heldout)}
-
-
-def _residuals(values, design):
-    """Return residuals of least squares, and those of each row when it is left out."""
-    basis = np.linalg.qr(design)[0]
-    residual = values - basis @ (basis.T @ values)
-    return residual, residual / np.maximum(1 - np.sum(basis**2, axis=1), 1e-6)[:, None]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import imu_calibration
+from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.proof import prove_by_hand
@@ -119,7 +120,7 @@ def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, 
     """
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     model, gathered = hand.model.model, recording.gathered
-    gathered.findings = findings
+    gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
     held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)

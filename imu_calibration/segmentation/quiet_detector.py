@@ -71,7 +71,12 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
             return np.zeros(n, bool)
         # at rest the variance hardly grows with the span; where it does, the quietest part was moving as well
         shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), least)
-        quiet &= _covered(np.all(variance <= ratio ** 2 * limit, axis=1), width)
+        calm = np.all(variance <= ratio ** 2 * limit, axis=1)
+        quiet &= _covered(calm, width)
+        if width > 1:   # from one sample to the next into another attitude: quiet spans end there and begin there, and none goes across
+            across = _covered(calm, width - 1)
+            quiet[:-1] &= across
+            quiet[1:] &= across
     return np.repeat(_shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
 
 

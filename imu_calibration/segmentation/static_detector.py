@@ -10,6 +10,13 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 _TURNING_SD = 30.0
 """A mean rate that many noise sds, and a hundredth of the largest rate, off the usual one is a steady turn, not a bias."""
 
+_STEP_SPAN = 0.5
+"""Means over so many seconds are compared with the next to find where rest goes over into a slow turn."""
+_ENOUGH = 6
+"""Intervals whose mean rates show how they scatter."""
+_SCATTERS = 8.0
+"""A mean rate that stands out from both neighbours by so many times the scatter (and the noise of one sample at least) is a turn."""
+
 _LARGEST_GROWTH = 4.0
 """Bias wander over a long rest adds less variance than this."""
 
@@ -49,7 +56,7 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     period = np.median(step[step > 0]) / 1e9
     quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=settings.quiet_ratio, longest=settings.static_minimum, floor=QuietFloor())
     found = [piece for piece in _intervals(imu.stamp_ns, quiet, period, settings) if _keeps_attitude(imu.force_s[piece], period)]
-    return _not_turning(imu.rate_s, found)
+    return _not_turning(imu.rate_s, _at_one_rate(imu.rate_s, found, period, settings.static_minimum))
 
 
 def _intervals(stamp_ns, quiet, period, settings):
@@ -73,11 +80,38 @@ def _keeps_attitude(force, period):
     return force.var(axis=0).sum() <= _LARGEST_GROWTH * local
 
 
+def _at_one_rate(rate, found, period, shortest):
+    """Cut intervals where the rate steps by more than its noise: rest goes over into a slow turn that is as quiet."""
+    if not found:
+        return found
+    noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
+    width, parts = max(10, int(round(_STEP_SPAN / period))), []
+    for piece in found:
+        count = (piece.stop - piece.start) // width
+        means = rate[piece.start:piece.start + count * width].reshape(count, width, 3).mean(axis=1)
+        steps = np.flatnonzero(np.any(np.abs(np.diff(means, axis=0)) > np.maximum(noise, _least_step(rate)), axis=1)) + 1
+        edges = [piece.start, *(piece.start + width * steps), piece.stop]
+        parts += [slice(int(a), int(b)) for a, b in zip(edges, edges[1:]) if (b - a) * period >= shortest or len(edges) == 2]
+    return parts
+
+
+def _least_step(rate):
+    """Return the rate step, shape (3,), below which nothing counts: a thousandth of the largest rate."""
+    return 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0)
+
+
 def _not_turning(rate, found):
+    """Leave out intervals whose mean rate is far from that of their neighbours: turns slow and steady enough to look like rest."""
     if len(found) < 2:
         return found
     means = np.array([rate[piece].mean(axis=0) for piece in found])
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
     usual = np.median(means, axis=0)
     limit = np.maximum(_TURNING_SD * noise, 0.01 * np.abs(rate - usual).max(axis=0))
-    return [piece for piece, mean in zip(found, means, strict=True) if np.all(np.abs(mean - usual) <= limit)]
+    keep = np.all(np.abs(means - usual) <= limit, axis=1)
+    if len(found) >= _ENOUGH:   # one that stands alone between its neighbours; biases that warm up follow a course
+        step = np.diff(means, axis=0)
+        alone = np.minimum(np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1]))
+        scatter = np.median(np.abs(step), axis=0) / (0.6745 * np.sqrt(2))
+        keep[1:-1] &= np.all(alone <= np.maximum(_SCATTERS * scatter, noise), axis=1)
+    return [piece for piece, kept in zip(found, keep, strict=True) if kept]

@@ -114,3 +114,20 @@ def drifting(imu, force=0.0, rate=0.0):
 def nominal_truth():
     """The parameters of a sensor without errors."""
     return NOMINAL.copy()
+
+
+def with_slow_turn(seed, rate=0.03, seconds=4.0, **session):
+    """Return (imu, truth, samples of the turn): a session, then a slow, steady turn about the vertical, which gravity does not show, and a rest."""
+    imu, ranges, truth = hold_and_turn(seed, **session)
+    rng, last = np.random.default_rng(seed + 1), ranges[-1]
+    period = int(np.median(np.diff(imu.stamp_ns)))
+    bias_f, matrix_f, _, matrix_w = unpack(truth)
+    mean, bias = imu.force_s[last].mean(axis=0), imu.rate_s[last].mean(axis=0)
+    up = np.linalg.solve(matrix_f, mean - bias_f)
+    turning = matrix_w @ (rate * up / np.linalg.norm(up))
+    count = int(seconds * 1e9 / period)
+    noise = imu.force_s[last].std(axis=0), imu.rate_s[last].std(axis=0)
+    speed = np.repeat([1.0, 0.0], count)[:, None] * turning
+    more = ImuSamples(imu.stamp_ns[-1] + period * np.arange(1, 2 * count + 1), mean + noise[0] * rng.normal(size=(2 * count, 3)),
+                      bias + speed + noise[1] * rng.normal(size=(2 * count, 3)), imu.frame_id)
+    return ImuSamples.concatenate([imu, more]), truth, slice(len(imu), len(imu) + count)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration, HandData, solve_by_hand
+from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
@@ -103,7 +104,8 @@ def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progr
                                  f'{len(poses.start)} were found; hold the IMU still in more attitudes')
     options = replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE)
     baseline = solve_by_hand(data, options)
-    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns))
+    follows_gravity = shown(g_sensitivity_evidence(poses))
+    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
@@ -129,7 +131,7 @@ def _held(hand):
     return np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == 'held' for name in hand.model.param_names])
 
 
-def _why_not(effect, poses, turns):
+def _why_not(effect, poses, turns, follows_gravity):
     if effect.role is Role.LIMIT:
         return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
     if not possible_by_hand(effect):
@@ -138,6 +140,8 @@ def _why_not(effect, poses, turns):
         return 'no temperature was recorded', 'record imu/temperature'
     if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
         return f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only', 'record while the sensor warms up by at least some kelvins'
+    if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
+        return ('beside a bias that moves in time the rates at rest do not show it', 'hold each attitude again later, in another order')
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
     if moving and len([t for t in turns if t.rotation is None]) < 6:
         return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'

@@ -1,0 +1,84 @@
+"""Does the gyroscope at rest follow gravity? Asked of the poses beside time: a warm-up follows the order of the poses, and so may gravity."""
+
+import numpy as np
+import scipy.linalg
+from scipy.special import fdtrc
+
+from imu_calibration.by_hand.equations import Poses
+
+SPARE = 8
+"""With fewer poses beyond the columns the choice of the wander alone explains too much."""
+CHOSEN = 2
+"""Share and correlation time are taken from the data as well."""
+SHARES = (0.0, 0.5, 0.8, 0.95, 0.99)
+"""Shares of the scatter from pose to pose that wander in time, tried one after the other."""
+TIMES = (0.1, 0.3, 1.0, 3.0)
+"""Correlation times of the wander that are tried, in units of the time from the first pose to the last."""
+SILENT = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
+P_VALUE = 1e-3
+"""The response of the gyroscope to gravity enters the model when chance would show it less often."""
+
+
+def g_sensitivity_evidence(poses: Poses) -> dict:
+    """
+    Test whether the gyroscope's readings at rest follow the direction of gravity, beyond what time and temperature explain.
+
+    ``rate = bias(time, temperature) + sensitivity @ force + error``: the bias is a parabola in time, with a term in temperature where that was
+    recorded, and the error wanders, by a share and with a correlation time that restricted likelihood chooses beside all columns.
+
+    Returns
+    -------
+    dict
+        `g_sensitivity_p_value` of the F test against the bias alone, and `g_sensitivity_heldout_ratio`, the rms with over that without it
+        for poses left out one at a time.
+
+    """
+    count = len(poses.force)
+    time = np.arange(count, dtype=float) if poses.time is None else poses.time
+    time = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    course = np.column_stack([np.ones(count), time, time**2][:3 if count >= 12 else 2])
+    if poses.temperature_c is not None and np.ptp(poses.temperature_c) > 0:
+        course = np.column_stack([course, (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c)])
+    full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
+    if count < full.shape[1] + SPARE:
+        return dict(SILENT)
+    covariance = min(_covariances(time), key=lambda candidate: _loss(candidate, full, poses.rate))
+    (least, kept_out), (rest, rest_out) = (_left(covariance, design, poses.rate) for design in (full, course))
+    dof = count - full.shape[1] - CHOSEN
+    scale = least / dof + 1e-300
+    ratio = float(np.mean((rest - least) / 3 / scale))
+    heldout = np.sqrt(np.sum(kept_out**2 / scale) / max(np.sum(rest_out**2 / scale), 1e-300))
+    return {'g_sensitivity_p_value': float(fdtrc(9, 3 * dof, max(ratio, 0.0))), 'g_sensitivity_heldout_ratio': float(heldout)}
+
+
+def shown(evidence: dict) -> bool:
+    """Return whether the poses show the g-sensitivity clearly enough for it to enter the model by itself."""
+    return evidence['g_sensitivity_p_value'] < P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
+
+
+def _covariances(time):
+    apart = np.abs(time[:, None] - time)
+    yield np.eye(len(time))
+    for share in SHARES[1:]:
+        for tau in TIMES:
+            yield (1 - share) * np.eye(len(time)) + share * np.exp(-apart / tau)
+
+
+def _loss(covariance, design, values):
+    """Return minus twice the restricted log likelihood, the scale of each axis at its best."""
+    factor = np.linalg.cholesky(covariance)
+    white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
+    orthogonal, triangle = np.linalg.qr(white[:, :design.shape[1]])
+    rest = white[:, design.shape[1]:] - orthogonal @ (orthogonal.T @ white[:, design.shape[1]:])
+    spare = len(values) - design.shape[1]
+    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(np.abs(np.diag(triangle))).sum()
+    return spare * np.log((rest**2).sum(axis=0) + 1e-300).sum() + values.shape[1] * logs
+
+
+def _left(covariance, design, values):
+    """Return the weighted squares that a fit leaves, shape (3,), and the error of each value predicted from the others, shape (k, 3)."""
+    inverse = np.linalg.inv(covariance)
+    weighted = inverse @ design
+    projector = inverse - weighted @ np.linalg.solve(design.T @ weighted, weighted.T)
+    left = projector @ values
+    return np.einsum('ki,ki->i', values, left), left / np.maximum(np.diag(projector), 1e-300)[:, None]

@@ -1,0 +1,100 @@
+"""Poses and turns that do not belong to the others: somebody touched the IMU, or the recorder missed a turn."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from imu_calibration.by_hand.equations import COMPONENTS, Poses, State, TurnData, build_system
+from imu_calibration.by_hand.full_scale import missed_angle
+from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.solver import HandSolution
+
+P_VALUE = 1e-3
+"""Chance that a recording without outliers loses a pose or turn, per kind."""
+SHARE = 0.1
+"""Of each kind, at most this share is left out (one of few): what is more frequent is how the recording is."""
+LEAST_SPARE = 3.0
+"""Degrees of freedom that the others must leave to judge by."""
+CONTRADICTED = 0.35
+"""rad; gravity after a turn that is so far from where the rates carry it is not the rates' doing: scales that are off by a tenth leave less."""
+SEEN = 0.05
+"""A combination of a unit's rows that keeps less than this share of its error after the fit says nothing."""
+LOOSE = 1e3
+"""Factor on the noise of a pose's mean that takes its say, and leaves its direction to the turns."""
+
+
+def possible_turns(model: HandModel, state: State, poses: Poses, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
+    """Return (turns that carry gravity to about where it is found, number of the others): with a recorder that paused, the rates miss the turn."""
+    kept = [turn for turn in turns if turn.rotation is not None
+            or missed_angle(state, poses, turn, model.gyro_factor * np.eye(3)) < CONTRADICTED]
+    return kept, len(turns) - len(kept)
+
+
+def without_outliers(model: HandModel, found: HandSolution, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
+    """
+    Return (poses, turns, {kind: number}) without what is improbable beside the others of its kind: F tests of leaving one out, for as many as there are.
+
+    Poses that are left out stay in their place, with means that count for nothing.
+    """
+    units = _units(poses, turns)
+    rest, leverage, component = _whitened(model, found, poses, turns)
+    left = {}
+    for kind in range(len(COMPONENTS)):
+        own = [(rows, index) for rows, index, group in units if group == kind]
+        total, spare = _distance(rest[component == kind], leverage[component == kind], 1e-3)
+        allowed = max(1, int(SHARE * len(own)))
+        worst = sorted((_p_value(rest[rows], leverage[rows], total, spare), index) for rows, index in own)
+        out = [index for p, index in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
+        if out:
+            left[COMPONENTS[kind]] = out
+    if 'pose' in left:
+        poses = replace(poses, force_sem=_loosened(poses.force_sem, left['pose']))
+    if 'drift' in left:
+        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, left['drift']))
+    turns = [turn for index, turn in enumerate(turns) if index not in left.get('turn', ())]
+    return poses, turns, {kind: len(out) for kind, out in left.items()}
+
+
+def _units(poses, turns):
+    """Return (rows, index of the pose or turn, component) in the order of `build_system`: poses, rates at rest, calm drifts, turns."""
+    count = len(poses.start)
+    units = [(slice(3 * k, 3 * k + 3), k, 0) for k in range(count)]
+    units += [(slice(6 * count + 3 * k, 6 * count + 3 * k + 3), k, 1) for k in range(count)]
+    start = 9 * count
+    for index, turn in enumerate(turns):
+        if turn.rotation is None:
+            units.append((slice(start, start + 2), index, 2))
+        start += 2 if turn.rotation is None else 3
+    return units
+
+
+def _whitened(model, found, poses, turns):
+    """Return residuals in sds, an orthonormal basis of what was fitted, and the component of each row."""
+    system = build_system(model, found.state, poses, turns)
+    root = np.sqrt(found.scatter.total(system.noise, system.component))
+    design = np.hstack([system.nuisance, system.main[:, ~found.held]]) / root[:, None]
+    rest = system.residual / root
+    basis = np.linalg.qr(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))[0][:len(rest)]
+    return rest - basis @ (basis.T @ rest), basis, system.component
+
+
+def _distance(rest, basis, least):
+    """Return (squared Mahalanobis distance of some residuals, whose covariance is what the fit left them, and its rank)."""
+    values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
+    seen = values > least
+    return float(np.sum((vectors[:, seen].T @ rest)**2 / values[seen])), int(np.count_nonzero(seen))
+
+
+def _p_value(rest, basis, total, spare):
+    square, count = _distance(rest, basis, SEEN)
+    if not count or spare - count < LEAST_SPARE:
+        return 1.0
+    return float(fdtrc(count, spare - count, square / count / max((total - square) / (spare - count), 1e-12)))
+
+
+def _loosened(sem, index):
+    loose = sem.copy()
+    loose[index] *= LOOSE
+    return loose
