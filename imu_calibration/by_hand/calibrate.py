@@ -70,6 +70,10 @@ class HandCalibration:
     """What was estimated."""
     information: np.ndarray
     """Information of the data alone, in the order of `model`, shape (m, m)."""
+    used_poses: Poses
+    """The poses as they were weighed: those left out with means that count for nothing, a bias that moves at its mean."""
+    used_turns: list
+    """`TurnData` that were not left out."""
 
     @property
     def sd(self):
@@ -196,7 +200,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
         poses = without_movement(poses, movements)
         found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
     found = replace(found, covariance=with_movement(found.covariance, model, movements))
-    poses = data.poses   # as they are: what was left out, or moved, is for everybody to see
+    used, poses = poses, data.poses   # as they are: what was left out, or moved, is for everybody to see
     goals = model.tolerances(options.tolerances)
     status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
@@ -210,7 +214,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
                            tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
                            np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
-                           found.factor.T @ found.factor)
+                           found.factor.T @ found.factor, used, turns)
 
 
 def _settled(model, found):

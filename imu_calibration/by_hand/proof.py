@@ -61,7 +61,7 @@ class _Rows:
 
     def __init__(self, hand, turns):
         model, count = hand.model, len(hand.poses.start)
-        system = build_system(model, hand.state, hand.poses, turns)
+        system = build_system(model, hand.state, hand.used_poses, turns)
         scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
         weight = 1.0 / np.sqrt(system.noise + scatter[system.component])
         held = np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == HELD for name in model.param_names])

@@ -128,7 +128,7 @@ def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, 
     calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
-                              proof=prove_by_hand(hand, turns, hand_options(options).settings))
+                              proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings))
     needed = {name: (item['needs'], float('nan')) for item in reversed(hand.advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
                       options=options, hand=hand)
