@@ -11,8 +11,8 @@ from imu_calibration.by_hand.workflow import read_by_hand
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.stream_cleaning import clean_samples
 
+from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn, with_corrupt_sample, with_spikes
