@@ -136,3 +136,15 @@ def test_blocks_survive_a_restart(windows):
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert np.any(grown(first) > 1.0)
     np.testing.assert_array_equal(first.sd, second.sd)
+
+
+def test_accumulators_of_one_recording_share_its_memory(windows, monkeypatch):
+    monkeypatch.setattr(accumulator_module, 'CAPACITY', 40)
+    monkeypatch.setattr(accumulator_module, 'LEAST_ROWS', 4)
+    shared = Accumulator(share=8)
+    for window in reduce_windows(windows, MODEL, TABLE):
+        shared.add(window)
+    assert len(windows) > 20
+    assert len(shared.rows) <= 5
+    assert shared.copy().share == restrict(shared, MODEL, MODEL).share == 8
+    assert sum(shared.windows.values()) == len(windows)

@@ -49,9 +49,9 @@ def without_outliers(model: HandModel, found: HandSolution, poses: Poses, turns:
         out = [index for p, index in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
         if out:
             left[COMPONENTS[kind]] = out
-    if 'pose' in left:
+    if left.get('pose'):
         poses = replace(poses, force_sem=_loosened(poses.force_sem, left['pose']))
-    if 'drift' in left:
+    if left.get('drift'):
         poses = replace(poses, rate_sem=_loosened(poses.rate_sem, left['drift']))
     turns = [turn for index, turn in enumerate(turns) if index not in left.get('turn', ())]
     return poses, turns, {kind: len(out) for kind, out in left.items()}

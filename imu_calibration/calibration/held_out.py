@@ -25,7 +25,7 @@ BLOCKS = 3 * FOLDS
 class HeldOutBlock:
     """Every so many-th window of each kind."""
 
-    accumulator: Accumulator = field(default_factory=lambda: Accumulator(in_blocks=False))
+    accumulator: Accumulator = field(default_factory=lambda: Accumulator(in_blocks=False, share=BLOCKS))
     """For fitting."""
     pieces: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     """(sensor, regime) -> triangular factor of the rows of short pieces, for judging."""

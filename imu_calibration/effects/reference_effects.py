@@ -130,7 +130,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         Effect(
             **of_table | {'unit': 'm'}, name='axis_offset', components=names.places, shape=(len(names.places),), moot=_places_taken,
             explanation='The axes do not pass through the points that the description says.',
-            tolerance_reason='0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
+            tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
             plausible=(('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),), motion=('two_axis', 'three_speeds'),
             warp=_places, acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
         Effect(

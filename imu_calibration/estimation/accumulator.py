@@ -13,6 +13,8 @@ CAPACITY = 4096
 """Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
 MOST_BLOCKS = 48
 """Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there."""
+LEAST_ROWS = 16
+"""Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
 
 
 class _CentredRows:
@@ -93,6 +95,8 @@ class Accumulator(_CentredRows):
     """Windows per block."""
     in_blocks: bool = True
     """Whether blocks are kept; without them standard deviations are those of noise alone."""
+    share: int = 1
+    """Among how many accumulators of one recording the memory is shared: each keeps so many times fewer rows."""
 
     def add(self, window: WindowStatistics) -> None:
         """Take one window (WindowStatistics)."""
@@ -102,14 +106,18 @@ class Accumulator(_CentredRows):
             self._add_to_blocks(window)
         self.rows.append(_without_within(window))
         self._count(window.kind, window.count, 1)
-        if len(self.rows) > CAPACITY:
+        if len(self.rows) > self._capacity:
             self._thin()
+
+    @property
+    def _capacity(self):
+        return max(CAPACITY // self.share, LEAST_ROWS)
 
     def copy(self) -> 'Accumulator':
         """Return an accumulator that goes its own way; rows and factors are never changed in place."""
         maps = (dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows'))
         return Accumulator(list(self.rows), *maps, [block.copy() for block in self.blocks], self.block_length,
-                           self.in_blocks)
+                           self.in_blocks, self.share)
 
     def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
@@ -122,7 +130,7 @@ class Accumulator(_CentredRows):
         self.blocks.extend(block.copy() for block in other.blocks if self.in_blocks)
         self.block_length = max(self.block_length, other.block_length)
         self._join_blocks()
-        while len(self.rows) > CAPACITY:
+        while len(self.rows) > self._capacity:
             self._thin()
 
     def block_of(self, session: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -217,7 +225,7 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
     small.within, small.slow = (_chosen(factors, chosen) for factors in (accumulator.within, accumulator.slow))
     small.blocks = [replace(block, within=_chosen(block.within, chosen), slow=_chosen(block.slow, chosen)) for block in accumulator.blocks]
-    small.block_length, small.in_blocks = accumulator.block_length, accumulator.in_blocks
+    small.block_length, small.in_blocks, small.share = accumulator.block_length, accumulator.in_blocks, accumulator.share
     small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
     return small
 
