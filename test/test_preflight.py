@@ -105,6 +105,42 @@ def stuck_axis(imu, joints, temperature):
     return replace(imu, rate_s=rate), joints, temperature
 
 
+def frozen(samples, start, seconds, *names):
+    """Hold the readings at `start` seconds."""
+    first, last = np.searchsorted(samples.stamp_ns, samples.stamp_ns[0] + np.array([start, start + seconds]) * 10**9)
+    columns = {name: getattr(samples, name).copy() for name in names}
+    for column in columns.values():
+        column[first:last] = column[first]
+    return replace(samples, **columns)
+
+
+def imu_frozen_for_a_time(imu, joints, temperature):
+    return frozen(imu, 40, 30, 'force_s', 'rate_s'), joints, temperature
+
+
+def gyroscope_frozen_for_a_time(imu, joints, temperature):
+    return frozen(imu, 40, 8, 'rate_s'), joints, temperature
+
+
+def gyroscope_frozen_at_its_largest(imu, joints, temperature):
+    largest = float(imu.stamp_ns[np.argmax(imu.rate_s[:, 2])] - imu.stamp_ns[0]) * 1e-9
+    return frozen(imu, largest, 8, 'rate_s'), joints, temperature
+
+
+def joints_frozen_for_a_time(imu, joints, temperature):
+    moving = np.linalg.norm(imu.rate_s, axis=1) > 0.2
+    longest = np.argmax(np.convolve(moving, np.ones(1000), 'valid'))
+    return imu, frozen(joints, float(imu.stamp_ns[longest] - imu.stamp_ns[0]) * 1e-9, 6, 'position', 'velocity'), temperature
+
+
+def half_a_g_off(imu, joints, temperature):
+    return replace(imu, force_s=imu.force_s + [0.47 * G, 0.0, 0.0]), joints, temperature
+
+
+def fast_at_rest(imu, joints, temperature):
+    return replace(imu, rate_s=imu.rate_s + [0.0, 1.4, 0.0]), joints, temperature
+
+
 def clipped_gyroscope(imu, joints, temperature):
     return replace(imu, rate_s=np.clip(imu.rate_s, -1.0, 1.0)), joints, temperature
 
@@ -183,6 +219,12 @@ FAULTS = (
     (dead_axis, 'frozen', REFUSE, ('accelerometer y never changes',)),
     (dead_gyroscope, 'frozen', REFUSE, ('the gyroscope must measure something',)),
     (stuck_axis, 'frozen', WARNING, ('gyroscope y stands still',)),
+    (imu_frozen_for_a_time, 'frozen', WARNING, ('the IMU must measure', 'from 40.', 's to 70.')),
+    (gyroscope_frozen_for_a_time, 'frozen', WARNING, ('the gyroscope must measure', 'from 40.')),
+    (gyroscope_frozen_at_its_largest, 'frozen', WARNING, ('the gyroscope must measure',)),
+    (joints_frozen_for_a_time, 'frozen', WARNING, ('stand still while the IMU turns', 'from ')),
+    (half_a_g_off, 'bias', WARNING, ('0.47 g', 'any grade')),
+    (fast_at_rest, 'bias', WARNING, ('80 deg/s', 'any grade')),
     (clipped_gyroscope, 'clipping', WARNING, ('gyroscope clips at 1 rad/s (57 deg/s)',)),
     (repeated_stamps, 'stamps', WARNING, ('Imu', 'repeat the stamp before')),
     (no_stamps, 'stamps', REFUSE, ('header stamps advance',)),
@@ -193,7 +235,7 @@ FAULTS = (
     (late_joints, 'clocks', WARNING, ('60.0 s after the Imu',)),
     (lost_samples, 'sampling', WARNING, ('promises', 'samples were lost')),
     (holes, 'gaps', WARNING, ('gaps', 'not used')),
-    (wrong_gravity, 'gravity', WARNING, ('within 2 %', '+4.')),
+    (wrong_gravity, 'gravity', WARNING, ('within 2 %', '+4.', 'differs by 0.5 % between places')),
     (published_twice, 'repeated_readings', WARNING, ('50 %', 'publishes faster')),
     (in_kelvin, 'temperature', WARNING, ('kelvin',)),
 )
@@ -348,8 +390,19 @@ def test_how_the_stream_is_cut_does_not_matter(session):
 def test_a_real_range_that_was_reached_once_is_no_clipping(session):
     """The largest reading of a smooth motion comes once; many equal readings come from a rounded one, below it as above."""
     rounded = replace(session.imu, force_s=np.round(session.imu.force_s, 1), rate_s=np.round(session.imu.rate_s, 2))
-    assert 'clipping' not in [f.check for f in findings((rounded, session.joints, None))]
+    assert not {'clipping', 'frozen'} & {f.check for f in findings((rounded, session.joints, None))}
     assert ('resolution', NOTE) in [(f.check, f.severity) for f in findings((rounded, session.joints, None))]
+
+
+@pytest.mark.parametrize('fault', (gyroscope_frozen_for_a_time, gyroscope_frozen_at_its_largest, imu_frozen_for_a_time))
+def test_what_is_frozen_does_not_clip(session, fault):
+    assert [check for check, _ in trouble(findings(fault(session.imu, session.joints, None)))] == ['frozen']
+
+
+def test_a_rate_of_nothing_is_no_end_of_the_range(session):
+    """A gyroscope that is hardly turned and stops at 2 deg/s, whatever piles up there."""
+    slow = replace(session.imu, rate_s=np.clip(session.imu.rate_s, -0.035, 0.035))
+    assert 'clipping' not in {f.check for f in findings((slow, session.joints, None))}
 
 
 # Topics -------------------------------------------------------------------------------------------------------------------------

@@ -7,16 +7,16 @@ What is wrong with a recording before anything is estimated from it.
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
-from imu_calibration.preflight import stamp_checks, value_checks
+from imu_calibration.preflight import frozen_checks, stamp_checks, value_checks
 from imu_calibration.preflight.evidence import EvidenceGatherer
 from imu_calibration.preflight.finding import REFUSE, WARNING, CheckFinding
 from imu_calibration.segmentation.block_cleaning import BlockCleaner, CleanedBlock
 from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
 CHECKS = (
-    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, value_checks.frozen, value_checks.rate_unit, value_checks.full_scale,
-    value_checks.handedness,
-    value_checks.gravity, value_checks.clipping, value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
+    value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, frozen_checks.frozen, frozen_checks.frozen_for_a_time,
+    value_checks.rate_unit, value_checks.full_scale,
+    value_checks.handedness, value_checks.bias, value_checks.gravity, value_checks.clipping, value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
     stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )
 """In the order in which they refuse: a wrong unit makes much of what follows wrong as well."""

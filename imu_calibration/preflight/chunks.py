@@ -1,6 +1,6 @@
 """A stream of IMU samples as short chunks: mean, scatter and range of each, in bounded memory."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class Chunks:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def select(self, keep: np.ndarray) -> 'Chunks':
+        """Return the chunks at a mask."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in ('time', 'duration', 'mean', 'sd', 'range')})
 
 
 class ChunkSeries:

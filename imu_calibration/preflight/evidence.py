@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks, ChunkSeries
 from imu_calibration.preflight.extremes import Extremes
+from imu_calibration.preflight.frozen_parts import FrozenPart, StandingJoints, frozen_chunks, frozen_joints, frozen_parts
 from imu_calibration.preflight.full_scale import factor_between_rests
 from imu_calibration.preflight.rest import Rest, find_rest
 from imu_calibration.preflight.turning import Turning, relate_turns
@@ -63,28 +64,46 @@ class RecordingEvidence:
     """Lowest and highest temperature."""
     gravity: float
     """Local gravity, m/s^2."""
+    still_joints_ns: np.ndarray
+    """First and last stamp of each stretch in which no joint position changes, shape (n, 2)."""
+
+    @cached_property
+    def frozen(self) -> dict[str, np.ndarray]:
+        """Sensor -> in which chunks it gives one reading again and again, bool, shape (n,)."""
+        return frozen_chunks(self.chunks, self.resolution)
+
+    @cached_property
+    def awake(self) -> Chunks:
+        """The chunks in which no sensor is frozen."""
+        return self.chunks.select(~np.logical_or(*self.frozen.values()))
+
+    @cached_property
+    def frozen_parts(self) -> list[FrozenPart]:
+        """Where a sensor is frozen, or the joints are while the IMU turns."""
+        rate = np.zeros(3) if self.rest is None else self.rest.rate
+        return frozen_parts(self.chunks, self.frozen) + frozen_joints(self.awake, self.still_joints_ns, rate)
 
     @cached_property
     def rest(self) -> Rest | None:
         """What was read while steady, or None."""
-        return find_rest(self.chunks)
+        return find_rest(self.awake)
 
     @cached_property
     def turning(self) -> Turning | None:
         """How gravity turns against the rates, or None."""
-        return relate_turns(self.chunks)
+        return relate_turns(self.awake)
 
     @cached_property
     def rate_factor(self) -> float | None:
         """Measured rates over those that carry gravity from rest to rest, or None."""
-        return factor_between_rests(self.chunks, self.rest)
+        return factor_between_rests(self.awake, self.rest)
 
     @cached_property
     def quiet_range(self) -> np.ndarray:
         """Largest minus smallest reading in a quiet chunk, shape (6,)."""
         if self.rest is not None:
             return self.rest.range
-        return np.quantile(self.chunks.range, 0.1, axis=0) if len(self.chunks) else np.zeros(6)
+        return np.quantile(self.awake.range, 0.1, axis=0) if len(self.awake) else np.zeros(6)
 
     @cached_property
     def length(self) -> Any:
@@ -101,7 +120,7 @@ class EvidenceGatherer:
         self.gravity = gravity
         self._steps = {name: _Steps() for name in STREAMS}
         self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
-        self._resolution = np.full(6, np.inf)
+        self._resolution, self._joints = np.full(6, np.inf), StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
 
     def push(self, cleaned: CleanedBlock) -> None:
@@ -111,6 +130,8 @@ class EvidenceGatherer:
                 self._steps[name].push(samples.stamp_ns, epoch)
         for _, imu in cleaned.imu:
             self._take_imu(imu)
+        for _, joints in cleaned.joints:
+            self._joints.push(joints.stamp_ns, joints.position)
         for _, temperature in cleaned.temperature:
             low, high = self._temperature_c or (np.inf, -np.inf)
             self._temperature_c = (min(low, float(temperature.temperature_c.min())), max(high, float(temperature.temperature_c.max())))
@@ -121,7 +142,7 @@ class EvidenceGatherer:
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
         return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends,
-                                 self._temperature_c, self.gravity)
+                                 self._temperature_c, self.gravity, self._joints.stretches())
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])

@@ -12,6 +12,9 @@ STILL = 0.02
 
 
 LEAST_POSES = 9
+LEAST_FACES = 6
+FARTHEST = 0.8
+"""Bias in units of gravity from which on readings are no sphere but counts with an offset."""
 LEAST_SPREAD = 0.05
 """Smallest eigenvalue of the scatter of directions (1/3 when they are even) from which on poses tell bias from length."""
 
@@ -37,15 +40,22 @@ class Rest:
     @property
     def sphere(self) -> tuple[np.ndarray, float] | None:
         """Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None."""
-        if len(self.force) < LEAST_POSES:
-            return None
+        return self._sphere() if len(self.force) >= LEAST_POSES else None
+
+    @property
+    def bias(self) -> np.ndarray | None:
+        """Bias of the accelerometer, to a tenth of gravity or so, where six faces or more show it, or None."""
+        found = self._sphere() if len(self.force) >= LEAST_FACES else None
+        return None if found is None else found[0]
+
+    def _sphere(self):
         scaled = self.force / np.median(self.norm)
         design = np.column_stack([2 * scaled, np.ones(len(scaled))])
         *centre, rest = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=None)[0]
         centre = np.array(centre)
         directions = (scaled - centre) / np.maximum(np.linalg.norm(scaled - centre, axis=1, keepdims=True), 1e-9)
         spread = np.linalg.eigvalsh(np.cov(directions.T))[0]
-        if spread < LEAST_SPREAD or np.linalg.norm(centre) > 0.5:
+        if spread < LEAST_SPREAD or np.linalg.norm(centre) > FARTHEST:
             return None
         return centre * np.median(self.norm), float(np.sqrt(rest + centre @ centre) * np.median(self.norm))
 

@@ -1,4 +1,4 @@
-"""Checks of the readings: units, axes, frozen and clipping outputs, gravity, resolution, temperature."""
+"""Checks of the readings: units, axes, clipping outputs, biases, gravity, resolution, temperature."""
 
 from collections.abc import Iterator
 
@@ -8,6 +8,7 @@ from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.evidence import RecordingEvidence
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
+from imu_calibration.preflight.frozen_parts import SENSOR_COLUMNS
 from imu_calibration.preflight.full_scale import FACTORS, nearest_power
 from imu_calibration.units import significant
 
@@ -17,16 +18,18 @@ FASTEST = 100.0
 """rad/s, 5700 deg/s: hardly any gyroscope measures more."""
 FASTEST_DEG = 5000.0
 """Numbers above it are no deg/s either."""
-MOVING = 50.0
-"""An axis beside one that moves by this many steps of the converter does not stay the same by chance."""
-LONG = 4
-"""Chunks, one second."""
 CLIP_FORCE = 1.15
 """Times gravity; outputs without visible noise pile up at gravity without being clipped."""
 FINE = 8.0
 """Noise that spans this many steps of the converter is visible."""
 CLIP_RATE = 10.0
 """Times the range of the noise."""
+LEAST_RANGE = 0.4
+"""rad/s, 23 deg/s: what stops below it has not reached the end of the range of a gyroscope that is turned."""
+MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
+"""m/s^2, rad/s: several times what the cheapest grades promise (0.1 g, 20 deg/s)."""
+PLACE = 0.005
+"""Share by which gravity differs between places: 9.78 to 9.83 m/s^2."""
 REPEATED_SHARE = 0.05
 ROUNDING = 1e-6
 """m/s^2, rad/s; no converter is that fine."""
@@ -126,48 +129,6 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                   f'{what} ({kind}); correct signs and order of the axes in the driver')
 
 
-def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """No output stands still while its neighbours move."""
-    chunks, range_ = evidence.chunks, evidence.chunks.range
-    if not len(chunks):
-        return
-    for sensor, part, _ in CHANNELS:
-        noisy = evidence.quiet_range[part] > 0
-        constant = evidence.n_changed[part] == 0
-        if constant.all():
-            yield CheckFinding('frozen', REFUSE,
-                               f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
-                          'look at the sensor and its driver')
-            continue
-        for axis in np.flatnonzero(constant):
-            if noisy.any():
-                yield CheckFinding('frozen', REFUSE,
-                                   f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
-                              'look at the sensor and its driver')
-        for axis in np.flatnonzero(~constant):
-            moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
-            same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
-            stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
-            if stuck.any():
-                seconds = stuck.sum() * float(np.median(chunks.duration))
-                yield CheckFinding('frozen', WARNING,
-                                   f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
-                              'and leave that time out', samples=int(stuck.sum() * chunks.size))
-
-
-def _at_end(values, ends):
-    """Return which values are those at which an output piles up: clipped, not frozen."""
-    return np.logical_or.reduce([np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0) for sign, end in zip((1, -1), ends)])
-
-
-def _in_long_runs(flags):
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]]))).reshape(-1, 2)
-    kept = np.zeros(len(flags), bool)
-    for start, end in edges[edges[:, 1] - edges[:, 0] >= LONG]:
-        kept[start:end] = True
-    return kept
-
-
 def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output piles up at the end of its range."""
     for sensor, part, unit in CHANNELS:
@@ -175,9 +136,13 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         least = CLIP_RATE * evidence.quiet_range[part]
         if sensor == 'accelerometer':
             least = np.where(fine, least, CLIP_FORCE * (evidence.length or 0.0))
+        else:
+            least = np.maximum(least, LEAST_RANGE)
+        held = _held(evidence, sensor)
         words, total, level = [], 0, 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            counts = [end.n_clipped if end.level > least[axis] and (fine[axis] or end.jumped) else 0 for end in ends]
+            counts = [_clipped(end, sign * held[:, axis], evidence.chunks.size) if end.level > least[axis] and (fine[axis] or end.jumped)
+                      else 0 for sign, end in zip((1, -1), ends)]
             if sum(counts):
                 words.append(f'{"xyz"[axis]} {sum(counts)}')
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
@@ -186,6 +151,33 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding('clipping', WARNING,
                                f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
                           'what is beyond is lost, move less or choose a wider range', samples=total)
+
+
+def _held(evidence, sensor):
+    """Return the readings of the chunks in which a sensor is frozen, shape (n, 3)."""
+    return evidence.chunks.mean[evidence.frozen[sensor]][:, SENSOR_COLUMNS[sensor]]
+
+
+def _clipped(end, held, size):
+    """Return how many readings are at the end of the range; a pile that is a frozen stretch with its two ends is none."""
+    frozen = size * int(np.isclose(held, end.level, rtol=1e-9).sum())
+    return end.n_clipped if not frozen or end.n_clipped > frozen + 2 * size else 0
+
+
+def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The biases are such as sensors have."""
+    rest = evidence.rest
+    if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
+        return   # in few attitudes a steady spin about the vertical looks like rest
+    found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
+    for sensor, _, unit in CHANNELS:
+        size = float(np.linalg.norm(found[sensor]))
+        if size > MOST_BIAS[sensor]:
+            people = f'{size / STANDARD_GRAVITY:.2f} g' if sensor == 'accelerometer' else f'{size / DEG:.0f} deg/s'
+            values = ', '.join(f'{value:+.2f}' for value in found[sensor])
+            yield CheckFinding('bias', WARNING,
+                               f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of sensor has; look at '
+                          'offsets in the driver, or at the supply and the soldering of the sensor')
 
 
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -202,14 +194,16 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if abs(off) > GRAVITY_SHARE:
         yield CheckFinding('gravity', WARNING,
                            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
-                      f'{100 * off:+.1f} %: scale or bias is far off, or the gravity given is that of another place')
+                      f'{100 * off:+.1f} %: scale or bias is far off (gravity itself differs by '
+                      f'{100 * PLACE} % between places)')
     else:
         yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 
 
 def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
-    share = evidence.n_repeated / max(evidence.n_samples, 1)
+    frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
+    share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
         yield CheckFinding('repeated_readings', WARNING,
                            f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
