@@ -67,7 +67,7 @@ def test_calibration_by_hand_cleans_each_sample_once(seen):
 def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, seen, with_table):
     (look,) = inspect(BAG, [Topics()], table if with_table else None, options=PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
-    assert (look.calibrated is not None) == with_table
+    assert (look.calibrated is not None) == with_table and (look.by_hand is not None) != with_table
 
 
 def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):

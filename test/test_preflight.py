@@ -21,6 +21,7 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.write import write_session
 
 from worlds.physics import make_session, write_bag
+from worlds.physics_hand import hold_and_turn
 
 G = 9.80665
 
@@ -251,7 +252,8 @@ def test_inspect_names_the_fault(capsys, tmp_path, session, fault, check, severi
     found = [f for f in findings(fault(session.imu, session.joints, session.temperature)) if f.check == check and f.severity == severity]
     assert found and [word for word in words if word not in ' '.join(f.text for f in found)] == []
     assert all(f'{severity} {check.replace("_", " ")} {" ".join(f.text.split())}' in printed for f in found)
-    assert code == 3 or severity == WARNING
+    worst = {f.severity for f in findings(fault(session.imu, session.joints, session.temperature))}
+    assert code == (1 if REFUSE in worst else 3)
 
 
 @pytest.mark.parametrize('fault', sorted({fault for fault, _, severity, _ in FAULTS if severity == REFUSE}, key=lambda f: f.__name__))
@@ -470,6 +472,16 @@ def test_inspect_says_which_topics_it_leaves_alone(capsys, tmp_path, session, ki
     assert main(['inspect', str(several_topics(tmp_path, session, **{kind: 2}))]) == 0
     line, = (line for line in capsys.readouterr().out.splitlines() if line.startswith('not read'))
     assert f'/{kind}_0, /{kind}_1' in line and line.endswith(f'(--{kind.rstrip("s")}-topic)')
+
+
+def test_inspect_says_what_the_recording_determines_by_hand(capsys, tmp_path):
+    imu = hold_and_turn(3)[0]
+    for samples, words in ((imu, 'without a table, it determines, from 14 poses and 13 turns'),
+                           (imu.select(slice(0, 400)), 'not usable for calibration without a table: ')):
+        write_session(str(tmp_path / str(len(samples))), samples)
+        assert main(['inspect', str(tmp_path / str(len(samples)))]) == 0
+        printed = capsys.readouterr().out
+        assert words in printed and ('determined: accelerometer.bias.x' in printed) == (len(samples) > 400)
 
 
 @pytest.mark.parametrize('bad', (0, 1))

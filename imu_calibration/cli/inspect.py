@@ -8,6 +8,7 @@ from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.cli.show import console, show_findings
 from imu_calibration.errors import ImuCalibrationError, with_hint
+from imu_calibration.preflight.checks import refuse
 from imu_calibration.use_cases.choices import calibration_options, topics_of
 from imu_calibration.use_cases.inspect import imu_topics_of, inspect
 from imu_calibration.use_cases.recordings import Topics, existing
@@ -36,7 +37,7 @@ def run(options: Namespace) -> int:
     out = console()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints_of(options))
-    code = 0
+    codes = []
     for look in looks:
         out.print()
         if len(looks) > 1:
@@ -44,8 +45,12 @@ def run(options: Namespace) -> int:
         show_findings(out, look.findings, hints_of(options))
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
-        code = max(code, look.exit_code, _judge(out, look, hints_of(options)))
-    return code
+        codes.append(max(look.exit_code, _judge(out, look, hints_of(options))))
+        if look.by_hand is not None:
+            _show_by_hand(out, look.by_hand, hints_of(options))
+    if set(codes) == {1}:   # nothing is usable: told on standard error too, as every refusal
+        refuse(looks[0].findings)
+    return 3 if any(codes) else 0
 
 
 def _show_topics(out, looks):
@@ -95,14 +100,30 @@ def _judge(out, look, hints):
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
         out.print(f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]} samples')
+    _show_parameters(out, result.calibration)
+    return exit_code(result.calibration)
+
+
+def _show_by_hand(out, found, hints):
+    """Print whether the recording can be calibrated by hand, and which parameters that determines."""
+    if isinstance(found, ImuCalibrationError):
+        out.print(f'not usable for calibration without a table: {found.told(hints)}', soft_wrap=True, markup=False)
+        return
+    windows = found.calibration.statistics['windows']
+    out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:',
+              soft_wrap=True)
+    _show_parameters(out, found.calibration)
+
+
+def _show_parameters(out, calibration):
+    """Print the parameters by status, and the motions that would determine more."""
     groups = {}
-    for name, status in zip(result.calibration.param_names, result.calibration.status):
+    for name, status in zip(calibration.param_names, calibration.status):
         groups.setdefault(status, []).append(name)
     for status, names in groups.items():
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
     needs = {}
-    for direction in result.calibration.undetermined:
+    for direction in calibration.undetermined:
         needs.setdefault(direction['needs'], {}).update(direction['parameters'])
     for motion, names in needs.items():
         out.print(f'needs: {motion}  ({", ".join(names)})', soft_wrap=True)
-    return exit_code(result.calibration)

@@ -107,7 +107,8 @@ class StandingJoints:
 
     def __init__(self) -> None:
         self._found: list[tuple[int, int]] = []
-        self._last, self._since, self._until = None, None, None
+        self._last: np.ndarray | None = None
+        self._since, self._until = 0, 0
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
         """Take joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
@@ -131,9 +132,9 @@ class StandingJoints:
 
     def stretches(self) -> np.ndarray:
         """Return first and last stamp of each stretch until now, shape (n, 2)."""
-        open_one = [] if self._since is None or self._until - self._since < self.LEAST_NS else [(self._since, self._until)]
+        open_one = [] if self._until - self._since < self.LEAST_NS else [(self._since, self._until)]
         return np.array(self._found + open_one, np.int64).reshape(-1, 2)
 
     def _close(self):
-        if self._since is not None and self._until - self._since >= self.LEAST_NS and len(self._found) < self.CAPACITY:
+        if self._until - self._since >= self.LEAST_NS and len(self._found) < self.CAPACITY:
             self._found.append((self._since, self._until))

@@ -1,20 +1,22 @@
 """Inspect: what the topics of a recording hold, what looks wrong with them, and what they can determine; each is read through once."""
 
-from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 
+from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.result import HandResult
+from imu_calibration.by_hand.workflow import hand_result, read_by_hand
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.preflight.checks import Preflight, unusable
+from imu_calibration.preflight.checks import Preflight, unusable, warnings
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.block_cleaning import BlockCleaner
 from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
 from msg_adapters.bag import Recording, imu_topics, list_topics
@@ -34,6 +36,8 @@ class Look:
     """Reason -> messages that could not be read."""
     calibrated: TableResult | ImuCalibrationError | None
     """What the motions determine, or why nothing; None without a table."""
+    by_hand: HandResult | ImuCalibrationError | None = None
+    """What poses and turns determine beside gravity, or why nothing; None with a table, and where a calibration would be wrong."""
 
     @property
     def refused(self) -> bool:
@@ -42,9 +46,11 @@ class Look:
 
     @property
     def exit_code(self) -> int:
-        """0, or 3 where something is lost, unusable or refused."""
+        """1 where a calibration would be wrong, 3 where it may suffer or something is lost or unusable, else 0."""
         dropped = any(stream.dropped for stream in self.streams.values())
-        return 3 if self.refused or self.lost or dropped or unusable(self.findings) else 0
+        if self.refused:
+            return 1
+        return 3 if self.lost or dropped or unusable(self.findings) or warnings(self.findings) else 0
 
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
@@ -62,6 +68,7 @@ def _look(bag, topics, table, options):
     recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
     recording.close()
     preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
+    by_hand = None
     if table is not None:
         try:
             calibrated = calibrate([source_of(bag, topics, table.joint_names)], table, options, mapper=_watched_by(preflight))
@@ -69,9 +76,22 @@ def _look(bag, topics, table, options):
             calibrated = error
     if not preflight.streams:   # not read to its end: nothing to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False)
-        source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
-        deque(BlockCleaner(nominal=options.nominal, watchers=[preflight]).all_of(source()), maxlen=0)
-    return Look(recording, preflight.streams, preflight.findings, preflight.lost, calibrated)
+        by_hand = _by_hand(source_of(bag, topics, want_joints='optional', want_temperature='optional'), options, preflight)
+    look = Look(recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand)
+    return look if table is None and not look.refused else replace(look, by_hand=None)
+
+
+def _by_hand(source, options, preflight):
+    """Show a recording to the checks and return what it determines without a table, or why nothing."""
+    try:
+        recording = read_by_hand(source(), options.nominal, [preflight])
+        if any(finding.severity == REFUSE for finding in preflight.findings):
+            return None
+        asked = hand_options(options)
+        data = gather_by_hand(recording.imu, settings=asked.settings, temperature_c=recording.temperature_c)
+        return hand_result(solve_by_hand(data, asked), recording, options, findings=preflight.findings)
+    except ImuCalibrationError as error:
+        return error
 
 
 def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[Gathered]]:
