@@ -9,6 +9,7 @@ SHOWN = {
     '(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³'),
     '(rad/s)^-1': (1e2 * DEG, '% per deg/s'), '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
     'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
+    'rad/turn': (1 / DEG, 'deg per turn'),
 }
 """SI unit -> (factor, unit that people use)."""
 SHOWN_OF_NOISE = {

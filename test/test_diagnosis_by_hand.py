@@ -10,6 +10,7 @@ from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.document import to_mapping
+from imu_calibration.diagnosis.workflow import diagnosis_lines
 from imu_calibration.errors import NotObservableError
 
 from worlds.hand_sessions import GRAVITY, simulate
@@ -91,6 +92,19 @@ def test_a_cause_that_no_catalogue_holds_is_unexplained():
     assert not found.findings
     assert found.unexplained['accelerometer'].significant
     assert found.unexplained['accelerometer'].rms == pytest.approx(3 * MG, rel=0.5)
+
+
+def test_what_turns_leave_is_an_angle_per_turn():
+    """A rate that comes only while it turns, another one in each turn: 0.6 deg/s per axis for 1.6 s."""
+    def slips(force, rate, time, pose):
+        offsets = np.random.default_rng(98).normal(0, 0.6 * DEG, (pose.max() + 1, 3))
+        return NOTHING, offsets[pose] * (np.linalg.norm(rate, axis=1) > 0.01)[:, None]
+    found = diagnosed(33, slips).diagnosis
+    rest = found.unexplained['gyroscope']
+    text, = (line for line in diagnosis_lines(found) if line.startswith('unexplained') and 'gyroscope' in line)
+    assert rest.significant and rest.unit == to_mapping(found)['unexplained']['gyroscope']['unit'] == 'rad/turn'
+    assert 'deg per turn rms' in text
+    assert rest.rms == pytest.approx(0.6 * DEG * 1.6, rel=0.4)   # the matrix takes a part
 
 
 def test_the_document_and_the_extended_model_go_together(responding):

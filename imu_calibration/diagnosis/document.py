@@ -18,7 +18,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,
-        'unexplained': {sensor: _rest(diagnosis.unexplained[sensor]) for sensor in SENSORS},
+        'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor]) for sensor in SENSORS},
         'not_testable': list(diagnosis.not_testable),
         'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
         'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
@@ -50,8 +50,8 @@ def _gain(gain):
             'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
 
 
-def _rest(rest):
-    return {'significant': rest.significant, 'rms': rest.rms, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
+def _rest(sensor, rest):
+    return {'significant': rest.significant, 'rms': rest.rms, 'unit': rest.unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor], 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
             'share': rest.share, 'where': rest.where}
 
 

@@ -136,7 +136,7 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
     values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked,
                               'older windows not looked at': forgotten}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
-    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor)
+    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
                for sensor, found in diagnosis.unexplained.items() if found.significant}
     if not diagnosis.findings:
         return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)

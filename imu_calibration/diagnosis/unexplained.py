@@ -28,7 +28,7 @@ class Unexplained:
     significant: bool
     """Whether it stands out of noise and of the way in which every bias moves."""
     rms: float
-    """Rms beyond noise, m/s^2 or rad/s: of the windows' means, or within windows where only that stands out."""
+    """Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows where only that stands out."""
     sigma: float
     """Standard deviations by which it exceeds noise."""
     correlates_with: str | None
@@ -41,6 +41,8 @@ class Unexplained:
     """Residual of the windows' means, shape (k, 3)."""
     noise_sd: np.ndarray
     """What noise alone would leave there, shape (k, 3)."""
+    unit: str | None = None
+    """Unit of `rms` where it is not that of the sensor: 'rad/turn' where turns by hand leave most."""
 
 
 def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:

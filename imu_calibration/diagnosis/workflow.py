@@ -142,7 +142,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
-            lines.append(f'unexplained: {in_words(rest.rms, sensor)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
+            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
@@ -157,7 +157,7 @@ def nothing_named(diagnosis: Diagnosis) -> str:
             'so that something else may be the cause of both')
 
 
-def in_words(value: float, sensor: str) -> str:
-    """Return a specific force or rate in people's units."""
-    factor, unit = for_people({'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
+def in_words(value: float, sensor: str, unit: str | None = None) -> str:
+    """Return a specific force or rate, or a value in another unit, in people's units."""
+    factor, unit = for_people(unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
     return f'{significant(value * factor)} {unit}'

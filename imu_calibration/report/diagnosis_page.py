@@ -59,7 +59,7 @@ def _reasons(diagnosis, rests):
         lines = [(f'No effect of the {len(diagnosis.candidates)} that were asked about explains more than noise does.', '')]
     for sensor, rest in rests:
         more = f', and it goes with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{in_unit(rest.rms, UNIT[sensor])} rms of the {sensor} are unexplained{more}'
+        lines.append((f'{in_unit(rest.rms, rest.unit or UNIT[sensor])} rms of the {sensor} are unexplained{more}'
                       + (f'; {rest.where}' if rest.where else '') + '.',
                       'look there: a knock, a slip in the fixture, or a cause that the catalogue does not know'))
     return lines
@@ -238,5 +238,5 @@ def _goes_with(rest):
 
 
 def _rest(sensor, rest):
-    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, UNIT[sensor]), 'sigma': text(rest.sigma, 2),
-            'with': _goes_with(rest), 'where': rest.where or '–'}
+    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNIT[sensor]),
+            'sigma': text(rest.sigma, 2), 'with': _goes_with(rest), 'where': rest.where or '–'}

@@ -12,6 +12,9 @@ from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Un
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.questions import Question
 
+PER_TURN = 'rad/turn'
+"""Unit of what turns leave: the angle by which gravity misses its direction after one."""
+
 
 def as_solution(hand: HandCalibration) -> Solution:
     """Return a HandCalibration as the `Solution` that documents and reports know."""
@@ -59,19 +62,21 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
         if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
-            excess = np.sum(residual**2) / spare - np.mean(block.floor)
+            size = 1.0 if block.duration is None else block.duration[:, None]**2   # a turn leaves an angle, a pose a rate
+            excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
     count = len(hand.poses.start)
     first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
     layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
     significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
+    unit = None if chosen is None or chosen.duration is None else PER_TURN
     if not significant:
-        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd)
+        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd, unit)
     name, share = correlate(_explanations(hand), layers / noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
-    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd)
+    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd, unit)
 
 
 def _explanations(hand):

@@ -33,10 +33,13 @@ class Block:
     """Pose of each row, that before it for a turn, shape (m,)."""
     time: np.ndarray
     """Seconds since the first sample, shape (m,)."""
+    duration: np.ndarray | None = None
+    """Of each turn, s, shape (m,): residuals of turns times it are angles; None for poses."""
 
     def select(self, keep: np.ndarray) -> 'Block':
         """Return the rows at a mask."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in ('rows', 'known', 'floor', 'pose', 'time')})
+        return replace(self, **{name: getattr(self, name)[keep] for name in ('rows', 'known', 'floor', 'pose', 'time', 'duration')
+                                if getattr(self, name) is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +148,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
-    across, rows, known = tangent(hand.state.up), [], []
+    across, rows, known, durations = tangent(hand.state.up), [], [], []
     for turn in turns:
         i, j = turn.first, turn.last
         bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
@@ -164,6 +167,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
             place += effect.size
         row[:, -1] = -across[j].T @ carried / found.duration
         rows.append(row)
+        durations.append(found.duration)
         known.append(np.full(2, turn.noise_variance / found.duration**2))
     return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
-                 np.array([turn.time.mean() for turn in turns]))
+                 np.array([turn.time.mean() for turn in turns]), np.array(durations))
