@@ -57,7 +57,7 @@ def unexplained_text(document, sensor):
     rest = document['unexplained'].get(sensor) or {}
     if rest.get('rms') is None:
         return 'not tested'
-    factor, unit = for_people('m/s^2' if sensor == 'accelerometer' else 'rad/s')
+    factor, unit = for_people(rest['unit'])
     along = f', with {rest["correlates_with"]}' if rest.get('correlates_with') else ''
     return f'{"**significant**" if rest.get("significant") else "no"}, {significant(rest["rms"] * factor)} {unit}{along}'
 
