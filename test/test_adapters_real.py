@@ -80,5 +80,5 @@ def test_ros1_bags_take_the_general_path(tmp_path):
     np.testing.assert_array_equal(np.concatenate([block.imu.force_s for block in blocks]), imu.force_s)
     np.testing.assert_array_equal(blocks[0].imu.stamp_ns, imu.stamp_ns)
     np.testing.assert_array_equal(blocks[0].joints.velocity, joints.velocity[:, [2, 0, 1]])
-    with pytest.raises(InputError, match='convert it first'):
+    with pytest.raises(InputError, match='convert it with the command'):
         copy_with_corrected(path, tmp_path / 'new', '/imu/data_raw', corrected_topic='/c', correct=None)

@@ -135,8 +135,10 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     print(f'diagnosed live: {status.message}; solve answered after {answered:.1f} s')
     assert first.effect == 'accel_quadratic'
     assert found['outcome'] == 'found' and found['effect'] == first.effect and found['p-value'] == f'{first.p_value:.2g}'
-    assert found['held-out reduction'] == f'{first.gain.reduction:.3f}' and found['explanation'] == first.explanation
-    assert status.level == b'\1' and first.explanation in status.message
+    # The verb tells the size in its own calibration, which has levelling and arms beside the finding: it may differ by some sd.
+    story = first.explanation.partition(' Its size')[0]
+    assert found['held-out reduction'] == f'{first.gain.reduction:.3f}' and found['explanation'].startswith(story)
+    assert status.level == b'\1' and story in status.message
 
 
 @pytest.mark.real_data

@@ -55,6 +55,6 @@ def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
     gatherer = MotionGatherer(table)
     windows = gatherer.push(pair.first.block) + gatherer.finish()
     monkeypatch.setattr(investigation, 'may_be_clipped', lambda windows, sensor: True)
-    monkeypatch.setattr(investigation, 'without_clipped', lambda *given: [])
+    monkeypatch.setattr(investigation, 'without_clipped', lambda *given, **known: [])
     found = investigation.investigate(windows, table, SensorModel(joint_names=table.joint_names))
     assert found.used == [window for window in windows if window.kind != 'unused'] and not found.limits

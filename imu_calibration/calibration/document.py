@@ -101,7 +101,7 @@ class Calibration:
         return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
 
     @property
-    def uncertainty_known(self):
+    def uncertainty_known(self) -> bool:
         """Whether somebody knows how certain the values are: of those that another program made nobody does."""
         return self.provenance.get('uncertainty') != UNKNOWN
 

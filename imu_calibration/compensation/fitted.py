@@ -28,6 +28,10 @@ class FittedErrors(Protocol):
         """How well each parameter is known: 'determined', 'weak' or 'held'."""
 
     @property
+    def uncertainty_known(self) -> bool:
+        """Whether somebody knows how certain the values are."""
+
+    @property
     def frame_id(self) -> str:
         """Frame of the messages that it was made from."""
 

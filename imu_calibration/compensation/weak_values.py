@@ -17,11 +17,11 @@ def applied_values(calibration: FittedErrors) -> np.ndarray:
     Parameters
     ----------
     calibration : Calibration
-        With statuses; only weak parameters are touched.
+        With statuses; only weak parameters are touched, and none where nobody knows how certain the values are (imported ones).
 
     """
     weak = [k for k, status in enumerate(calibration.status) if status == WEAK]
-    if not weak:
+    if not weak or not calibration.uncertainty_known:
         return calibration.values
     values, covariance = calibration.values.copy(), calibration.covariance.copy()
     prior = np.concatenate([effect.prior_values() for effect in calibration.model.effects])
