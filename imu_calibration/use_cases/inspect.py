@@ -47,7 +47,8 @@ class Look:
     @property
     def exit_code(self) -> int:
         """1 where a calibration would be wrong, 3 where it may suffer or something is lost or unusable, else 0."""
-        dropped = any(stream.dropped for stream in self.streams.values())
+        # Of spikes the findings say whether they are worth a warning.
+        dropped = any(set(stream.dropped) - {'spike'} for stream in self.streams.values())
         if self.refused:
             return 1
         return 3 if self.lost or dropped or unusable(self.findings) or warnings(self.findings) else 0
