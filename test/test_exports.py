@@ -42,7 +42,7 @@ ROUND_TRIP = 1e-12
 
 def motion(seed, n=12):
     force, rate, alpha, temperature = random_motion(n, seed)
-    return motion_of(force, rate, alpha, temperature, 'a random motion')
+    return motion_of(force, rate, alpha, temperature_c=temperature, text='a random motion')
 
 
 def readings(calibration, ref):

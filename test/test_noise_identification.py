@@ -240,9 +240,9 @@ def test_dead_reckoning_scatters_as_predicted():
             readings = draw(before + after, size)
             force = readings[before:] - readings[:before].mean()
             ends.append(np.sum(force * (seconds - (np.arange(after) + 0.5) * step)) * step)
-        predicted = position_sd([process], [size**2], 'accelerometer', seconds, alignment=alignment)[0]
+        predicted = position_sd([process], [size**2], 'accelerometer', seconds=seconds, alignment=alignment)[0]
         assert np.std(ends) == pytest.approx(predicted, rel=0.12), process.name
-    white = position_sd([WHITE], [1.0], 'accelerometer', seconds, alignment=200.0)[0]
+    white = position_sd([WHITE], [1.0], 'accelerometer', seconds=seconds, alignment=200.0)[0]
     assert white == pytest.approx(np.sqrt(seconds**3 / 3 + seconds**4 / 4 / 200.0), rel=1e-3)
-    tilt = position_sd([WHITE], [1.0], 'gyroscope', seconds, alignment=200.0, gravity=10.0)[0]
+    tilt = position_sd([WHITE], [1.0], 'gyroscope', seconds=seconds, alignment=200.0, gravity=10.0)[0]
     assert tilt == pytest.approx(10.0 * np.sqrt(seconds**5 / 20 + seconds**6 / 36 / 200.0), rel=1e-3)

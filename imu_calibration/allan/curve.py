@@ -59,7 +59,7 @@ class Detrending:
         return np.column_stack(columns)
 
 
-def read_curve(blocks: Iterable[SampleBlock], parts: list[list[StillPart]], period: float, detrending: Detrending,
+def read_curve(blocks: Iterable[SampleBlock], parts: list[list[StillPart]], period: float, *, detrending: Detrending,
                time_of: Callable[[int, np.ndarray], np.ndarray], nominal: NominalScaling | None = None) -> AllanCurve:
     """
     Read the parts at rest and return their Allan variances.

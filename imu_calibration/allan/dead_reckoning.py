@@ -29,11 +29,11 @@ def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]
 
 def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
     processes = axis.processes()
-    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds)
+    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds=seconds)
     return float(np.sqrt((shares**2).sum()))
 
 
-def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float], sensor: str, seconds: float, *,
+def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float], sensor: str, *, seconds: float,
                 alignment: float = 60.0, gravity: float = STANDARD_GRAVITY) -> np.ndarray:
     """
     Return the standard deviation of the position by each process of one axis, m, shape (n_processes,).

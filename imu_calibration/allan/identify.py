@@ -91,7 +91,7 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     search = TrendSearch(_blocks(found, parts, clock))
     trends = tuple(search.find(axis) for axis in range(6))
     detrending = Detrending(trends, search.reference, clock.temperature(found))
-    curve = read_curve(source(), parts, found.period, detrending, clock.time, nominal)
+    curve = read_curve(source(), parts, found.period, detrending=detrending, time_of=clock.time, nominal=nominal)
     _require_scatter(curve)
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
     moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]))

@@ -94,7 +94,7 @@ class Moments:
 
 
 def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None,
-                  start: np.ndarray | None = None) -> MomentFit:
+                  *, start: np.ndarray | None = None) -> MomentFit:
     """
     Fit the coefficients of given processes.
 
@@ -193,7 +193,7 @@ def fit_with_time(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
             return fit
         seen.add(best)
         model = (*processes, gauss_markov(moments.times[best]))
-        fit = fit_processes(moments, model, fixed, None if fit is None else fit.coefficients)
+        fit = fit_processes(moments, model, fixed, start=None if fit is None else fit.coefficients)
         whitener = Whitener(fit.covariance)
 
 

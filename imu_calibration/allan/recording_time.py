@@ -33,11 +33,11 @@ class RecordingTimes:
     def needed(self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int) -> float | None:
         """Return the shortest of `LENGTHS` in which coefficient `index` of a model is determined, s; None when none is long enough."""
         for length in LENGTHS:
-            if self.relative_sd(length, processes, coefficients, index) <= RELATIVE_SD:
+            if self.relative_sd(length, processes, coefficients, index=index) <= RELATIVE_SD:
                 return float(length)
         return None
 
-    def relative_sd(self, seconds: float, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int) -> float:
+    def relative_sd(self, seconds: float, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, *, index: int) -> float:
         """Return the standard deviation of a coefficient over the coefficient, from one recording at rest of this length."""
         moments = self._moments(seconds)
         design, tensor = moments.design(processes), moments.tensor(processes)

@@ -24,7 +24,7 @@ EXACT = 0.02
 """Accuracy of the ends, in standard deviations."""
 
 
-def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], name: str,
+def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, name: str,
                          excess: float = 1.0) -> tuple[float, float]:
     """
     Return the interval of the coefficient of a process: from 0 where the curve does without it.
@@ -59,7 +59,7 @@ def score_at_zero(moments: Moments, fit: MomentFit, index: int) -> float:
     return _ScoreOfCoefficient(moments, fit, 1.0, index).tail_above(0.0)
 
 
-def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], excess: float = 1.0) -> tuple[float, float]:
+def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0) -> tuple[float, float]:
     """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk does as well."""
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
@@ -139,7 +139,7 @@ class _ScoreOfCoefficient(_Score):
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
         else:
-            fit = fit_processes(self.moments, processes, {self.index: value}, self.fit.coefficients)
+            fit = fit_processes(self.moments, processes, {self.index: value}, start=self.fit.coefficients)
         return fit, *self._directions(fit)
 
     def _directions(self, fit):
@@ -154,7 +154,7 @@ class _ScoreOfTime(_Score):
     def at(self, value):
         """Return the fit with the time held, the direction of a longer time, and those of the coefficients."""
         processes = (*self.fit.processes[:-1], gauss_markov(value))
-        fit = fit_processes(self.moments, processes, None, self.fit.coefficients)
+        fit = fit_processes(self.moments, processes, None, start=self.fit.coefficients)
         design = self.moments.design(processes)
         return fit, _by_time(self.moments, value), [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0]
 

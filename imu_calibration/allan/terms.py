@@ -144,10 +144,10 @@ def _figures(choice, name, excess):
     """Return the terms of one process: its figure, and the correlation time of a Gauss-Markov process."""
     fits, weights = choice.having(name)
     index = fits[0].names.index(name)
-    interval = coefficient_interval(choice.moments, fits, weights, name, excess)
+    interval = coefficient_interval(choice.moments, fits, weights, name=name, excess=excess)
     found = {name: _term(name, np.sqrt(fits[0].coefficients[index]), np.sqrt(interval))}
     if name == GAUSS_MARKOV:
-        found[TIME] = _term(TIME, fits[0].processes[index].time, time_interval(choice.moments, fits, weights, excess))
+        found[TIME] = _term(TIME, fits[0].processes[index].time, time_interval(choice.moments, fits, weights, excess=excess))
     return found
 
 

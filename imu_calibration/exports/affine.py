@@ -76,11 +76,11 @@ class Placement:
         """Return the placement that undoes this one."""
         return Placement(mat_ts=self.mat_ts.T, origin_s=-self.mat_ts @ self.origin_s, mat_readings=self.mat_readings.T)
 
-    def readings(self, force, rate):
+    def readings(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings in the program's axes, each shape (n, 3)."""
         return force @ self.mat_readings.T, rate @ self.mat_readings.T
 
-    def truth(self, force, rate, alpha):
+    def truth(self, force: np.ndarray, rate: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate at the program's origin in its frame, each shape (n, 3)."""
         return (force + lever_matrix(rate, alpha) @ self.origin_s) @ self.mat_ts.T, rate @ self.mat_ts.T
 

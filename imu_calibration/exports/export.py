@@ -63,7 +63,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     found, unknown = _noise_numbers(calibration, target, noise, rate)
     placement, numbers = placed_numbers(calibration, target)
     motion = motion or standard_motion(calibration)
-    loss = loss_of(target, calibration, numbers, placement, motion)
+    loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
     lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
              *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(calibration), *target.ignored(numbers), *unknown)),
              *(f'note: {hint}' for hint in [target.hint] if hint)]

@@ -51,7 +51,7 @@ class Loss:
         return not self.effects and max(self.left.values()) < NOTHING
 
 
-def loss_of(target: Target, calibration: Calibration, numbers: Numbers, placement: Placement, motion: TrialMotion) -> Loss:
+def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: Placement, motion: TrialMotion) -> Loss:
     """
     Return what a target loses of a calibration on a motion.
 

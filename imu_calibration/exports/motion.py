@@ -33,7 +33,7 @@ class TrialMotion:
     """What it is, for people."""
 
 
-def motion_of(force, rate, alpha, temperature_c, text: str) -> TrialMotion:
+def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, temperature_c: np.ndarray, text: str) -> TrialMotion:
     """Return a motion from its arrays, shapes (n, 3) and (n,)."""
     attitude = np.broadcast_to(np.eye(3), (len(force), 3, 3))
     reference = Reference(np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c)
@@ -61,10 +61,10 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     temperature = np.linspace(low, high, len(time))
     warmth = f'{low:g} C' if low == high else f'{low:g} to {high:g} C'
     text = f'a standard motion (gravity in all directions, {largest:.3g} rad/s at 0.3 to 0.5 Hz about each axis, {warmth})'
-    return motion_of(force, rate, alpha, temperature, text)
+    return motion_of(force, rate, alpha, temperature_c=temperature, text=text)
 
 
-def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, name: str) -> TrialMotion:
+def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, *, name: str) -> TrialMotion:
     """
     Return the motion of a recording as the calibration sees it: its compensated readings.
 
@@ -83,8 +83,8 @@ def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: Temp
     stamps = imu.stamp_ns[kept]
     slope = StampedDerivative(derivative_for(calibration, typical_period(stamps[:10_000]) or 0.01))
     alpha = slope.push_block(stamps, corrected.rate[kept])
-    return motion_of(corrected.force[kept], corrected.rate[kept], alpha, temperature_at(calibration, temperature, stamps),
-                     f'{name} ({int(kept.sum())} samples)')
+    return motion_of(corrected.force[kept], corrected.rate[kept], alpha, temperature_c=temperature_at(calibration, temperature, stamps),
+                     text=f'{name} ({int(kept.sum())} samples)')
 
 
 def temperature_at(calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
     return head + commented(comments) + to_text(plain(mapping))
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """Return a value with arrays as lists and numpy's numbers as Python's."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
@@ -56,7 +57,7 @@ def text_of(content: bytes, what: str) -> str:
         raise InputError(f'the {what} must be a text file, it is none; give another file') from error
 
 
-def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], what: str) -> np.ndarray:
+def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -> np.ndarray:
     """
     Return an entry of a mapping as an array.
 

@@ -62,13 +62,14 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
     temperature = temperatures(bag, topics)
     if stand is None:
         blocks = [block.imu for block in source_of(bag, topics, want_joints=False)() if block.imu is not None]
-        return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name_of(bag))
+        return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag))
     table = table_of(stand, [bag], topics)
     truth = session_truth(source_of(bag, topics, table.joint_names)(), table)
     ref = truth.reference
     count = len(ref.time)
-    return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_at(calibration, temperature, np.asarray(truth.imu.stamp_ns)),
-                     f'{name_of(bag)}, moved as its table says ({count} samples)')
+    warmth = temperature_at(calibration, temperature, np.asarray(truth.imu.stamp_ns))
+    return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_c=warmth,
+                     text=f'{name_of(bag)}, moved as its table says ({count} samples)')
 
 
 def import_calibration(path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = '') -> Calibration:

@@ -1,5 +1,7 @@
 """ArduPilot: a parameter file with offsets, scale factors and temperature calibration of the first IMU."""
 
+from pathlib import Path
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
@@ -53,7 +55,7 @@ def _thermal(found, sensor, temperature_c):
     return _polynomial(found, sensor, np.clip(temperature_c, low, high)) - _polynomial(found, sensor, np.clip(then, low, high))
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL``; gyroscopes have no scale."""
     force = readings.force - _thermal(found, 'accelerometer', readings.temperature_c) - _vector(found, OFFSET['accelerometer'])
     rate = readings.rate - _thermal(found, 'gyroscope', readings.temperature_c) - _vector(found, OFFSET['gyroscope'])
@@ -80,7 +82,7 @@ def write(page: Page) -> str:
     return commented(page.comments) + ''.join(f'{name},{value!r}\n' for name, value in values.items())
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read the parameters of the first IMU."""
     known = (*OFFSET.values(), SCALE, *CALTEMP.values(), TCAL)
     every = read_parameters(content, 'ArduPilot parameter file')

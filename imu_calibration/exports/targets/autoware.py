@@ -1,6 +1,7 @@
 """Autoware: parameters of imu_corrector, and the scale factors that it takes from a topic."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def _offset(found):
     return np.array([found[f'angular_velocity_offset_{a}'] for a in AXES])
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(rate - offset) / scale``; specific force passes as it is."""
     return readings.force, (readings.rate - _offset(found)) / np.asarray(found[TOPIC])
 
@@ -50,11 +51,11 @@ def write(page: Page) -> str:
     return yaml_file([*page.comments, *scale], {'/**': {'ros__parameters': {**parameters, 'on_off_correction': switches}}})
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read a parameter file; scale factors only from the comment that `write` makes."""
     what = 'imu_corrector parameter file'
     found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
-    offsets = {name: float(numbers_at(found, name, (), what)) for name in (f'angular_velocity_offset_{a}' for a in AXES)}
+    offsets = {name: float(numbers_at(found, name, (), what=what)) for name in (f'angular_velocity_offset_{a}' for a in AXES)}
     scale = re.search(rf'^#.*{TOPIC} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M)
     values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
     return Read({**offsets, TOPIC: values}, () if scale else of('gyroscope', SCALES))

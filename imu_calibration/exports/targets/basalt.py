@@ -1,6 +1,7 @@
 """basalt: the IMU's part of its calibration JSON."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def imu(found: dict) -> AffineImu:
     return AffineImu(matrix=matrix, bias={sensor: matrix[sensor] @ bias for sensor, (_, bias) in _parts(found).items()})
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``raw + S raw - b`` of both sensors."""
     parts = _parts(found)
     (accel, accel_bias), (gyro, gyro_bias) = parts.values()
@@ -56,16 +57,16 @@ def write(page: Page) -> str:
     return json.dumps(plain({'value0': {**page.numbers, **(page.noise or {})}, 'comments': page.comments}), indent=2) + '\n'
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read a calibration JSON of basalt."""
     what = 'basalt calibration'
     values = section(read_json(content, what), 'value0', what)
-    found = {name: numbers_at(values, name, (size,), what) for name, size in (('calib_accel_bias', 9), ('calib_gyro_bias', 12))}
+    found = {name: numbers_at(values, name, (size,), what=what) for name, size in (('calib_accel_bias', 9), ('calib_gyro_bias', 12))}
     rate, sample_sd = values.get('imu_update_rate'), {}
     if isinstance(rate, (int, float)) and rate > 0:
         for sensor, name in (('accelerometer', 'accel_noise_std'), ('gyroscope', 'gyro_noise_std')):
             if name in values:
-                sample_sd[sensor] = float(np.max(numbers_at(values, name, (3,), what)) * np.sqrt(rate))
+                sample_sd[sensor] = float(np.max(numbers_at(values, name, (3,), what=what)) * np.sqrt(rate))
     return Read(found, (), sample_sd)
 
 

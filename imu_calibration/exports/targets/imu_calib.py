@@ -1,5 +1,7 @@
 """imu_calib (ROS 1, and its ports to ROS 2): the YAML file of the accelerometer."""
 
+from pathlib import Path
+
 import numpy as np
 
 from imu_calibration.exports.affine import AffineImu
@@ -18,7 +20,7 @@ def _parts(found):
     return np.reshape(found['SM'], (3, 3)), np.asarray(found['bias'])
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``SM raw - bias`` of the accelerometer."""
     matrix, bias = _parts(found)
     return readings.force @ matrix.T - bias, readings.rate
@@ -36,11 +38,11 @@ def write(page: Page) -> str:
     return yaml_file(page.comments, page.numbers)
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read the YAML file."""
     what = 'imu_calib file'
     mapping = read_yaml(content, what)
-    return Read({'SM': numbers_at(mapping, 'SM', (9,), what), 'bias': numbers_at(mapping, 'bias', (3,), what)})
+    return Read({'SM': numbers_at(mapping, 'SM', (9,), what=what), 'bias': numbers_at(mapping, 'bias', (3,), what=what)})
 
 
 TARGETS = (Target(

@@ -29,14 +29,14 @@ def imu(found: dict) -> AffineImu:
     return AffineImu(matrix=matrix, bias=bias)
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``T K (raw - B)``."""
     parts = [_parts(found, sensor) if sensor in found else (np.eye(3), np.zeros(3)) for sensor in ENDINGS]
     force, rate = ((raw - bias) @ matrix.T for raw, (matrix, bias) in zip((readings.force, readings.rate), parts))
     return force, rate
 
 
-def read(content: bytes, path) -> Read:
+def read(content: bytes, path: str | Path) -> Read:
     """Read the file that is named and, when it is there, the one of the other sensor beside it."""
     path = Path(path)
     own = next((sensor for sensor, ending in ENDINGS.items() if path.suffix == ending), 'accelerometer')

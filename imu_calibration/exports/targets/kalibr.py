@@ -1,5 +1,6 @@
 """Kalibr: imu.yaml with noise densities and the intrinsics of its models scale-misalignment and scale-misalignment-size-effect."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def imu(found: dict) -> AffineImu:
                      cross=np.asarray(gyroscopes['A']) @ turn, arms=arms)
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """
     Return true (force, rate): the inverse of Kalibr's forward equations.
 
@@ -82,7 +83,7 @@ def read_densities(mapping: dict[str, Any]) -> dict[str, float]:
     return {sensor: float(value) * float(rate)**0.5 for sensor, value in values.items()}
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read what kalibr_calibrate_imu_camera writes (``imu0: ...``) and what `write` writes."""
     what = 'Kalibr result'
     mapping = read_yaml(content, what)
@@ -91,9 +92,9 @@ def read(content: bytes, _path) -> Read:
         model = shortened(str(mapping.get('model', 'calibrated')))
         raise InputError(f"the {what} must come of a model with intrinsics, its model is '{model}'; run Kalibr with scale-misalignment")
     a, g = section(mapping, 'accelerometers', what), section(mapping, 'gyroscopes', what)
-    arms = {name: numbers_at(a, name, (3,), what) for name in LEVERS if name in a}
-    found = {'model': mapping.get('model'), 'accelerometers': {'M': numbers_at(a, 'M', (3, 3), what), **arms},
-             'gyroscopes': {name: numbers_at(g, name, (3, 3), what) for name in ('M', 'C_gyro_i', 'A')}}
+    arms = {name: numbers_at(a, name, (3,), what=what) for name in LEVERS if name in a}
+    found = {'model': mapping.get('model'), 'accelerometers': {'M': numbers_at(a, 'M', (3, 3), what=what), **arms},
+             'gyroscopes': {name: numbers_at(g, name, (3, 3), what=what) for name in ('M', 'C_gyro_i', 'A')}}
     return Read(found, () if arms else ARMS, read_densities(mapping))
 
 

@@ -45,7 +45,7 @@ def covariances(found: Noise) -> dict:
             for name, densities in (('angular_velocity', found.gyroscope), ('linear_acceleration', found.accelerometer))}
 
 
-def write(page: Page, inside: str = '', gravity: str = '', head: str = '') -> str:
+def write(page: Page, inside: str = '', gravity: str = '', *, head: str = '') -> str:
     """Return YAML, inside a section where the program has one."""
     values = {**(page.noise or {}), **({gravity: _gravity(page)} if gravity else {})}
     return yaml_file(page.comments, {inside: values} if inside else values, head)

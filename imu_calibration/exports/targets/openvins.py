@@ -1,6 +1,7 @@
 """OpenVINS: kalibr_imu_chain.yaml with the intrinsics of its models 'kalibr' and 'rpng'."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -27,7 +28,7 @@ def imu(found: dict) -> AffineImu:
     return AffineImu(matrix={'accelerometer': ta @ to_acc, 'gyroscope': tw @ to_gyro}, cross=tg)
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return (force, rate) as its propagation makes them."""
     tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in NAMES)
     force = readings.force @ (to_acc.T @ np.linalg.inv(ta)).T
@@ -41,12 +42,12 @@ def write(page: Page, model: str) -> str:
     return yaml_file(page.comments, {'imu0': chain}, head='%YAML:1.0\n')
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read a chain; what it leaves out is the identity, or zero, as in OpenVINS."""
     what = 'OpenVINS chain'
     chain = section(read_yaml(content, what), 'imu0', what)
     found = {name: np.zeros((3, 3)) if name == 'Tg' else np.eye(3) for name in NAMES}
-    found |= {name: numbers_at(chain, name, (3, 3), what) for name in NAMES if name in chain}
+    found |= {name: numbers_at(chain, name, (3, 3), what=what) for name in NAMES if name in chain}
     return Read(found, (), read_densities(chain))
 
 

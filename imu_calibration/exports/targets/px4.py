@@ -1,5 +1,7 @@
 """PX4: a parameter file for QGroundControl, with linear thermal compensation where the calibration has it."""
 
+from pathlib import Path
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
@@ -50,7 +52,7 @@ def _vector(found, prefix, ending, missing):
     return np.array([found.get(f'{prefix}_{a}{ending}', missing) for a in AXES])
 
 
-def corrected(found: dict, readings: Readings):
+def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(raw - thermal - offset) * scale``; gyroscopes have no scale."""
     made = {}
     for sensor, raw in zip(SENSORS, (readings.force, readings.rate)):
@@ -84,7 +86,7 @@ def _plain(found):
     return [(name, value if isinstance(value, int) else float(value)) for name, value in found.items()]
 
 
-def read(content: bytes, _path) -> Read:
+def read(content: bytes, _path: str | Path) -> Read:
     """Read the parameters of the first accelerometer and gyroscope."""
     every = read_parameters(content, 'PX4 parameter file')
     found = {name: value for name, value in every.items() if name.startswith((*CAL.values(), *TC.values()))}

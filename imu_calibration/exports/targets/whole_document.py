@@ -3,6 +3,7 @@
 import io
 import json
 import zlib
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def write_json(page: Page) -> str:
     return json.dumps({**plain(page.numbers), 'comments': page.comments}, indent=1) + '\n'
 
 
-def read_json_document(content: bytes, _path) -> Read:
+def read_json_document(content: bytes, _path: str | Path) -> Read:
     """Read the document in a JSON file."""
     return Read(read_json(content, 'JSON calibration'))
 
@@ -40,7 +41,7 @@ def write_mat(page: Page) -> bytes:
     return HEADER.ljust(TEXT) + stream.getvalue()[TEXT:]
 
 
-def read_mat(content: bytes, _path) -> Read:
+def read_mat(content: bytes, _path: str | Path) -> Read:
     """Read the document in a .mat file."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
