@@ -46,7 +46,7 @@ def test_a_limit_is_seen_in_fine_and_in_coarse_outputs(step):
 def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
     folder = recordings / 'shaft_yaw_slow_later'
     found = diagnose(folder, folder / 'table.yaml')
-    assert found.diagnosis.windows >= 8
+    assert found.result.diagnosis.windows >= 8
 
 
 def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
