@@ -36,7 +36,7 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
     def further(response):
         return force @ response.T, np.einsum('ip,nq->nipq', np.eye(3), force).reshape(300, 3, 9)
 
-    turn = integrate_turn(time, rate, bias, matrix, further(response))
+    turn = integrate_turn(time, rate, bias=bias, matrix=matrix, further=further(response))
     true = np.linalg.solve(matrix, (rate - bias - force @ response.T).T).T
     step = np.diff(time)[:, None]
     slope = np.gradient(true, time, axis=0)
@@ -47,7 +47,7 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
     np.testing.assert_allclose(turn.mat_ji, attitude.as_matrix().T, atol=1e-12)
 
     def psi(bias, matrix, response):
-        return -Rotation.from_matrix(integrate_turn(time, rate, bias, matrix, further(response)).mat_ji @ turn.mat_ji.T).as_rotvec()
+        return -Rotation.from_matrix(integrate_turn(time, rate, bias=bias, matrix=matrix, further=further(response)).mat_ji @ turn.mat_ji.T).as_rotvec()
 
     def slope(make, size=1e-6):
         return np.stack([(psi(*make(size * e)) - psi(*make(-size * e))) / (2 * size) for e in np.eye(9)], axis=1)
@@ -64,7 +64,7 @@ def test_turn_is_of_third_order_in_the_step():
     for period in (0.04, 0.02):
         attitude, rate = turn_samples(Rotation.identity(), [1.5, -0.5, 0.8], [0.3, 0.5, -0.2], period, 1.6)
         rest = np.zeros((1, 3))
-        turn = integrate_turn(period * np.arange(len(rate) + 2), np.concatenate([rest, rate, rest]), np.zeros(3), np.eye(3))
+        turn = integrate_turn(period * np.arange(len(rate) + 2), np.concatenate([rest, rate, rest]), bias=np.zeros(3), matrix=np.eye(3))
         errors.append(Rotation.from_matrix(turn.mat_ji @ Rotation.from_rotvec([1.5, -0.5, 0.8]).as_matrix()).magnitude())
     assert errors[0] < 3e-4 and errors[1] < errors[0] / 7
 
@@ -80,13 +80,13 @@ def test_system_is_the_derivative_of_its_residuals():
     data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
     known = TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))
     turns = [TurnData(*data, 0, 1), TurnData(*data, 1, 2), known]
-    system = build_system(FULL, state, poses, turns)
+    system = build_system(FULL, state, poses, turns=turns)
     design = np.hstack([system.nuisance, system.main])
     size = 1e-6
     slopes = []
     for step in size * np.eye(design.shape[1]):
         # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
-        ahead, behind = (build_system(FULL, moved(state, s * step, 3), poses, turns).residual for s in (1, -1))
+        ahead, behind = (build_system(FULL, moved(state, s * step, 3), poses, turns=turns).residual for s in (1, -1))
         slopes.append(-(ahead - behind) / (2 * size))
     slopes = np.array(slopes).T
     accelerometer = np.arange(15, 24)

@@ -25,7 +25,7 @@ def blocks(imu, seed=0, mean=20):
 def make_live(saved=None, **by_hand):
     """Return a LiveByHand that looks for rest as often as it can."""
     settings = LiveByHandSettings(**{'gravity': GRAVITY, **by_hand})
-    return LiveByHand(CalibrationOptions(), LiveSettings(), settings, saved, lambda: 0.0)
+    return LiveByHand(CalibrationOptions(), LiveSettings(), settings, saved=saved, clock=lambda: 0.0)
 
 
 def run(live, imu, seed=0):
@@ -50,6 +50,16 @@ def assert_same(live, expected, share=1e-6):
     known = b.sd > 0
     assert np.max(np.abs(a.values - b.values)[known] / b.sd[known]) < share
     np.testing.assert_allclose(a.sd, b.sd, rtol=1e-6)
+
+
+def test_another_gravity_changes_the_next_solution(session):
+    live = make_live()
+    run(live, session)
+    before = live.solve(pending=True)
+    live.change(LiveByHandSettings(gravity=GRAVITY + 0.01))
+    after = live.solve(pending=True)
+    assert_same(after, offline(session, GRAVITY + 0.01))
+    assert after.gravity - before.gravity == pytest.approx(0.01)
 
 
 @pytest.fixture(scope='module')

@@ -147,7 +147,7 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     data = accumulator_state.to_bytes(gathered, live.model)
     again = accumulator_state.from_bytes(data, live.model)
     assert accumulator_state.to_bytes(again, live.model) == data
-    found, expected = (conclude(solve_gathered(each, live.model), each, live.model, TABLE).calibration for each in (again, gathered))
+    found, expected = (conclude(solve_gathered(each, live.model), each, live.model, table=TABLE).calibration for each in (again, gathered))
     assert_same(found, expected, 1e-12)
 
 

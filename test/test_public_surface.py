@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 XYZ = {'x', 'y', 'z', 'wx', 'wy', 'wz', 'fx', 'fy', 'fz'}
 """Components of one vector, as what is called for every sample takes them."""
-UNTYPED = ('by_hand', 'calibration', 'nodes')
+UNTYPED = ('nodes',)
 """Packages in which some of what is public does not say its types yet."""
 POSITIONAL = (*UNTYPED, 'settings.py')
 """Packages in which some functions take more than three arguments by their place; settings are declared like rows of a table."""

@@ -66,7 +66,7 @@ def by_hand(quick):
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
     return calibrate([lambda: iter([quick])], TABLE, CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
-                     PROVENANCE)
+                     provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')

@@ -1,10 +1,11 @@
 """What to do next when a calibration by hand leaves a parameter weak: the pose or turn that would help most."""
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.by_hand.model import GYRO_MATRIX, unpack
+from imu_calibration.by_hand.model import GYRO_MATRIX, HandModel, unpack
 from imu_calibration.effects.base import AXES
 from imu_calibration.reference.reference_motion import skew
 
@@ -12,7 +13,8 @@ STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.produc
 """Six faces, twelve edges and eight corners turned up."""
 
 
-def missing_motion(model, factor, values, statuses, tolerances, pose_sd, turn_sd):
+def missing_motion(model: HandModel, factor: np.ndarray, values: np.ndarray, *, statuses: Sequence[str], tolerances: np.ndarray,
+                   pose_sd: float, turn_sd: float) -> tuple[dict, ...]:
     """
     Name the standard pose or turn that lowers the worst sd of each sensor most.
 
@@ -64,7 +66,7 @@ def _pose_candidates(model, values, sd):
     bias, matrix, *_ = unpack(values)
     for up in STANDARD_POSES:
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
-        rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], np.zeros(1), np.full(1, model.model.temperature_ref_c))[1]
+        rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], time=np.zeros(1), temperature_c=np.full(1, model.model.temperature_ref_c))[1]
         yield rows / sd, f'hold it still with {_direction(up)} up'
 
 

@@ -37,9 +37,9 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     if poses.time is None or not np.ptp(poses.time) > 0:
         return {}
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
-    residual, columns = model.norm_rows(values, poses.force, poses.time, poses.temperature_c)
-    true = model.compensate(values, poses.force, np.zeros_like(poses.force), poses.time, poses.temperature_c)[0]
-    more = model.further('gyroscope', values, true, np.zeros_like(true), poses.time, poses.temperature_c)[0]
+    residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+    true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
+    more = model.further('gyroscope', values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)[0]
     turning = (poses.rate - values[GYRO_BIAS] - more)
     found = {'accelerometer': _of_norms(time, residual, columns[:, ACCELEROMETER]), 'gyroscope': _of_rates(time, turning)}
     return {sensor: movement for sensor, movement in found.items() if movement is not None}

@@ -76,38 +76,39 @@ class HandCalibration:
     """`TurnData` that were not left out."""
 
     @property
-    def sd(self):
+    def sd(self) -> np.ndarray:
         """Standard deviation of each parameter, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def value(self, name):
+    def value(self, name: str) -> float:
         """Return the parameter called `name`."""
         return float(self.values[self.param_names.index(name)])
 
-    def sd_of(self, name):
+    def sd_of(self, name: str) -> float:
         """Return the standard deviation of the parameter called `name`."""
         return float(self.sd[self.param_names.index(name)])
 
     @property
-    def accelerometer(self):
+    def accelerometer(self) -> tuple[np.ndarray, np.ndarray]:
         """(bias, matrix) of the accelerometer."""
         return unpack(self.state.values)[:2]
 
     @property
-    def gyroscope(self):
+    def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
         effect = self.model.model.find('gyroscope', Role.CROSS)
         response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.parts[effect.key]].reshape(3, 3)
         return *unpack(self.state.values)[2:], response
 
-    def compensate(self, force, rate, time=None, temperature_c=None):
+    def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
+                   temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` where effects ask for them."""
-        return self.model.compensate(self.state.values, force, rate, time, temperature_c)
+        return self.model.compensate(self.state.values, force, rate, time=time, temperature_c=temperature_c)
 
-    def norm_residuals(self, force=None):
+    def norm_residuals(self, force: np.ndarray | None = None) -> np.ndarray:
         """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
         if force is None:
-            return self.model.norm_rows(self.state.values, self.poses.force, self.poses.time, self.poses.temperature_c)[0]
+            return self.model.norm_rows(self.state.values, self.poses.force, time=self.poses.time, temperature_c=self.poses.temperature_c)[0]
         return self.model.norm_rows(self.state.values, force)[0]
 
 
@@ -169,8 +170,8 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: By
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
-    turns, dropped = collect_turns(time, imu, poses, settings, temperature_c)
-    turns += [known_turn_data(time, imu, turn, poses, settings, temperature_c) for turn in known_turns]
+    turns, dropped = collect_turns(time, imu, poses=poses, settings=settings, temperature_c=temperature_c)
+    turns += [known_turn_data(time, imu, turn, poses=poses, settings=settings, temperature_c=temperature_c) for turn in known_turns]
     return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
 
 
@@ -186,12 +187,12 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     _check_temperature(model, poses)
     state = first_state(model, poses)
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
-    turns, contradicted = possible_turns(model, state, poses, turns)
+    turns, contradicted = possible_turns(model, state, poses, turns=turns)
     left = {'contradicted by gravity': contradicted} if contradicted else {}
     for _ in range(PASSES):
         found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
         settled, model = _settled(model, found), model.at(found.state.values)
-        poses, turns, out = without_outliers(model, found, poses, turns)
+        poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
         left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
         if settled and not out:
             break
@@ -205,7 +206,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
     turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
-    advice = missing_motion(model, found.factor, found.state.values, status, goals, pose_sd, turn_sd)
+    advice = missing_motion(model, found.factor, found.state.values, statuses=status, tolerances=goals, pose_sd=pose_sd, turn_sd=turn_sd)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()}, **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
@@ -244,7 +245,7 @@ def _gyroscope_effects(poses, settings):
 
 
 def _statistics(model, found, poses, turns):
-    before, after = (model.norm_rows(values, poses.force, poses.time, poses.temperature_c)[0] for values in (model.nominal, found.state.values))
+    before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0] for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
     result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,

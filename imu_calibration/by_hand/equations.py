@@ -1,5 +1,6 @@
 """The equations of a calibration by hand: poses at rest, turns between them, and full turns of known angle."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,7 +98,7 @@ class System:
     """Index into `COMPONENTS`, or -1, shape (m,)."""
 
 
-def tangent(up):
+def tangent(up: np.ndarray) -> np.ndarray:
     """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
     one = np.cross(up, helper)
@@ -105,7 +106,7 @@ def tangent(up):
     return np.stack([one, np.cross(up, one)], axis=2)
 
 
-def moved(state, step, n_poses):
+def moved(state: State, step: np.ndarray, n_poses: int) -> State:
     """Return the state after a step (nuisance, then parameters)."""
     turn = np.einsum('kij,kj->ki', tangent(state.up), step[:2 * n_poses].reshape(-1, 2))
     up = state.up + turn
@@ -113,7 +114,7 @@ def moved(state, step, n_poses):
                  state.drift + step[2 * n_poses:5 * n_poses].reshape(-1, 3))
 
 
-def build_system(model, state, poses, turns, memory=None):
+def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData], memory: dict | None = None) -> System:
     """
     Stack the rows of poses, bias drifts and turns at the current state.
 
@@ -141,7 +142,7 @@ def _pose_rows(model, state, poses, across):
     bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('accelerometer', state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
     for column, (i, j) in enumerate(LOWER):
@@ -158,7 +159,7 @@ def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('gyroscope', state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
     main[:, :, GYRO_BIAS] = np.eye(3)
     main[:, :, model.extra_index('gyroscope')] = slopes
@@ -186,7 +187,7 @@ def _integrated(model, state, data, bias, key, memory):
         psi = turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel() + turn.by_further @ (further - old_further)
         if np.linalg.norm(psi) < NEAR:
             return small_rotation(-psi) @ turn.mat_ji, turn
-    turn = integrate_turn(data.time, data.rate, bias, matrix, _further_of_turn(model, state, data, bias))
+    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, state, data, bias))
     memory[key] = ((bias, matrix, further), turn)
     return turn.mat_ji, turn
 
@@ -194,7 +195,7 @@ def _integrated(model, state, data, bias, key, memory):
 def turned(model: HandModel, values: np.ndarray, data: TurnData) -> np.ndarray:
     """Return the matrix that carries directions from the beginning to the end of a turn, as these parameters integrate it, shape (3, 3)."""
     bias, matrix = values[GYRO_BIAS], unpack(values)[3]
-    return integrate_turn(data.time, data.rate, bias, matrix, _further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)).mat_ji
+    return integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)).mat_ji
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across):
@@ -219,7 +220,7 @@ def _known_turn_rows(model, state, data):
     """``matrix^-1 integral(measured - bias - further effects) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
     _, _, bias, matrix = unpack(state.values)
     further = _further_of_turn(model, state, data, bias)
-    turn = integrate_turn(data.time, data.rate, bias, matrix, further)
+    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further)
     inverse = np.linalg.inv(matrix)
     rotation = inverse @ turn.integral
     main = np.zeros((3, model.size))
@@ -235,7 +236,7 @@ def _further_of_turn(model, state, data, bias):
     """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
     bias_f, matrix_f, _, matrix = unpack(state.values)
     force, rate = np.linalg.solve(matrix_f, (data.force - bias_f).T).T, np.linalg.solve(matrix, (data.rate - bias).T).T
-    return model.further('gyroscope', state.values, force, rate, data.time, data.temperature_c)
+    return model.further('gyroscope', state.values, force, rate=rate, time=data.time, temperature_c=data.temperature_c)
 
 
 def _flat(residual, nuisance, main, noise, component):

@@ -28,13 +28,13 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
         return 1.0
 
     def missed(factor):
-        return float(np.median([missed_angle(state, poses, turn, factor * np.eye(3)) for turn in some]))
+        return float(np.median([missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]))
 
     return believed_factor(missed)
 
 
-def missed_angle(state: State, poses: Poses, turn: TurnData, matrix: np.ndarray) -> float:
+def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
     """Return by how much gravity misses its direction after a turn when the gyroscope reads `matrix` times the rate, rad."""
     bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
-    mat_ji = integrate_turn(turn.time, turn.rate, bias, matrix).mat_ji
+    mat_ji = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix).mat_ji
     return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))

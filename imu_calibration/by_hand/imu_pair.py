@@ -10,6 +10,7 @@ from imu_calibration.by_hand.modulating_functions import SAMPLES_LEAST, holes, m
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.reference.reference_motion import skew
+from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.settings import setting
 
@@ -47,7 +48,8 @@ class PairedImu:
     """Median step, s."""
 
     @classmethod
-    def make(cls, imu, start_ns, gravity, calibration, settings):
+    def make(cls, imu: ImuSamples, start_ns: int, gravity: float, *, calibration: HandCalibration | None,
+             settings: ArmSettings) -> 'PairedImu':
         """Compensate the samples of one IMU, with a calibration from their own poses when none is given."""
         time = 1e-9 * (imu.stamp_ns - start_ns)
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps carry no new moment
@@ -60,7 +62,7 @@ class PairedImu:
         return cls(time, *_compensated(imu, calibration), flagged, calibration, poses, period)
 
 
-def clipped(values):
+def clipped(values: np.ndarray) -> np.ndarray:
     """
     Return which samples touch the end of the range, shape (n,).
 
@@ -90,7 +92,7 @@ def _compensated(imu, calibration):
     return imu.force_s, imu.rate_s - bias
 
 
-def require_overlap(imu_a, imu_b):
+def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     """Refuse IMUs that were not recorded at the same time."""
     if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
         raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics')
@@ -100,12 +102,12 @@ def require_overlap(imu_a, imu_b):
                          'check the clocks')
 
 
-def window_length(a, b, settings):
+def window_length(a: PairedImu, b: PairedImu, settings: ArmSettings) -> float:
     """Return the length of the windows, s."""
     return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
 
 
-def window_centres(a, b, offset, length):
+def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:
     """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
     step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
     begin = max(a.time[0], b.time[0] - offset) + margin
@@ -128,11 +130,11 @@ class RelativeRotation:
     """How late B's stamps are, s."""
 
 
-def relative_rotation(a, b, settings, rounds=4):
+def relative_rotation(a: PairedImu, b: PairedImu, settings: ArmSettings, *, rounds: int = 4) -> RelativeRotation:
     """Return the rotation from the directions at rest where both were calibrated, else from the rates; the offset from the rates."""
     offset, length = 0.0, window_length(a, b, settings)
     for _ in range(rounds):
-        centres = window_centres(a, b, offset, length)
+        centres = window_centres(a, b, offset=offset, length=length)
         over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
         free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
         over_a, over_b = over_a.select(free), over_b.select(free)

@@ -2,6 +2,7 @@
 
 import copy
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,17 +10,22 @@ import numpy as np
 from imu_calibration.by_hand.calibrate import POSES_LEAST
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.result import HandResult
 from imu_calibration.by_hand.sample_store import HandStore
-from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
+from imu_calibration.by_hand.status import NOTHING, HandStatus, hand_status, look_for_poses
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand
-from imu_calibration.calibration.effect_states import group_states, waiting_groups
+from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
+from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.samples import ImuSamples
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.stamping import StampLine
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting
 
 SEARCH_SHARE = 0.05
@@ -70,7 +76,8 @@ class LiveByHand:
 
     """
 
-    def __init__(self, options, settings, by_hand=LiveByHandSettings(), saved=None, clock=time.monotonic):
+    def __init__(self, options: CalibrationOptions, settings: LiveSettings, by_hand: LiveByHandSettings = LiveByHandSettings(), *,
+                 saved: bytes | None = None, clock: Callable[[], float] = time.monotonic):
         self.options, self.settings, self._clock = replace(options, gravity=by_hand.gravity or None), settings, clock
         self._asked = hand_options(self.options)
         _check_model(self.model)
@@ -82,7 +89,7 @@ class LiveByHand:
         self._search(self._store)
 
     @property
-    def model(self):
+    def model(self) -> SensorModel:
         """The model, as far as it is known before a solution."""
         asked = self._asked
         return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
@@ -91,40 +98,40 @@ class LiveByHand:
     """Live, no temperatures are kept with the poses."""
 
     @property
-    def frame_id(self):
+    def frame_id(self) -> str:
         """Frame of the sensor; '' before the first message."""
         imu = self._store.samples()
         return '' if imu is None else imu.frame_id
 
-    def change_windows(self, windows):
+    def change_windows(self, windows: WindowSettings) -> None:
         """Find poses by other settings from now on, in all samples."""
         self.options = replace(self.options, windows=windows)
         self._search(self._store)
 
-    def change(self, by_hand):
+    def change(self, by_hand: LiveByHandSettings) -> None:
         """Take another gravity, or another number of samples to keep."""
-        self._gravity = by_hand.gravity or None
+        self.options = replace(self.options, gravity=by_hand.gravity or None)
         self._store.most = by_hand.hand_samples
 
     @property
-    def n_windows(self):
+    def n_windows(self) -> int:
         """Poses at the last search."""
         return len(self.found.rests)
 
     @property
-    def stamping(self):
+    def stamping(self) -> StampLine | None:
         """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
         return self._check.line
 
     @property
-    def counts(self):
+    def counts(self) -> dict[str, int]:
         """Samples that could not be used, by reason."""
         counts = dict(self._drops)
         for reason, count in self._check.counts.items():
             counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
         return {reason: count for reason, count in counts.items() if count}
 
-    def push(self, block):
+    def push(self, block: SampleBlock) -> list[ImuSamples]:
         """Take what arrived and return the poses that are over and were not returned before, as mean ImuSamples, one each, in a list."""
         for reason, count in (block.dropped or {}).items():
             self._drops[reason] = self._drops.get(reason, 0) + count
@@ -159,7 +166,7 @@ class LiveByHand:
         return [ImuSamples(self._store.true_stamps(imu.stamp_ns[[m]]), found.poses.force[[k]], found.poses.rate[[k]], imu.frame_id)
                 for k, m in zip(new, middle)]
 
-    def solve(self, pending=False, provenance=None):
+    def solve(self, pending: bool = False, provenance: dict | None = None) -> HandResult:
         """
         Solve what was gathered and return the HandResult, which stays in `result`.
 
@@ -191,17 +198,17 @@ class LiveByHand:
         self.result = calibrate_samples_by_hand(recording, self.options, provenance, stills=self.found.rests)
         return self.result
 
-    def needs_linearising(self):
+    def needs_linearising(self) -> bool:
         """Return False: the solution is iterated to its end."""
         return False
 
-    def saved(self, pending=False):
+    def saved(self, pending: bool = False) -> bytes:
         """Return the samples as bytes, for `saved` of another run."""
         store = self._store.copy()
         store.add(copy.deepcopy(self._check).finish())
         return store.to_bytes()
 
-    def residuals(self, poses):
+    def residuals(self, poses: Sequence[ImuSamples]) -> ImuSamples | None:
         """
         Return measured minus predicted of poses from `push`, as ImuSamples, or None before the first solution.
 
@@ -218,18 +225,15 @@ class LiveByHand:
         rate_s = mean.rate_s - resting_bias - gravity_s @ sensitivity.T
         return ImuSamples(mean.stamp_ns, (true - gravity_s) @ matrix.T, rate_s, mean.frame_id)
 
-    def groups(self):
+    def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""
         if self.result is None:
             return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
         return group_states(self.result)
 
-    def question(self):
-        """Return None: what the model gets wrong is asked of recordings."""
-
-    def status(self, hints=None):
+    def status(self, hints: dict[str, str] | None = None) -> HandStatus:
         """Return the HandStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result and self.result.calibration, self.options.gravity is None, hints)
+        status = hand_status(self.found, self.result and self.result.calibration, gravity_unknown=self.options.gravity is None, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.calibration.status import tolerances_of
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel, linear_names
 from imu_calibration.errors import InputError
@@ -28,12 +28,12 @@ REPEATS = 4
 """Fixed-point steps that invert an effect: each gains a factor of its size against the input, a thousand or more."""
 
 
-def possible_by_hand(effect):
+def possible_by_hand(effect: Effect) -> bool:
     """Return whether gravity in poses and the turns between them can show an effect: it has columns, and none of them asks for a table."""
     return bool(effect.groups) and effect.warp is None and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
 
 
-def unpack(values):
+def unpack(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
     matrix = np.zeros((3, 3))
     for value, (i, j) in zip(values[3:9], LOWER):
@@ -68,65 +68,66 @@ class HandModel:
                              'give a table, or leave it out', key='table')
 
     @cached_property
-    def extras(self):
+    def extras(self) -> tuple[Effect, ...]:
         """Effects beyond bias and matrix, in parameter order."""
         return self.model.further
 
     @cached_property
-    def parts(self):
+    def parts(self) -> dict[tuple[str, str], slice]:
         """(sensor, effect name) -> slice of the parameter vector, for the further effects."""
         ends = np.cumsum([N_BASE] + [e.size for e in self.extras])
         return {e.key: slice(a, b) for e, a, b in zip(self.extras, ends, ends[1:])}
 
     @cached_property
-    def param_names(self):
+    def param_names(self) -> tuple[str, ...]:
         """SENSOR.EFFECT.COMPONENT of each parameter."""
         return (*BASE_NAMES, *(name for e in self.extras for name in e.param_names()))
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Number of parameters."""
         return len(self.param_names)
 
     @cached_property
-    def nominal(self):
+    def nominal(self) -> np.ndarray:
         """Values before any data, shape (n,)."""
         start, base = self.model.start(), BASE_NOMINAL.copy()
         base[GYRO_MATRIX] *= self.gyro_factor
         return np.concatenate([base, *(start[self.model.slices[e.key]] for e in self.extras)])
 
     @cached_property
-    def priors(self):
+    def priors(self) -> np.ndarray:
         """Standard deviations about `nominal` before any data, shape (n,)."""
         known = dict(zip(self.model.param_names, self.model.prior()[1]))
         sd = np.array([known[name] for name in self.param_names])
         sd[GYRO_MATRIX] *= self.gyro_factor
         return sd
 
-    def tolerances(self, given):
+    def tolerances(self, given: dict) -> np.ndarray:
         """Return the standard deviations that are good enough, shape (n,); the catalogue's where `given` has none."""
         known = dict(zip(self.model.param_names, tolerances_of(self.model, given)))
         return np.array([known[name] for name in self.param_names])
 
-    def index_of(self, sensor):
+    def index_of(self, sensor: str) -> np.ndarray:
         """Return the parameters of one sensor, bias and matrix first."""
         base = range(9) if sensor == 'accelerometer' else range(9, N_BASE)
         return np.array([*base, *(k for (s, _), part in self.parts.items() if s == sensor for k in range(part.start, part.stop))])
 
-    def extra_index(self, sensor):
+    def extra_index(self, sensor: str) -> np.ndarray:
         """Return the parameters of the further effects of one sensor."""
         return self.index_of(sensor)[9 if sensor == 'accelerometer' else 12:]
 
-    def at(self, values):
+    def at(self, values: np.ndarray) -> 'HandModel':
         """Return the same model with the columns of warm-ups taken at `values`."""
         return replace(self, model=self.model.at(self.in_model_order(values)))
 
-    def in_model_order(self, values):
+    def in_model_order(self, values: np.ndarray) -> np.ndarray:
         """Return the parameters in the order of the SensorModel."""
         known = dict(zip(self.param_names, values)) | dict.fromkeys(FIXED, 0.0)
         return np.array([known[name] for name in self.model.param_names])
 
-    def further(self, sensor, values, force, rate, time=None, temperature_c=None):
+    def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray, time: np.ndarray | None = None,
+                temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return what the further effects add to the output of a sensor, and its derivative by their parameters.
 
@@ -158,16 +159,18 @@ class HandModel:
             columns.append(sum(np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()))
         return output, np.concatenate(columns, axis=2)
 
-    def compensate(self, values, force, rate, time=None, temperature_c=None):
+    def compensate(self, values: np.ndarray, force: np.ndarray, rate: np.ndarray, *, time: np.ndarray | None = None,
+                   temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (m, 3)."""
         bias_f, matrix_f, bias_w, matrix_w = unpack(values)
         true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
         for _ in range(REPEATS if self.extras else 0):
-            more_f, more_w = (self.further(s, values, true_f, true_w, time, temperature_c)[0] for s in SENSORS)
+            more_f, more_w = (self.further(s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c)[0] for s in SENSORS)
             true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
         return true_f, true_w
 
-    def norm_rows(self, values, force, time=None, temperature_c=None):
+    def norm_rows(self, values: np.ndarray, force: np.ndarray, *, time: np.ndarray | None = None,
+                  temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return ``|true force| - gravity`` of mean readings at rest, shape (k,), and minus its derivative by all parameters, shape (k, n).
 
@@ -180,14 +183,14 @@ class HandModel:
 
         """
         _, matrix, *_ = unpack(values)
-        true = self.compensate(values, force, np.zeros_like(force), time, temperature_c)[0]
+        true = self.compensate(values, force, np.zeros_like(force), time=time, temperature_c=temperature_c)[0]
         norm = np.linalg.norm(true, axis=1)
         back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
         columns = np.zeros((len(force), self.size))
         columns[:, 0:3] = back
         for place, (i, j) in enumerate(LOWER, 3):
             columns[:, place] = back[:, i] * true[:, j]
-        slopes = self.further('accelerometer', values, true, np.zeros_like(true), time, temperature_c)[1]
+        slopes = self.further('accelerometer', values, true, rate=np.zeros_like(true), time=time, temperature_c=temperature_c)[1]
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
         return norm - self.gravity, columns
 

@@ -30,24 +30,24 @@ class Windows:
     weight_slope: np.ndarray
     """Quadrature weights of `slope`, 1/s, shape (n_windows, width)."""
 
-    def mean(self, values):
+    def mean(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted means of values (n, k), shape (n_windows, k)."""
         return _weighted(self.index, self.weight, values)
 
-    def slope(self, values):
+    def slope(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted means of the time derivative of values (n, k), shape (n_windows, k)."""
         return _weighted(self.index, self.weight_slope, values)
 
-    def touches(self, flags):
+    def touches(self, flags: np.ndarray) -> np.ndarray:
         """Return which windows hold a flagged sample, shape (n_windows,)."""
         return np.any(flags[self.index] & (self.weight > 0), axis=1)
 
-    def select(self, keep):
+    def select(self, keep: np.ndarray) -> 'Windows':
         """Return the windows at `keep`."""
         return Windows(self.index[keep], self.weight[keep], self.weight_slope[keep])
 
 
-def make_windows(time, centres, length):
+def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Windows:
     """
     Lay windows of `length` seconds around `centres` over the samples at `time`.
 
@@ -81,7 +81,7 @@ def _weighted(index, weight, values):
     return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]))
 
 
-def holes(time, longest):
+def holes(time: np.ndarray, longest: float) -> np.ndarray:
     """Return flags of samples next to a step longer than `longest` seconds, shape (n,)."""
     wide = np.diff(time) > longest
     return np.concatenate([wide, [False]]) | np.concatenate([[False], wide])

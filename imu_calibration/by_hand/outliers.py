@@ -25,14 +25,14 @@ LOOSE = 1e3
 """Factor on the noise of a pose's mean that takes its say, and leaves its direction to the turns."""
 
 
-def possible_turns(model: HandModel, state: State, poses: Poses, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
+def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
     """Return (turns that carry gravity to about where it is found, number of the others): with a recorder that paused, the rates miss the turn."""
     kept = [turn for turn in turns if turn.rotation is not None
-            or missed_angle(state, poses, turn, model.gyro_factor * np.eye(3)) < CONTRADICTED]
+            or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED]
     return kept, len(turns) - len(kept)
 
 
-def without_outliers(model: HandModel, found: HandSolution, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
+def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
     """
     Return (poses, turns, {kind: number}) without what is improbable beside the others of its kind: F tests of leaving one out, for as many as there are.
 
@@ -72,7 +72,7 @@ def _units(poses, turns):
 
 def _whitened(model, found, poses, turns):
     """Return residuals in sds, an orthonormal basis of what was fitted, and the component of each row."""
-    system = build_system(model, found.state, poses, turns)
+    system = build_system(model, found.state, poses, turns=turns)
     root = np.sqrt(found.scatter.total(system.noise, system.component))
     design = np.hstack([system.nuisance, system.main[:, ~found.held]]) / root[:, None]
     rest = system.residual / root

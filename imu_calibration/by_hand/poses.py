@@ -55,7 +55,7 @@ def _pooled_noise(parts, pieces=8):
     return NoiseModel(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
-def distinct_attitudes(force, apart):
+def distinct_attitudes(force: np.ndarray, apart: float) -> int:
     """Return how many of the mean readings (k, 3) point in directions more than `apart` rad from each other."""
     kept = []
     for direction in force / np.linalg.norm(force, axis=1, keepdims=True):

@@ -30,7 +30,8 @@ class Turn:
     """Seconds from first to last sample."""
 
 
-def integrate_turn(time, rate_measured, bias, matrix, further=None):
+def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndarray, matrix: np.ndarray,
+                   further: tuple[np.ndarray, np.ndarray] | None = None) -> Turn:
     """
     Integrate ``rate = matrix^-1 (measured - bias - further effects)`` over one stretch of samples.
 
@@ -78,7 +79,7 @@ def integrate_turn(time, rate_measured, bias, matrix, further=None):
     return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_further, integral, path, float(time[-1] - time[0]))
 
 
-def small_rotation(vector):
+def small_rotation(vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrix of one rotation vector, to second order in what the caller keeps small."""
     cross = skew(vector)
     return np.eye(3) + cross + 0.5 * cross @ cross

@@ -47,7 +47,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
             return {}
         values, part = known.values_without(out), _selected(poses, out)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last])]
-        norms.append([model.norm_rows(each, part.force, part.time, part.temperature_c)[0]**2 for each in (plain, values)])
+        norms.append([model.norm_rows(each, part.force, time=part.time, temperature_c=part.temperature_c)[0]**2 for each in (plain, values)])
         if len(turns) - len(left) >= TURNS_LEAST:
             angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
     proof = {'accelerometer': _entry(norms, 'm/s^2')}
@@ -61,7 +61,7 @@ class _Rows:
 
     def __init__(self, hand, turns):
         model, count = hand.model, len(hand.poses.start)
-        system = build_system(model, hand.state, hand.used_poses, turns)
+        system = build_system(model, hand.state, hand.used_poses, turns=turns)
         scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
         weight = 1.0 / np.sqrt(system.noise + scatter[system.component])
         held = np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == HELD for name in model.param_names])
@@ -98,7 +98,7 @@ def _missed(model, values, poses, turns, gyroscope):
     mixed = values.copy()
     for part in (GYRO_BIAS, GYRO_MATRIX, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
-    true = model.compensate(values, poses.force, np.zeros_like(poses.force), poses.time, poses.temperature_c)[0]
+    true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
     carried = np.array([turned(model, mixed, turn) @ up[turn.first] for turn in turns]).reshape(-1, 3)
     last = up[[turn.last for turn in turns]].reshape(-1, 3)

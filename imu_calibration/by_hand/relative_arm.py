@@ -1,10 +1,12 @@
 """Where one IMU sits relative to another on the same rigid body, from their readings in motion."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.by_hand.imu_pair import (
     ArmSettings,
     PairedImu,
@@ -19,6 +21,7 @@ from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.reference_motion import skew
+from imu_calibration.samples import ImuSamples
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
 """Differences of the accelerometers' biases and stamps, and the gyroscopes' lateness against the accelerometers."""
@@ -52,11 +55,11 @@ class RelativeArm:
     """Plain numbers: windows, clipped share, residuals, nuisances, what the calibration added to the sd."""
 
     @property
-    def arm_sd(self):
+    def arm_sd(self) -> np.ndarray:
         """Standard deviation of `arm`, m, shape (3,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def lines(self):
+    def lines(self) -> Iterator[str]:
         """Return the remarks for a person to read."""
         d = self.diagnostics
         turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
@@ -71,7 +74,8 @@ class RelativeArm:
                 yield f'the arm along {axis} is weak; twist fast about the other two axes'
 
 
-def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY, calibration_a=None, calibration_b=None):
+def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = ArmSettings(), *, gravity: float = STANDARD_GRAVITY,
+                 calibration_a: HandCalibration | None = None, calibration_b: HandCalibration | None = None) -> RelativeArm:
     """
     Estimate the arm r of ``f_B - f_A = alpha x r + omega x (omega x r)`` between two IMUs on one rigid body.
 
@@ -102,7 +106,7 @@ def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY,
     """
     require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
-    a, b = (PairedImu.make(imu, start, gravity, given, settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
+    a, b = (PairedImu.make(imu, start, gravity, calibration=given, settings=settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
     rotation = relative_rotation(a, b, settings)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
@@ -117,7 +121,7 @@ def estimate_arm(imu_a, imu_b, settings=ArmSettings(), gravity=STANDARD_GRAVITY,
 def _build_rows(a, b, rotation, delay, settings):
     """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
     length, offset = window_length(a, b, settings), rotation.offset
-    centres = window_centres(a, b, offset, length)
+    centres = window_centres(a, b, offset=offset, length=length)
     force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
     rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
     free = ~(force_a.touches(a.flagged) | force_b.touches(b.flagged) | rate_a.touches(a.flagged) | rate_b.touches(b.flagged))

@@ -40,7 +40,7 @@ class ArmRows:
     """Length of the windows, s."""
 
 
-def lever_rows(alpha, products):
+def lever_rows(alpha: np.ndarray, products: np.ndarray) -> np.ndarray:
     """``[alpha x] + omega omega^T - |omega|^2``, shape (n, 3, 3)."""
     return skew(alpha) + products - np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
 
@@ -64,19 +64,19 @@ class Fit:
     seen: tuple
     """Shares of the arm's information that are not noise of the columns, with their directions."""
 
-    def weighted(self, index):
+    def weighted(self, index: np.ndarray) -> np.ndarray:
         """Return design' times the derivative of the weighted residual by the residual, for some windows, shape (n, p, 3)."""
         turned, residual = np.swapaxes(self.design[index], 1, 2), self.residual[index]
         along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
 
-    def curvature(self, index):
+    def curvature(self, index: np.ndarray) -> np.ndarray:
         """Return what some windows add to the Hessian, shape (p, p)."""
         rows = np.swapaxes(self.weighted(index), 1, 2).reshape(-1, self.design.shape[2])
         return rows.T @ self.design[index].reshape(rows.shape)
 
 
-def fit_arm(rows):
+def fit_arm(rows: ArmRows) -> Fit:
     """
     Solve ``difference = W(alpha, rate) @ arm + bias + lateness and delay terms`` with Student-t errors.
 
@@ -149,7 +149,7 @@ def _robust_fit(design, target, alpha_noise):
     return values, weights, weight_fall, excess
 
 
-def jackknife_covariance(fit, centres, cluster):
+def jackknife_covariance(fit: Fit, centres: np.ndarray, cluster: float) -> np.ndarray:
     """Leave out one stretch of time after the other: errors within one may be anything."""
     label = np.unique(np.floor((centres - centres[0]) / cluster).astype(int), return_inverse=True)[1]
     shifts = []
@@ -161,6 +161,6 @@ def jackknife_covariance(fit, centres, cluster):
     return (len(shifts) - 1) / len(shifts) * shifts.T @ shifts
 
 
-def response(fit, columns):
+def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
     """Return how the values answer to small changes of the left-hand side, columns (n, 3, k)."""
     return np.linalg.solve(fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True))

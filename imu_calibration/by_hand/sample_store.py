@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -30,20 +31,20 @@ class HandStore:
 
     """
 
-    def __init__(self, most):
+    def __init__(self, most: int):
         self.most, self._parts, self._epoch = most, [], 0
         self._shift, self.forgotten = 0, 0
 
     def __len__(self):
         return sum(len(part) for part in self._parts)
 
-    def copy(self):
+    def copy(self) -> 'HandStore':
         """Return a copy that shares the samples."""
         twin = HandStore(self.most)
         twin.__dict__ |= self.__dict__ | {'_parts': list(self._parts)}
         return twin
 
-    def add(self, accepted):
+    def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
         """Take what a StreamCheck accepted: (epoch, ImuSamples), ...; stamps go on rising where the clock was set anew."""
         for epoch, samples in accepted:
             if not len(samples):
@@ -53,18 +54,18 @@ class HandStore:
             self._epoch = epoch
             self._parts.append(ImuSamples(samples.stamp_ns + self._shift, samples.force_s, samples.rate_s, samples.frame_id))
 
-    def samples(self):
+    def samples(self) -> ImuSamples | None:
         """Return all samples, or None."""
         if not self._parts:
             return None
         self._parts = [ImuSamples.concatenate(self._parts)]
         return self._parts[0]
 
-    def true_stamps(self, stamp_ns):
+    def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the header stamps of samples of the present epoch."""
         return stamp_ns - self._shift
 
-    def forget(self, rests, most_rests):
+    def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
         """
         Let samples go when there are too many: the inside of the longest rest when that is enough, else the oldest; return if any went.
 
@@ -96,7 +97,7 @@ class HandStore:
         self.forgotten += int(np.count_nonzero(~keep))
         self._parts = [imu.select(keep)]
 
-    def to_bytes(self):
+    def to_bytes(self) -> bytes:
         """Return the samples as an npz archive."""
         target, imu = io.BytesIO(), self.samples()
         if imu is None:
@@ -105,7 +106,7 @@ class HandStore:
                  rate_s=imu.rate_s)
         return target.getvalue()
 
-    def load(self, data):
+    def load(self, data: bytes) -> None:
         """
         Put saved samples before what comes, as a recording with a pause in it.
 

@@ -97,7 +97,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     """Return a `State` from the norms in poses alone, which give directions too, and the rates at rest."""
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     for _ in range(ITERATIONS):
-        residual, columns = model.norm_rows(values, poses.force, poses.time, poses.temperature_c)
+        residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
         rows = np.vstack([columns[:, ACCELEROMETER] / (1e-3 * gravity), np.diag(1 / priors[ACCELEROMETER])])
         target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[ACCELEROMETER] / priors[ACCELEROMETER]])
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
@@ -115,7 +115,7 @@ def _iterate(model, state, poses, turns, free, priors, variance, fallback, memor
     count = len(poses.start)
     scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf))
     for number in range(1, ITERATIONS + 1):
-        system = build_system(model, state, poses, turns, memory)
+        system = build_system(model, state, poses, turns=turns, memory=memory)
         design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),
                             np.hstack([np.zeros((free.sum(), 5 * count)), np.eye(model.size)[free][:, free]])])
         residual = np.concatenate([system.residual, (model.nominal - state.values)[free]])
@@ -138,7 +138,7 @@ def _iterate(model, state, poses, turns, free, priors, variance, fallback, memor
 
 def _factor(model, state, poses, turns, scatter, memory):
     """Return the triangular factor of the parameters with directions and drifts eliminated, at inflated variances."""
-    system = build_system(model, state, poses, turns, memory)
+    system = build_system(model, state, poses, turns=turns, memory=memory)
     root = np.sqrt(scatter.total(system.noise, system.component, inflated=True))
     full = np.linalg.qr(np.hstack([system.nuisance, system.main]) / root[:, None], mode='r')
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]

@@ -5,14 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST
+from imu_calibration.by_hand.equations import Poses
 from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes
 from imu_calibration.by_hand.turns import collect_turns
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import Progress
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import SCALES
 from imu_calibration.errors import with_hint
+from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.segmentation.window_settings import WindowSettings
 
 FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
 """The six directions that can be turned up."""
@@ -26,8 +30,8 @@ class Findings:
 
     rests: list
     """Ranges at rest (slice)."""
-    poses: object
-    """`Poses`, or None without any rest."""
+    poses: Poses | None
+    """Their means; None without any rest."""
     attitudes: int
     """Different attitudes."""
     turns: int
@@ -53,20 +57,21 @@ class HandStatus:
     """Figures by name."""
 
 
-def look_for_poses(imu, windows):
+def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     """Return the Findings in ImuSamples with rising stamps."""
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
     if not rests:
         return NOTHING
     settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
-    turns, dropped = collect_turns(seconds, imu, poses, settings)
+    turns, dropped = collect_turns(seconds, imu, poses=poses, settings=settings)
     goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
     resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
     return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
 
 
-def hand_status(found, calibration, gravity_unknown, hints=None):
+def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unknown: bool,
+                hints: dict[str, str] | None = None) -> HandStatus:
     """
     Return the HandStatus.
 
@@ -95,7 +100,7 @@ def hand_status(found, calibration, gravity_unknown, hints=None):
     return HandStatus(word, '; '.join(parts), values)
 
 
-def unseen(found):
+def unseen(found: Findings) -> list[str]:
     """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
     if found.poses is None:
         return list(FACES)

@@ -16,7 +16,7 @@ SUMMIT = 3
 """Neighbours that the top of one smooth turn may leave in the same coarse step."""
 
 
-def collect_turns(time: np.ndarray, imu: ImuSamples, poses: Poses, settings: ByHandSettings,
+def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses, settings: ByHandSettings,
                   temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
     """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
@@ -80,7 +80,7 @@ def _at_end(values, fresh):
     return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)
 
 
-def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, poses: Poses, settings: ByHandSettings,
+def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses, settings: ByHandSettings,
                     temperature_c: np.ndarray | None = None) -> TurnData:
     """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)

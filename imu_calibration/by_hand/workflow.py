@@ -1,12 +1,14 @@
 """A calibration by hand as the same document and result that a calibration on a table gives."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 import imu_calibration
 from imu_calibration.by_hand.bias_movement import notes
-from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.calibrate import HandCalibration, gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.equations import TurnData
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.proof import prove_by_hand
 from imu_calibration.by_hand.result import HandResult
@@ -19,9 +21,10 @@ from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
+from imu_calibration.preflight.finding import CheckFinding
 from imu_calibration.preflight.joint_checks import check_force
-from imu_calibration.samples import ImuSamples, TemperatureSamples
-from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from imu_calibration.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.segmentation.block_cleaning import BlockCleaner, Watcher
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class HandRecording:
     """Reason -> samples that could not be used."""
 
     @property
-    def gathered(self):
+    def gathered(self) -> Gathered:
         """What a document says of the recording besides its parameters."""
         imu, warm = self.imu, self.temperature_c
         return Gathered(counts=self.counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
@@ -44,7 +47,7 @@ class HandRecording:
                         temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
 
 
-def read_by_hand(blocks, nominal=None, watchers=()):
+def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()) -> HandRecording:
     """
     Return the `HandRecording` of a whole stream of SampleBlock; `nominal` and `watchers` as for the `BlockCleaner`.
 
@@ -69,13 +72,14 @@ def read_by_hand(blocks, nominal=None, watchers=()):
     return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count})
 
 
-def read_imu(blocks, watchers=()):
+def read_imu(blocks: Iterable[SampleBlock], watchers: Sequence[Watcher] = ()) -> tuple[ImuSamples, dict[str, int]]:
     """Return (ImuSamples, counts of what was dropped) of a whole recording, cleaned; raises as `read_by_hand`."""
     recording = read_by_hand(blocks, watchers=watchers)
     return recording.imu, recording.counts
 
 
-def calibrate_without_table(sources, options=CalibrationOptions(), provenance=None):
+def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOptions = CalibrationOptions(),
+                            provenance: dict | None = None) -> HandResult:
     """
     Calibrate by hand and return the HandResult: gravity is the reference (see `calibrate_by_hand`).
 
@@ -100,15 +104,17 @@ def calibrate_without_table(sources, options=CalibrationOptions(), provenance=No
     return calibrate_samples_by_hand(recording, options, provenance, findings=preflight.findings)
 
 
-def calibrate_samples_by_hand(recording, options=CalibrationOptions(), provenance=None, *, stills=None, findings=()):
+def calibrate_samples_by_hand(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
+                              *, stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> HandResult:
     """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a look at the recording."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, asked.settings, temperature_c=recording.temperature_c)
     hand = solve_by_hand(data, asked)
-    return hand_result(hand, recording, options, provenance, findings=findings, turns=data.turns)
+    return hand_result(hand, recording, options, provenance=provenance, findings=findings, turns=data.turns)
 
 
-def hand_result(hand, recording, options=CalibrationOptions(), provenance=None, *, findings=(), turns=()):
+def hand_result(hand: HandCalibration, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
+                provenance: dict | None = None, findings: Sequence[CheckFinding] = (), turns: Sequence[TurnData] = ()) -> HandResult:
     """
     Return a HandCalibration as the result that reports and documents know, proven on its poses and `turns` where these are enough.
 

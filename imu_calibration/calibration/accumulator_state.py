@@ -21,7 +21,7 @@ _MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
 
-def to_bytes(gathered, model):
+def to_bytes(gathered: Gathered, model: SensorModel) -> bytes:
     """
     Return a `Gathered` as an npz archive: numbers to the last bit, no pickled objects.
 
@@ -60,7 +60,7 @@ def to_bytes(gathered, model):
     return target.getvalue()
 
 
-def from_bytes(data, model):
+def from_bytes(data: bytes, model: SensorModel) -> Gathered:
     """
     Return the `Gathered` in an archive.
 
@@ -90,7 +90,7 @@ def _reading(data):
                             f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume') from error
 
 
-def saved_model(data):
+def saved_model(data: bytes) -> SensorModel:
     """Return the SensorModel whose columns a saved accumulator holds; raises as `from_bytes` when it is damaged."""
     with _reading(data) as (header, _):
         return _model(header)

@@ -32,7 +32,7 @@ class EvidentResult:
     """What was asked and answered; None with too few windows."""
 
 
-def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(),
+def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
                           provenance: dict | None = None, progress: Callable | None = None, asking: Callable | None = None,
                           mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
     """
@@ -51,24 +51,24 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         As `calibrate`.
 
     """
-    first = solve_recordings(sources, table, options, progress, mapper, names, keep_windows=True)
+    first = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names, keep_windows=True)
     solution, gathered, model = first
     windows = gathered.spread.windows
     if len(windows) < LEAST_WINDOWS:
-        return EvidentResult(conclude(*first, table, options, provenance), None)
+        return EvidentResult(conclude(*first, table=table, options=options, provenance=provenance), None)
     found = investigate(windows, table, baseline_model(options, table, solution.model), progress=asking,
                         bias_processes=options.bias_processes)
     added = [question for question in found.named if (question.sensor, question.name) not in model.slices]
     if added:
         options = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
-        solution, gathered, model = solve_recordings(sources, table, options, progress, mapper, names)
+        solution, gathered, model = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names)
     solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
     if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
         solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named,
                                      saturations=found.limits)
     clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
     changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
-    return EvidentResult(conclude(solution, gathered, model, table, options, provenance, changes), found)
+    return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:

@@ -1,9 +1,11 @@
 """Use cases as plain functions: the command line, the nodes and the tests call the same ones."""
 
 
+from collections.abc import Callable, Sequence
+
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.from_solution import document, motions_needed
-from imu_calibration.calibration.gathered import join
+from imu_calibration.calibration.gathered import Gathered, join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
@@ -11,14 +13,19 @@ from imu_calibration.calibration.proof import prove_solution
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.shrinkage import shrunk
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.preflight.joint_checks import check_units
+from imu_calibration.reference.table import Table
 
 
-def calibrate(sources, table, options=CalibrationOptions(), provenance=None, progress=None, mapper=map, names=None):
+def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+              provenance: dict | None = None, progress: Callable | None = None, mapper: Callable = map,
+              names: Sequence[str] | None = None) -> TableResult:
     """
     Calibrate from one or several recordings of the same IMU on a table.
 
@@ -48,10 +55,13 @@ def calibrate(sources, table, options=CalibrationOptions(), provenance=None, pro
         When a recording cannot be used or is of another frame, with its name when there are several.
 
     """
-    return conclude(*solve_recordings(sources, table, options, progress, mapper, names), table, options, provenance)
+    return conclude(*solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names), table=table, options=options,
+                    provenance=provenance)
 
 
-def solve_recordings(sources, table, options=CalibrationOptions(), progress=None, mapper=map, names=None, keep_windows=False):
+def solve_recordings(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+                     progress: Callable | None = None, mapper: Callable = map, names: Sequence[str] | None = None,
+                     keep_windows: bool = False) -> tuple[Solution, Gathered, SensorModel]:
     """
     Return (Solution, Gathered, the SensorModel whose columns were gathered) of recordings; arguments as in `calibrate`.
 
@@ -82,7 +92,7 @@ def _first_temperature(sources):
     raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
 
 
-def solve_gathered(gathered, model, options=CalibrationOptions()):
+def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
     """Return the Solution of what was gathered with the columns of `model`, with the effects that it asks for: the reduce step."""
     narrow = settle_model(model, options, gathered)
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
@@ -93,12 +103,14 @@ def solve_gathered(gathered, model, options=CalibrationOptions()):
     return shrunk(solution, _by_default(solution.model, options))
 
 
-def conclude(solution, gathered, model, table, options=CalibrationOptions(), provenance=None, changes=ModelChanges()):
+def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,
+             options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
+             changes: ModelChanges = ModelChanges()) -> TableResult:
     """Judge a solution of what was gathered with `model`, say which motions it lacks, and return the TableResult."""
     tolerances = tolerances_of(solution.model, options.tolerances)
     needed = motions_needed(solution, tolerances, table)
     proof = prove_solution(gathered.held_out, solution, model)
-    calibration = document(solution, tolerances, table, gathered, needed, provenance, proof, changes)
+    calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof, changes=changes)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
 

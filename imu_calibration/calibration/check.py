@@ -35,8 +35,9 @@ class CheckResult:
         return disproved(self.proof) or proven(self.proof)
 
 
-def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, options: CalibrationOptions = CalibrationOptions(), *,
-                   names: Sequence[str] = (), progress: Callable | None = None) -> CheckResult:
+def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,
+                   options: CalibrationOptions = CalibrationOptions(), names: Sequence[str] = (),
+                   progress: Callable | None = None) -> CheckResult:
     """
     Prove a calibration on recordings of its IMU on a table.
 

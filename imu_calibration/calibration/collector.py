@@ -1,5 +1,6 @@
 """From a stream of samples to a least-squares system: one recording at a time, to be merged."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ from imu_calibration.estimation.window_statistics import WindowStatistics, reduc
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling, SampleBlock
+from imu_calibration.segmentation.block_cleaning import Watcher
+from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -18,13 +21,14 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 class Collector:
     """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
 
-    def __init__(self, table, model: SensorModel, settings=WindowSettings(), *, nominal=None, session=0, watchers=(), windows: list | None = None,
+    def __init__(self, table: Table, model: SensorModel, settings: WindowSettings = WindowSettings(), *,
+                 nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (), windows: list | None = None,
                  spread: bool = False):
         self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
         self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
         self.gathered = Gathered()
 
-    def push(self, block: SampleBlock):
+    def push(self, block: SampleBlock) -> list[Window]:
         """Take a block and return the windows that it completed."""
         if block.imu is not None and len(block.imu):
             self._note_imu(block.imu)
@@ -32,13 +36,13 @@ class Collector:
             self._note_temperature(block.temperature.temperature_c)
         return self._take(self.gatherer.push(block))
 
-    def finish(self):
+    def finish(self) -> Gathered:
         """Close the last window and return what was gathered."""
         self._take(self.gatherer.finish())
         self.update_counts()
         return self.gathered
 
-    def update_counts(self):
+    def update_counts(self) -> None:
         """Bring the counts up to date."""
         counts = dict(self.gatherer.counts)
         for reason, count in self.gatherer.cleaner.lost.items():
@@ -103,15 +107,15 @@ class GatherStep:
     """Names of the recordings for messages; with several of them an error names the one at fault."""
     spread: bool = False
     """Whether windows are kept to ask for effects."""
-    progress: object = None
+    progress: Callable[[int], object] | None = None
     """Called with the number of IMU samples read so far."""
 
-    def __call__(self, numbered):
+    def __call__(self, numbered: tuple[int, Callable]) -> Gathered:
         """Return the Gathered of a recording, given (its number, callable that yields its blocks)."""
         session, source = numbered
         return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
 
-    def read(self, blocks, session, preflight, windows=None):
+    def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *, windows: list | None = None) -> Gathered:
         """
         Return the Gathered of a recording, which is read once, for its windows and for the checks; `windows` takes them all, unused ones too.
 

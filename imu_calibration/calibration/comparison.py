@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
@@ -43,14 +44,14 @@ class Comparison:
     """The verdict in words."""
 
 
-def moved_beyond_sd(first, second):
+def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
     """Return whether a later calibration says something else: other parameters, or a value further off than the first one's own sd."""
     if first.param_names != second.param_names:
         return True
     return bool(np.any(np.abs(second.values - first.values) > first.sd))
 
 
-def compare(first, second):
+def compare(first: Calibration, second: Calibration) -> Comparison:
     """
     Compare two calibrations, group by group.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from imu_calibration.calibration.document_checks import check_numbers, check_par
 from imu_calibration.calibration.document_parts import parts_of
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.base import SECTIONS
-from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.base import SECTIONS, Role
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
+from imu_calibration.samples import ImuSamples
 
 if TYPE_CHECKING:
     from imu_calibration.calibration.verdict import Verdict
@@ -61,34 +62,34 @@ class Calibration:
     """The verdict with its reasons one by one, where it was not read from a file."""
 
     @property
-    def param_names(self):
+    def param_names(self) -> tuple[str, ...]:
         """Names in the order of `values`."""
         return self.model.param_names
 
     @property
-    def sd(self):
+    def sd(self) -> np.ndarray:
         """Standard deviations, shape (n_params,)."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
 
-    def value(self, sensor, effect):
+    def value(self, sensor: str, effect: str) -> np.ndarray:
         """Return the value of one effect in its documented shape."""
         found = self.model.catalogue.find(sensor, effect, self.model.joint_names)
         return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
 
-    def of(self, sensor, role):
+    def of(self, sensor: str, role: Role) -> Any:
         """Return the value of the effect in a place of a sensor's equation (`effects.base.Role`) in its documented shape, or None."""
         return self.model.value(sensor, role, self.values)
 
-    def has(self, sensor, effect):
+    def has(self, sensor: str, effect: str) -> bool:
         """Return whether the model contains the effect."""
         return (sensor, effect) in self.model.slices
 
     @property
-    def knows_density(self):
+    def knows_density(self) -> bool:
         """Whether the noise is known at any sampling rate."""
         return 'noise_density' in self.statistics.get('accelerometer', {})
 
-    def noise(self, sensor, period=None):
+    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics.
 
@@ -106,15 +107,16 @@ class Calibration:
         return self.provenance.get('uncertainty') != UNKNOWN
 
     @property
-    def requested(self):
+    def requested(self) -> dict[str, str]:
         """Status of the parameters that somebody asks for, by name; table, clock and the common arm are nuisances."""
         return {name: status for name, status, wanted in zip(self.param_names, self.status, self.model.requested) if wanted}
 
-    def all_determined(self):
+    def all_determined(self) -> bool:
         """Return whether every parameter is determined."""
         return all(status == DETERMINED for status in self.status)
 
-    def compensate(self, samples, rate_s=None, *, time=None, temperature_c=None):
+    def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
+                   temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
         """
         Return readings with the calibrated errors taken out; see `compensation.arrays.compensate_readings`.
 
@@ -148,7 +150,7 @@ class Calibration:
         return shown.as_html(self)
 
 
-def checked_tolerances(mapping, catalogue=CATALOGUE):
+def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:
     """
     Return the content of a tolerance file when it is one: {section: {effect: number above zero}}.
 
@@ -171,7 +173,7 @@ def checked_tolerances(mapping, catalogue=CATALOGUE):
     return mapping
 
 
-def to_mapping(calibration):
+def to_mapping(calibration: Calibration) -> dict:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
     if calibration.model.definitions:
@@ -216,7 +218,7 @@ def _plain(value):
     return value
 
 
-def from_mapping(document):
+def from_mapping(document: Any) -> Calibration:
     """
     Return the calibration that a document describes.
 
@@ -250,12 +252,12 @@ def _check_format(found):
         raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; update imu_calibration")
 
 
-def calibration_to_text(calibration):
+def calibration_to_text(calibration: Calibration) -> str:
     """Return a calibration as the YAML of its document."""
     return to_text(to_mapping(calibration))
 
 
-def calibration_from_text(text):
+def calibration_from_text(text: str) -> Calibration:
     """
     Return the calibration in a YAML document.
 

@@ -1,12 +1,17 @@
 """What must hold of a calibration document beyond its layout: whoever uses one that was read needs no checks of its own."""
 
 import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import DocumentError, shortened
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.document import Calibration
 
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
@@ -87,7 +92,7 @@ KNOWN = {
 """Part of a document -> what it must be, when it is there: a function, or a mapping whose entries are told in the same way."""
 
 
-def check_parts(document, known=KNOWN, place=''):
+def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> None:
     """
     Refuse a document (dict) in which a part that others read is not what it must be; further parts may be anything.
 
@@ -108,7 +113,7 @@ def check_parts(document, known=KNOWN, place=''):
             raise DocumentError(f"'{place}{name}' has a value that it cannot have, {shortened(repr(value))}; correct the calibration file or write it anew")
 
 
-def check_numbers(calibration):
+def check_numbers(calibration: 'Calibration') -> 'Calibration':
     """
     Return the calibration when its numbers can belong to an IMU.
 

@@ -1,5 +1,8 @@
 """From the mapping of a calibration document to the parts of a `Calibration`: its layout, nothing about its numbers."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.calibration.status import Status
@@ -10,7 +13,7 @@ from imu_calibration.errors import DocumentError, shortened
 from imu_calibration.reference.joint import JointNames
 
 
-def parts_of(document):
+def parts_of(document: Mapping) -> dict[str, Any]:
     """
     Return {field of a Calibration: value} from the mapping of its document, whose parts have passed `check_parts`.
 

@@ -1,10 +1,13 @@
 """What is known of each effect of a calibration that goes on: determined, weak, held or waiting, and the motion that is still needed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 
@@ -42,7 +45,7 @@ class GroupState:
     """Standard deviation after one minute of that motion; NaN when it cannot be predicted."""
 
 
-def group_states(result):
+def group_states(result: CalibrationResult) -> list[GroupState]:
     """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
     calibration, states = result.calibration, []
     names, sd = calibration.param_names, calibration.sd
@@ -57,12 +60,12 @@ def group_states(result):
     return states
 
 
-def group_status(statuses):
+def group_status(statuses: Sequence[str]) -> Progress:
     """Return the worst of the statuses of an effect's parameters."""
     return next((progress for progress in (Progress.HELD, Progress.WEAK) if progress in statuses), Progress.DETERMINED)
 
 
-def waiting_groups(model):
+def waiting_groups(model: SensorModel) -> list[GroupState]:
     """Return the GroupState of every effect of a model of which nothing is known yet."""
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
     return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])

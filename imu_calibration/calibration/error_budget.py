@@ -6,7 +6,9 @@ solution; a wrong reference that changes the predicted output by ``dA c`` moves 
 together when the table is not level and apart when an encoder is read anew in every pose.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +23,9 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.levelling import tilt
 from imu_calibration.settings import setting
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.table_result import TableResult
 
 MOVING_SAMPLES = 20_000
 """Samples of moving windows that are looked at: every so many of them stand for all."""
@@ -51,12 +56,12 @@ class ErrorBudget:
     """Cause -> what was assumed."""
 
     @property
-    def total(self):
+    def total(self) -> np.ndarray:
         """All causes together, shape (n_params,)."""
         return np.sqrt(sum(part**2 for part in self.causes.values()))
 
 
-def error_budget(result, errors=ReferenceErrors()):
+def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
 
@@ -129,7 +134,7 @@ class _Heavier:
         return replace(table, gravity=table.gravity_value + self.change), motion
 
 
-def parameter_shifts(result, changes):
+def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.ndarray:
     """
     Return how each window's share of each change moves the parameters, shape (n_changes, n_windows, n_params).
 

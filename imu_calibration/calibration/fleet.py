@@ -1,5 +1,6 @@
 """Many units: the map step calibrates one, the merge step compares them. Plain functions, for any scheduler."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +8,10 @@ import numpy as np
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.result import exit_code
+from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.status import HELD
 from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.reference.table import Table
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,14 @@ class UnitResult:
 class FleetStep:
     """The map step with its arguments bound."""
 
-    table: object
-    """The Table on which every unit was recorded."""
+    table: Table
+    """The table on which every unit was recorded."""
     options: CalibrationOptions = CalibrationOptions()
     """What to estimate."""
-    report: object = None
-    """Callable that returns report.html of a CalibrationResult, or None; it must survive pickling when sent elsewhere."""
+    report: Callable[[CalibrationResult], str] | None = None
+    """Returns report.html; must survive pickling when sent elsewhere."""
 
-    def __call__(self, unit):
+    def __call__(self, unit: Unit) -> UnitResult:
         """Return the UnitResult of a unit; whatever goes wrong with it is part of the result."""
         try:
             return self._calibrated(unit)
@@ -68,7 +70,7 @@ class FleetStep:
 
     def _calibrated(self, unit):
         provenance = unit.provenance() if unit.provenance is not None else None
-        result = calibrate(unit.sources, self.table, self.options, provenance, names=unit.bags or None)
+        result = calibrate(unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None)
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         if self.report is not None:
             texts['report.html'] = self.report(result)
@@ -97,12 +99,12 @@ class Spread:
     """(value, unit's name) of the highest one."""
 
     @property
-    def ratio(self):
+    def ratio(self) -> float:
         """How much more the units differ than the calibrations are uncertain."""
         return self.spread / self.typical_sd if self.typical_sd > 0 else float('nan')
 
 
-def summarise(results):
+def summarise(results: Sequence[UnitResult]) -> list[Spread]:
     """
     Return the Spread of each parameter over the calibrated units: the merge step.
 
@@ -140,6 +142,6 @@ def _spread(name, unit, found):
     return Spread(name, unit, len(value), float(value.mean()), spread, float(np.sqrt(np.mean(sd**2))), (low[0], low[2]), (high[0], high[2]))
 
 
-def fleet_exit_code(results):
+def fleet_exit_code(results: Iterable[UnitResult]) -> int:
     """Return 0 when every unit ended with 0, else 3."""
     return 0 if all(result.exit_code == 0 for result in results) else 3

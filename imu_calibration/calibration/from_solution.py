@@ -1,22 +1,27 @@
 """From a solution to the content of the calibration document: statuses, weak directions, needed motions, statistics."""
 
+from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
 
 import imu_calibration
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.status import statuses
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.preflight.checks import unusable, warnings
+from imu_calibration.preflight.finding import CheckFinding
+from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window_cutter import dropped
 
 
-def motions_needed(solution, tolerances, table):
+def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
     return observability.needed_motions(solution, tolerances, table.gravity_value, prior_sd=make_prior(solution.model).sd,
                                         only_axis=_only_axis(table))
@@ -29,7 +34,8 @@ def _only_axis(table):
     return table.mat_sl @ np.asarray(table.joints[0].axis)
 
 
-def document(solution, tolerances, table, gathered, needed, provenance=None, proof=None, changes=ModelChanges()):
+def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gathered: Gathered, needed: dict[str, tuple[str, float]],
+             provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges()) -> Calibration:
     """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its proof (`proof`) and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
@@ -52,7 +58,7 @@ def _need(weights, needed):
     return texts[0] if texts else 'more of the same motion'
 
 
-def with_gravity_uncertainty(solution, table):
+def with_gravity_uncertainty(solution: Solution, table: Table) -> np.ndarray:
     """Return the covariance with the uncertainty of gravity, which scales the accelerometer matrix as a whole."""
     if not table.gravity_sd:
         return solution.covariance
@@ -62,7 +68,7 @@ def with_gravity_uncertainty(solution, table):
     return solution.covariance + np.outer(direction, direction)
 
 
-def statistics(solution, gathered):
+def statistics(solution: Solution, gathered: Gathered) -> dict:
     """Return the statistics section: noise, residuals, chi-square, windows, what was dropped."""
     result = {}
     for sensor in SENSORS:
@@ -84,7 +90,7 @@ def statistics(solution, gathered):
     return result | preflight_statistics(gathered.findings)
 
 
-def preflight_statistics(findings):
+def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:
     """Return the part of the statistics that says what a look at the recording found."""
     return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
 
@@ -93,7 +99,7 @@ def _finite(value):
     return float(value) if np.isfinite(value) else None
 
 
-def conditions(gathered, gravity):
+def conditions(gathered: Gathered, gravity: float) -> dict:
     """Return the conditions section."""
     date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
     return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,

@@ -1,6 +1,6 @@
 """What the map step of a calibration leaves behind, and how the parts of several recordings join."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -61,12 +61,12 @@ class Gathered:
         return fresh
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """Seconds from the first to the last IMU stamp, recordings added."""
         return 0.0 if self.first_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
 
 
-def merge(parts):
+def merge(parts: Iterable[Gathered]) -> Gathered:
     """Join what several recordings left behind: the merge step of calibration."""
     parts = list(parts)
     total = parts[0]
@@ -98,7 +98,7 @@ def _added(a, b):
     return a + b if isinstance(a, (int, float)) and isinstance(b, (int, float)) else a or b
 
 
-def naming(names, session):
+def naming(names: Sequence[str], session: int) -> Callable:
     """Return a function that calls another one and, with several recordings, puts the recording's name before its error."""
     def call(function, *arguments, **options):
         try:
@@ -110,7 +110,7 @@ def naming(names, session):
     return call
 
 
-def join(parts, names, check):
+def join(parts: Sequence[Gathered], names: Sequence[str], check: Callable[[Gathered], object]) -> Gathered:
     """
     Return the merged Gathered of several recordings.
 

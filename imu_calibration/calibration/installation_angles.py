@@ -1,9 +1,11 @@
 """Scale factors and the nine installation angles that a sensor matrix contains, in the units of the papers as well."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import Role
 from imu_calibration.samples import NominalScaling
@@ -42,7 +44,7 @@ class Derived:
 PAIRS = ((0, 1), (1, 2), (0, 2))
 
 
-def derive(calibration, sensor):
+def derive(calibration: Calibration, sensor: str) -> Derived:
     """
     Return the `Derived` of one sensor, standard deviations to first order from the full covariance.
 
@@ -68,13 +70,13 @@ def derive(calibration, sensor):
                    np.linalg.solve(matrix, bias))
 
 
-def split(matrix):
+def split(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (scale factors, unit vectors along the elements) of a sensor matrix, shapes (3,) and (3, 3)."""
     scale = np.linalg.norm(matrix, axis=1)
     return scale, matrix / scale[:, None]
 
 
-def angles_of(axes):
+def angles_of(axes: np.ndarray) -> np.ndarray:
     """Return the angle between each unit vector and each coordinate axis, rad; exact for small angles too, shape (n, 3)."""
     axes = np.asarray(axes, float)
     across = np.stack([np.hypot(axes[:, j - 2], axes[:, j - 1]) for j in range(3)], axis=1)
@@ -105,7 +107,8 @@ def _between_sd(axes, tangent, covariance, i, j):
     return float(np.sqrt(slope @ covariance @ slope) / sine)
 
 
-def in_paper_units(derived, nominal=None):
+def in_paper_units(derived: Derived,
+                   nominal: NominalScaling | Mapping | None = None) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
     """
     Return scale factors and biases in the units of the source papers, as (what, unit, values (3,), sds (3,)).
 

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+
 PASSES = 6
 """Passes over a recording at most, when effects have to be linearised anew."""
 
@@ -10,7 +13,7 @@ LINEAR_STEPS = 25
 """Steps of a numerical derivative (5 ms of a delay) over which a linearisation is believed in directions that are hardly seen."""
 
 
-def linearise_again(model, solution):
+def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
     """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
     return model.at(model.start_from(solution.model, _cautious(solution))) if _needs_another_pass(model, solution) else None
 

@@ -1,23 +1,30 @@
 """Calibration while the motion goes on: windows as they complete, a solution after them, the same answer as offline."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import conclude, solve_gathered
-from imu_calibration.calibration.effect_states import group_states, waiting_groups
+from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.live_collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import selected_columns
 from imu_calibration.estimation.window_store import WindowStore
 from imu_calibration.preflight.joint_checks import check_units
-from imu_calibration.samples import ImuSamples
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.stamping import StampLine
+from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting
 
 HELD_BACK = 200
@@ -70,7 +77,8 @@ class LiveCalibration:
 
     """
 
-    def __init__(self, table, options=CalibrationOptions(), settings=LiveSettings(), saved=None):
+    def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
+                 saved: bytes | None = None):
         self.table, self.options, self.settings, self.earlier = table, options, settings, None
         self._asked = choose_model(options, table)
         self._waiting, self._collector = [], None
@@ -83,13 +91,13 @@ class LiveCalibration:
             self._begin(self._asked, saved)
 
     @property
-    def n_windows(self):
+    def n_windows(self) -> int:
         """Windows gathered so far, those of an earlier run included."""
         parts = [self.earlier] + [self._collector and self._collector.gathered]
         return sum(sum(part.accumulator.windows.values()) for part in parts if part)
 
     @property
-    def counts(self):
+    def counts(self) -> dict[str, int]:
         """Samples of this run by what became of them."""
         if self._collector is None:
             return {}
@@ -97,33 +105,33 @@ class LiveCalibration:
         return dict(self._collector.gathered.counts)
 
     @property
-    def stamping(self):
+    def stamping(self) -> StampLine | None:
         """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
         return self._collector and self._collector.gatherer.cleaner.stamping
 
     @property
-    def needs_temperature(self):
+    def needs_temperature(self) -> bool:
         """Whether an effect that was asked for depends on temperature."""
         return self._asked.needs_temperature
 
     @property
-    def frame_id(self):
+    def frame_id(self) -> str:
         """Frame of the sensor; '' before the first message."""
         known = [part.frame_id for part in (self.earlier, self._collector and self._collector.gathered) if part]
         return next(filter(None, known), '')
 
-    def change_windows(self, windows):
+    def change_windows(self, windows: WindowSettings) -> None:
         """Find windows by other settings from now on; raises an InputError when these cannot be changed any more."""
         if self._collector is not None:
             self._collector.gatherer.change(windows)
         self.options = replace(self.options, windows=windows)
 
     @property
-    def model(self):
+    def model(self) -> SensorModel | None:
         """The model whose columns are gathered; None while a thermal effect waits for the first temperature."""
         return self._collector and self._collector.model
 
-    def push(self, block):
+    def push(self, block: SampleBlock) -> list[Window]:
         """
         Take what arrived and return the windows that it completed (list of Window).
 
@@ -160,9 +168,9 @@ class LiveCalibration:
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = LiveCollector(self.table, model, self.options, session, store, self._told)
+        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store, told=self._told)
 
-    def solve(self, pending=False, provenance=None):
+    def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
         Solve what was gathered and return the CalibrationResult, which stays in `result`.
 
@@ -197,20 +205,20 @@ class LiveCalibration:
             moved = linearise_again(model, solution)
             if moved is None or not store.complete:
                 break
-        self.result, self._too_far = conclude(solution, total, model, self.table, self.options, provenance), moved is not None
+        self.result, self._too_far = conclude(solution, total, model, table=self.table, options=self.options, provenance=provenance), moved is not None
         return self.result
 
-    def needs_linearising(self):
+    def needs_linearising(self) -> bool:
         """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
         return self._too_far
 
-    def gathered(self, pending=False):
+    def gathered(self, pending: bool = False) -> Gathered:
         """Return everything that was gathered, an earlier run included, to be saved."""
         if self._collector is None:
             return self.earlier or Gathered()
         return self._with_earlier(self._collector.snapshot(pending)[0])
 
-    def saved(self, pending=False):
+    def saved(self, pending: bool = False) -> bytes:
         """Return everything that was gathered as bytes, for another run (see `accumulator_state`)."""
         return accumulator_state.to_bytes(self.gathered(pending), self.model)
 
@@ -219,7 +227,7 @@ class LiveCalibration:
             return gathered
         return merge([copied(self.earlier), gathered])
 
-    def residuals(self, windows):
+    def residuals(self, windows: Sequence[Window]) -> ImuSamples | None:
         """
         Return measured minus predicted of windows from `push`, as ImuSamples, or None before the first solution.
 
@@ -240,13 +248,13 @@ class LiveCalibration:
         told, designs = self._designs.get(window, (None, None))
         if designs is None or self.result.gathered_model is not gathered_with:   # the solution was linearised elsewhere
             told, gathered_with = self._told(window), model
-            designs = columns_at(window, model, self.table, told)
+            designs = columns_at(window, model, table=self.table, told=told)
         chosen = selected_columns(gathered_with, model)
         parts = [measured[told] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
                  for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
         return ImuSamples(window.stamp_ns[told], *parts, self._collector.gathered.frame_id)
 
-    def groups(self):
+    def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""
         if self.result is None:
             return waiting_groups(self.model) if self.model is not None else []

@@ -1,15 +1,24 @@
 """The collector of a live calibration: what completed windows leave for residuals, a bounded store, and copies to solve while it goes on."""
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from imu_calibration.calibration.collector import Collector
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import columns
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import joined_motion
+from imu_calibration.estimation.window_store import WindowStore
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 
 
-def columns_at(window, model, table, told):
+def columns_at(window: Window, model: SensorModel, *, table: Table, told: slice) -> dict[str, np.ndarray]:
     """Return sensor -> columns at the samples `told` of a window."""
     motion, temperature = joined_motion([window])
     if window.kind != 'static':
@@ -20,7 +29,8 @@ def columns_at(window, model, table, told):
 class LiveCollector(Collector):
     """A Collector that hands completed windows on, with their columns at the samples `told`, and keeps a bounded number of them."""
 
-    def __init__(self, table, model, options, session, store, told):
+    def __init__(self, table: Table, model: SensorModel, options: CalibrationOptions, *, session: int, store: WindowStore,
+                 told: Callable[[Window], slice]):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
         self.store, self._told, self._completed = store, told, {}
 
@@ -38,12 +48,12 @@ class LiveCollector(Collector):
         if self.model.relinearised:
             self.store.add(window, reduced)
 
-    def take_completed(self):
+    def take_completed(self) -> dict[Window, tuple[slice, dict[str, np.ndarray]]]:
         """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
         completed, self._completed = self._completed, {}
         return completed
 
-    def snapshot(self, pending):
+    def snapshot(self, pending: bool) -> tuple[Gathered, WindowStore, list[Window]]:
         """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
         twin = copy.copy(self)
         twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
@@ -55,7 +65,7 @@ class LiveCollector(Collector):
         return twin.gathered, twin.store, list(twin.take_completed())
 
 
-def copied(gathered):
+def copied(gathered: Gathered) -> Gathered:
     """Return a copy that shares only what nobody changes in place."""
     copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
     return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))

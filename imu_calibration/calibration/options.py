@@ -6,10 +6,12 @@ import numpy as np
 
 from imu_calibration.allan.bias_processes import bias_processes
 from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -49,7 +51,7 @@ class CalibrationOptions:
         return {} if self.noise is None else bias_processes(self.noise)
 
 
-def choose_model(options, table):
+def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
     Return the model whose columns are gathered; `settle_model` takes out what the rotation does not show.
 
@@ -66,7 +68,7 @@ def choose_model(options, table):
     return replace(model, point={**model.point, **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
 
 
-def settle_model(model, options, gathered):
+def settle_model(model: SensorModel, options: CalibrationOptions, gathered: Gathered) -> SensorModel:
     """Return the model without the size effect when nobody asked for it and the recording holds no rotation that shows it."""
     if options.accelerometer_model is not None:
         return model

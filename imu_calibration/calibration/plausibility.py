@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
 
-def implausible(calibration):
+
+def implausible(calibration: Calibration) -> list[str]:
     """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
     lines = []
     for effect in calibration.model.effects:

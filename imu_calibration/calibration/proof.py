@@ -57,7 +57,7 @@ def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: Sensor
 
     """
     dealt = held_out.restricted(gathered_model, solution.model)
-    return prove(dealt, solution.model, dealt.values_without(solution), solution.values)
+    return prove(dealt, solution.model, folds=dealt.values_without(solution), reference=solution.values)
 
 
 def prove_calibration(held_out: HeldOut, model: SensorModel, calibration: Calibration) -> dict:
@@ -66,10 +66,10 @@ def prove_calibration(held_out: HeldOut, model: SensorModel, calibration: Calibr
     for effect in calibration.model.effects:
         if effect.key in model.slices:
             values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
-    return prove(held_out, model, [values], values)
+    return prove(held_out, model, folds=[values], reference=values)
 
 
-def prove(held_out: HeldOut, model: SensorModel, folds: Sequence[np.ndarray], reference: np.ndarray) -> dict:
+def prove(held_out: HeldOut, model: SensorModel, *, folds: Sequence[np.ndarray], reference: np.ndarray) -> dict:
     """
     Return sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows', 'seconds', 'delay_s', 'regimes'}.
 
@@ -199,7 +199,7 @@ def _entry(before, after, count):
     return compared(before, after, count) | {'seconds': float(count.sum() * PIECE_TIME)}
 
 
-def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, components: int = AXES) -> dict:
+def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = AXES) -> dict:
     """
     Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of whole blocks.
 

@@ -1,5 +1,8 @@
 """What a proof says, in sentences: whether a calibration helps on data that took no part, and what most likely spoils it."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from imu_calibration.effects.base import SENSORS
 
 HARM = 1.05
@@ -12,7 +15,7 @@ DELAY_SHARE = 0.1
 """They must explain this share of what is left."""
 
 
-def disproved(proof):
+def disproved(proof: Mapping) -> list[str]:
     """Return a line for each sensor whose error on held-out data is not shown to be smaller with the calibration, or grows in some motion."""
     lines = []
     for sensor, found in proof.items():
@@ -28,12 +31,12 @@ def disproved(proof):
     return lines
 
 
-def harmed(found):
+def harmed(found: Mapping) -> dict[str, Any]:
     """Return {regime: entry} of the regimes in which an entry of a proof says that the error grows."""
     return {name: part for name, part in (found.get('regimes') or {}).items() if part['after'] > HARM * part['before'] and part['ci95'][0] > 1.0}
 
 
-def proven(proof):
+def proven(proof: Mapping) -> list[str]:
     """Return what a proof shows, a line for each sensor."""
     return [f'{sensor} error on data that took no part ({found["windows"]} windows): {found["before"]:.3g} {found["unit"]} without, '
             f'{found["after"]:.3g} with it ({_ratio(found)}){_earlier(found)}' for sensor, found in proof.items()]

@@ -10,7 +10,7 @@ MOST_SAMPLES = 100_000
 class SpreadWindows:
     """Every so many-th window of each kind, so that memory and the time of a search are bounded; which ones depends on the recording alone."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []
 
     def add(self, window: Window) -> None:

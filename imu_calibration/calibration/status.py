@@ -5,6 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from imu_calibration.effects.sensor_model import SensorModel
+
 
 class Status(StrEnum):
     """Status of a parameter; a document holds the word."""
@@ -37,7 +39,7 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
     return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
 
 
-def tolerances_of(model, overrides=None):
+def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:
     """
     Return the tolerance of each parameter of a model, shape (n_params,).
 

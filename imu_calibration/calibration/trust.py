@@ -1,5 +1,6 @@
 """May a calibration be used? What its document says against it, and what whoever uses it should know."""
 
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.proof_words import disproved
 from imu_calibration.calibration.status import DETERMINED
@@ -7,7 +8,7 @@ from imu_calibration.calibration.verdict import BAD, GOOD, listed
 from imu_calibration.errors import DocumentError
 
 
-def objections(calibration):
+def objections(calibration: Calibration) -> list[str]:
     """
     Return why nobody should be corrected with a calibration unless they insist, a line each; the first is the gravest.
 
@@ -19,7 +20,7 @@ def objections(calibration):
     return list(dict.fromkeys([*bad, *implausible(calibration), *disproved(calibration.proof)]))
 
 
-def caveats(calibration):
+def caveats(calibration: Calibration) -> list[str]:
     """Return what should be known about a calibration that may be used, a line each."""
     if not calibration.verdict:
         return ['it carries no verdict, as files of earlier versions do: calibrate again to know how good it is']
@@ -27,19 +28,19 @@ def caveats(calibration):
     return [] if calibration.verdict == GOOD else [f'its verdict is {calibration.verdict}' + (f': {why}' if why else '')]
 
 
-def missing(calibration):
+def missing(calibration: Calibration) -> str:
     """Return which parameters are not determined, as text; '' when all are."""
     names = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
     return f'{len(names)} of {len(calibration.status)} parameters not determined ({listed(names)})' if names else ''
 
 
-def standing(calibration):
+def standing(calibration: Calibration) -> str:
     """Return in a few words how well a calibration is known, for one line in a log."""
     proof = 'proven on held-out data' if calibration.proof and not disproved(calibration.proof) else 'no proof on held-out data'
     return f'{calibration.verdict or "no verdict"}, {proof}'
 
 
-def refuse_untrusted(calibration):
+def refuse_untrusted(calibration: Calibration) -> None:
     """
     Refuse a calibration that has objections against it.
 

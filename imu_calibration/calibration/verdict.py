@@ -1,10 +1,12 @@
 """Good, weak or bad: whether a calibration may be used, why, and what to do next."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.proof_words import disproved, proven
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
@@ -74,7 +76,7 @@ class Verdict:
         return list(dict.fromkeys(lines))
 
 
-def judge(calibration, tolerances):
+def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     Return the Verdict on a calibration.
 
@@ -97,7 +99,7 @@ def judge(calibration, tolerances):
     return Verdict(word, tuple(favour + against + _notes(calibration, tolerances)))
 
 
-def judged(calibration, tolerances):
+def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
     found = judge(calibration, tolerances)
     return replace(calibration, verdict=str(found.word), verdict_reasons=tuple(found.lines()), judgement=found)
@@ -175,7 +177,7 @@ def _by_need(calibration, names):
     return found
 
 
-def listed(names):
+def listed(names: Sequence[str]) -> str:
     """Return names in a sentence; of many, the groups with their numbers."""
     if len(names) <= SHOWN_NAMES:
         return ', '.join(names)

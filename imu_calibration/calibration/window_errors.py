@@ -1,12 +1,16 @@
 """Errors of window means before and after calibration: what most of the report is drawn from."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.estimation.accumulator import restrict
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.table_result import TableResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +32,13 @@ class WindowErrors:
     floor: dict
     """Sensor -> what noise alone leaves in the mean, one sd, shape (n, 3)."""
 
-    def rms(self, sensor, which, kind=None):
+    def rms(self, sensor: str, which: str, kind: str | None = None) -> float:
         """Return the root mean square error of 'before' or 'after', over windows of one kind or all."""
         errors = getattr(self, which)[sensor][(self.kind == kind) if kind else slice(None)]
         return float(np.sqrt(np.mean(errors**2))) if errors.size else float('nan')
 
 
-def window_residuals(result):
+def window_residuals(result: 'TableResult') -> dict:
     """
     Return residuals per window before and after: what a nominal sensor would show, and what the model leaves.
 

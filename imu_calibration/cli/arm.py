@@ -32,7 +32,8 @@ def run(options: Namespace) -> int:
         preflight = Preflight()
         imus.append(read_imu(blocks, [preflight])[0])
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
-    result = estimate_arm(*imus)
+    first, second = imus
+    result = estimate_arm(first, second)
     out = console()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):
         shown, spread = with_sd(value * 1e3, sd * 1e3)

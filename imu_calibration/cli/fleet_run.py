@@ -75,7 +75,8 @@ def parameters_csv(spreads: Sequence[Spread]) -> str:
 def units_csv(results: Sequence[UnitResult]) -> str:
     """Return one row per unit: verdict, exit code, why it was refused, samples lost, and each parameter with its sd, SI."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
-    rows = [['name', 'verdict', 'exit_code', 'error', 'dropped'] + [heading for name in names for heading in (name, f'{name}.sd')]]
+    headings = [heading for name in names for heading in (name, f'{name}.sd')]
+    rows: list[list] = [['name', 'verdict', 'exit_code', 'error', 'dropped', *headings]]
     for result in results:
         known, dropped = {}, ''
         if result.calibration is not None:

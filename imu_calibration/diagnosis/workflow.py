@@ -79,10 +79,10 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     windows = []
 
     def read(step, numbered):
-        return [step.read(source(), session, Preflight(table.gravity_value), windows if not windows else None) for session,
+        return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,
                 source in numbered]
     report = _percent(progress) if progress else None
-    calibrated = calibrate_by_evidence([source], table, options, provenance, asking=report, mapper=read)
+    calibrated = calibrate_by_evidence([source], table, options, provenance=provenance, asking=report, mapper=read)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spread.windows))
     result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated=calibrated.result.solution)
@@ -116,7 +116,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     recording = read_by_hand(source(), options.nominal, [preflight])
     data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
-    result = hand_result(found.hand, recording, options, provenance, findings=preflight.findings, turns=data.turns)
+    result = hand_result(found.hand, recording, options, provenance=provenance, findings=preflight.findings, turns=data.turns)
     return DiagnosisResult(found.diagnosis, result.calibration, result.tolerances, result.needed, result.observations, options)
 
 

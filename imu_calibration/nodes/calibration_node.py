@@ -132,8 +132,8 @@ class CalibrationNode(Node):
 
     def _make_live(self, saved: bytes | None = None) -> LiveCalibration | LiveByHand:
         if self._table is None:
-            return LiveByHand(self._options, self._live_settings, self._hand_settings, saved)
-        return LiveCalibration(self._table, self._options, self._live_settings, saved)
+            return LiveByHand(self._options, self._live_settings, self._hand_settings, saved=saved)
+        return LiveCalibration(self._table, self._options, self._live_settings, saved=saved)
 
     def _resumed(self, place: SessionFiles) -> LiveCalibration | LiveByHand:
         try:

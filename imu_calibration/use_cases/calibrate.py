@@ -123,7 +123,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         else:
             result = _side_by_side(sources, table, options, recordings, jobs)
             if earlier is not None and result.calibration.proof:
-                result = _beside(result, check_on_table(sources, table, earlier, options).proof)
+                result = _beside(result, check_on_table(sources, table, earlier, options=options).proof)
         calibration = result.calibration
         return Calibrated(replace(result, calibration=replace(calibration, provenance=calibration.provenance | provenance.result())))
 

@@ -75,7 +75,8 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         open_bag(recording, topics, want_joints=True).close()
     table = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, table.joint_names)
-    return Checked(check_on_table([source], table, calibration, options, names=[name_of(recording)]), _notes(recording, calibration))
+    result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
+    return Checked(result, _notes(recording, calibration))
 
 
 def _notes(recording, calibration):

@@ -99,7 +99,7 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
     known = dict(zip(hand.model.param_names, hand.state.values))
     values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
-    return model.further(effect.sensor, values, force, rate, time, temperature_c)[1]
+    return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
 
 
 def _natural(poses, sensor):
@@ -110,7 +110,7 @@ def _natural(poses, sensor):
 def _norm_block(hand, space, at_rest, sensor_of):
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
-    residual, base = hand.model.norm_rows(hand.state.values, poses.force, poses.time, poses.temperature_c)
+    residual, base = hand.model.norm_rows(hand.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
     back = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
     rows[:, :base.shape[1]], rows[:, -1] = base, residual
@@ -126,7 +126,7 @@ def _rest_block(hand, space, at_rest, sensor_of):
     """Three rows per pose: the rate at rest."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
-    more, slopes = hand.model.further('gyroscope', hand.state.values, true, np.zeros_like(true), poses.time, poses.temperature_c)
+    more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
     rows = np.zeros((count, 3, space.size + 1))
     rows[:, :, 9:12] = np.eye(3)
     rows[:, :, hand.model.extra_index('gyroscope')] = slopes
@@ -156,7 +156,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
         further = [_columns(hand, e, None, force, rate, turn.time, turn.temperature_c) - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
                    for e in moving]
         stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
-        found = integrate_turn(turn.time, turn.rate, bias, matrix, (np.zeros_like(force), stacked))
+        found = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked))
         carried = found.mat_ji @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
         row = np.zeros((2, space.size + 1))
