@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 SEPARATOR = '=' * 80
@@ -12,6 +13,9 @@ SEPARATOR = '=' * 80
 _PARTS = {
     'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
     'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec\n',
+    'builtin_interfaces/Duration': 'int32 sec\nuint32 nanosec\n',
+    'trajectory_msgs/JointTrajectoryPoint': 'float64[] positions\nfloat64[] velocities\nfloat64[] accelerations\nfloat64[] effort\n'
+                                            'builtin_interfaces/Duration time_from_start\n',
     'geometry_msgs/Quaternion': 'float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n',
     'geometry_msgs/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
 }
@@ -25,6 +29,9 @@ _STANDARD = {
                'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b'),
     JOINT_STATE_TYPE: ('std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n', _HEADER,
                        'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e'),
+    JOINT_TRAJECTORY_TYPE: ('std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points\n',
+                            (*_HEADER, 'trajectory_msgs/JointTrajectoryPoint', 'builtin_interfaces/Duration'),
+                            'RIHS01_179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e'),
     TEMPERATURE_TYPE: ('std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n', _HEADER,
                        'RIHS01_72514a14126ab9f8a9abec974c78e5610a367b59db5da355ff1fb982d5bad4b8'),
 }
@@ -44,14 +51,14 @@ class TypeDefinition(NamedTuple):
 
 
 def standard_definition(message_type: str) -> TypeDefinition:
-    """Return the TypeDefinition of Imu, JointState or Temperature."""
+    """Return the TypeDefinition of a type that this package knows."""
     text, parts, digest = _STANDARD[message_type]
     nested = ''.join(f'{SEPARATOR}\nMSG: {part}\n{_PARTS[part]}' for part in parts)
     return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
 
 
 def is_standard_name(message_type: str) -> bool:
-    """Return whether this package knows the type: Imu, JointState or Temperature."""
+    """Return whether this package knows the type."""
     return message_type in _STANDARD
 
 
@@ -110,8 +117,9 @@ def _flatten(text):
             if not words or '=' in line.split('#')[0]:   # empty, or a constant
                 continue
             kind, name = words[0], prefix + words[1]
+            one, bracket, count = kind.partition('[')   # of a sequence
             if '/' in kind or kind in nested:
-                yield from expand(nested[kind.rpartition('/')[2]], name + '.')
+                yield from expand(nested[one.rpartition('/')[2]], name + bracket + count + '.')
             else:
                 yield kind, name
 

@@ -8,11 +8,13 @@ from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
 from imu_calibration.errors import InputError
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature
 from msg_adapters.imu import FIELDS, IMU_TYPE, parse_imu, patch_imu
 from msg_adapters.joint_state import JOINT_STATE_TYPE, MISSING_JOINT, NO_POSITION
+from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE, encode_trajectory, trajectory_from_message
 from msg_adapters.layout import MAX_LAYOUTS, Packed
 from msg_adapters.live import LiveGatherer
 from msg_adapters.stamps import MessageError
@@ -174,12 +176,40 @@ def test_names_that_never_match_are_refused_with_what_came():
         decoder.decode(Packed.join([serialize(joint_message((1, 0), '', ['pan', 'tilt'], [1, 2]))] * 1000))
 
 
-@pytest.mark.parametrize('message_type', [IMU_TYPE, JOINT_STATE_TYPE, TEMPERATURE_TYPE])
+@pytest.mark.parametrize('message_type', [IMU_TYPE, JOINT_STATE_TYPE, TEMPERATURE_TYPE, JOINT_TRAJECTORY_TYPE])
 def test_the_written_definitions_are_the_standard_ones(message_type):
     definition = standard_definition(message_type)
     assert definition.text.strip() == STORE.generate_msgdef(message_type, ros_version=2)[0].strip()
     assert definition.digest == STORE.hash_rihs01(message_type)
     assert is_standard(message_type, 'ros2msg', definition.text)
+
+
+@quick
+@given(st.lists(frames, max_size=4, unique=True), st.integers(0, 5), st.integers(0, 2), frames)
+def test_a_trajectory_is_written_as_rosbags_reads_it_and_comes_back(names, n_points, n_derivatives, frame):
+    rng = np.random.default_rng(n_points)
+    values = rng.normal(size=(3, n_points, len(names)))
+    time = np.cumsum(rng.integers(1, 10**9, n_points)) * 1e-9
+    values[1, -1:] = 0.0   # at rest at the end
+    points = TrajectoryPoints(tuple(names), time, *values[:1 + n_derivatives])
+    message = STORE.deserialize_cdr(encode_trajectory(points, frame), JOINT_TRAJECTORY_TYPE)
+    assert encode_trajectory(points, frame) == bytes(STORE.serialize_cdr(message, JOINT_TRAJECTORY_TYPE)) and message.header.frame_id == frame
+    back = trajectory_from_message(message)
+    assert back.joint_names == points.joint_names
+    np.testing.assert_allclose(back.time, time, atol=1e-9)
+    for name, wanted in points.columns().items() if n_points and names else ():
+        np.testing.assert_array_equal(back.columns()[name], wanted)
+    assert len(back.columns()) == 1 + n_derivatives or not n_points or not names
+
+
+def test_a_trajectory_whose_points_say_different_things_gives_what_all_say():
+    points = TrajectoryPoints(('a', 'b'), np.array([1.0, 2.0]), np.ones((2, 2)), np.zeros((2, 2)))
+    message = STORE.deserialize_cdr(encode_trajectory(points), JOINT_TRAJECTORY_TYPE)
+    message.points[1].velocities = np.zeros(1)
+    assert trajectory_from_message(message).rate is None
+    message.points[0].positions = np.zeros(0)
+    with pytest.raises(InputError, match='2 positions, one for each joint, some have not'):
+        trajectory_from_message(message)
 
 
 def test_definitions_with_comments_are_standard_and_others_are_not():

@@ -1,4 +1,10 @@
-"""simulator_node: a turntable that carries an IMU, live."""
+"""
+simulator_node: a turntable that carries an IMU, live.
+
+in: joint_trajectory (trajectory_msgs/JointTrajectory, as joint_trajectory_controller takes it; without points the table stops).
+out: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState), when asked for imu/temperature (sensor_msgs/Temperature),
+imu/truth (sensor_msgs/Imu) and /clock, ~/truth (std_msgs/String, the true parameters, latched), /diagnostics.
+"""
 
 import queue
 import sys
@@ -19,22 +25,26 @@ from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.settings import setting
-from imu_calibration.simulation.joint_trajectory import TableMotion
+from imu_calibration.simulation.hidden_causes import CAUSES, hidden_causes
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values
+from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows
+from msg_adapters.joint_trajectory import trajectory_from_message
 
-STRETCH = 0.2
+STRETCH = 0.1
 """Seconds of simulated time that are computed together, times the time factor; a trajectory takes effect that much later."""
 
 
@@ -54,6 +64,8 @@ class SimulatorSettings:
                                     symptom='another IMU is simulated', session=True)
     grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
                          symptom='noise too large or small')
+    hide: str = setting('', '', 'what else is wrong with the IMU, by its physics, names joined by +: ' + ', '.join(CAUSES),
+                        symptom='the diagnosis finds something else, or nothing', session=True)
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
     imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
     imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time',
@@ -84,12 +96,15 @@ class SimulatorNode(Node):
     def __init__(self):
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
+        self._controller = declare_parameters(self, ControllerSettings)
         self._table, self._motion = self._make_table()
         model, values = self._true_imu()
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
+        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], self._imu_seed())
         self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,
-                                          start_ns=start_ns)
+                                          start_ns=start_ns, causes=causes)
         self._trajectories = queue.Queue()
+        self._driven = {'followed': 0, 'refused': 0, 'why refused': ''}
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
         kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [(Imu, 'imu/truth')] * settings.truth
@@ -97,7 +112,8 @@ class SimulatorNode(Node):
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
         pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
         self._playback = Playback(self, publishers, self._batches(), pace, start_ns, publishers[:1], self._ended)
-        self.create_subscription(JointTrajectory, 'joint_trajectory', self._follow, 10)
+        self.create_subscription(JointTrajectory, 'joint_trajectory', self._trajectories.put, 10)
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.failed = self._is_over = False
         self._playback.start()
         moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
@@ -111,12 +127,13 @@ class SimulatorNode(Node):
     def _make_table(self):
         settings = self.settings
         table = files.read_table(Path(settings.table_file or config_file('table_three_axis.yaml')).expanduser())
-        if settings.profile in NO_PROFILE:
-            return table, TableMotion(None, len(table.joint_names))
-        profile = make_profile(settings.profile, settings.seed, table)
-        if profile.table is not None:
+        profile = None if settings.profile in NO_PROFILE else make_profile(settings.profile, settings.seed, table)
+        if profile is not None and profile.table is not None:
             table = Table.from_mapping(profile.table)
-        return table, TableMotion(profile, len(table.joint_names), settings.repeat)
+        return table, TableController(profile, table.joint_names, limits=limits_of(table), settings=self._controller, repeat=settings.repeat)
+
+    def _imu_seed(self):
+        return self.settings.seed if self.settings.imu_seed < 0 else self.settings.imu_seed
 
     def _true_imu(self):
         settings = self.settings
@@ -126,7 +143,7 @@ class SimulatorNode(Node):
             calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
             return calibration.model, calibration.values
         model = SensorModel(NAMED_MODELS['size_effect'], joint_names=self._table.joint_names)
-        return model, random_values(model, settings.grade, settings.seed if settings.imu_seed < 0 else settings.imu_seed)
+        return model, random_values(model, settings.grade, self._imu_seed())
 
     def _options(self):
         settings = self.settings
@@ -164,30 +181,19 @@ class SimulatorNode(Node):
     def _encode_joints(self, joints):
         return encode_joints(joints, with_velocity=self.settings.velocity)
 
-    def _follow(self, message):
-        names = list(self._table.joint_names)
-        missing = [name for name in names if name not in message.joint_names]
-        if missing:
-            self.get_logger().warning(f'a trajectory must name the joints {", ".join(names)}, {", ".join(missing)} are missing; '
-                                      'it is not followed')
-            return
-        self._trajectories.put(message)
-
     def _take_over(self, now, message):
-        order = [list(message.joint_names).index(name) for name in self._table.joint_names]
-        points = message.points
-        times = [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points]
-
-        def column(name):
-            found = [list(getattr(point, name)) for point in points]
-            return np.array(found)[:, order] if found and all(len(row) == len(message.joint_names) for row in found) else None
-
-        positions = column('positions')
         try:
-            positions = np.zeros((0, 0)) if positions is None else positions
-            self._motion.follow(now, time=times, position=positions, rate=column('velocities'), acceleration=column('accelerations'))
+            self._motion.follow(now, trajectory_from_message(message))
+            self._driven['followed'] += 1
         except ImuCalibrationError as error:
+            self._driven['refused'] += 1
+            self._driven['why refused'] = str(error)
             self.get_logger().warning(f'{error}; the trajectory is not followed')
+
+    def _statuses(self):
+        refused = self._driven['why refused']
+        text = f'the last trajectory that was refused: {refused}' if refused else 'follows what comes on joint_trajectory'
+        return [make_status(WARN if refused else OK, 'table', text, dict(self._driven))]
 
     def _ended(self, error):
         self._is_over, self.failed = True, error is not None and rclpy.ok()

@@ -1,5 +1,6 @@
 """A simulated table with an IMU on it, block after block: what a live simulator publishes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +12,10 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.simulation.joint_trajectory import TableMotion
+from imu_calibration.simulation.hidden_causes import Cause, Felt
 from imu_calibration.simulation.sensor_noise import quantise, read_encoders
 from imu_calibration.simulation.session import SimulationOptions, temperature_at
+from imu_calibration.simulation.table_controller import TableController
 
 TEMPERATURE_RATE = 1.0
 """Temperatures per second."""
@@ -50,13 +52,15 @@ class LiveSimulation:
     seed : int
     start_ns : int
         Stamp of time zero.
+    causes : sequence of Cause
+        What else is wrong with the IMU (`hidden_causes`).
 
     """
 
-    def __init__(self, model: SensorModel, values: np.ndarray, table: Table, *, motion: TableMotion,
-                 options: SimulationOptions = SimulationOptions(), seed: int = 0, start_ns: int = 0):
+    def __init__(self, model: SensorModel, values: np.ndarray, table: Table, *, motion: TableController,
+                 options: SimulationOptions = SimulationOptions(), seed: int = 0, start_ns: int = 0, causes: Sequence[Cause] = ()):
         self.model, self.values, self.table, self.motion, self.options = model.at(values), values, table, motion, options
-        self.start_ns = start_ns
+        self.start_ns, self.causes = start_ns, tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
         noise = options.noise
@@ -84,17 +88,25 @@ class LiveSimulation:
             empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
             return empty, empty
         motion, noise = self.motion.at(time), self.options.noise
-        temperature = temperature_at(time, self.options)
         outputs = []
         figures = ((noise.accel_density, noise.accel_resolution), (noise.gyro_density, noise.gyro_resolution))
-        for sensor, output, wander, (density, resolution) in zip(SENSORS, predict(self.model, self.values, self.table, motion=motion,
-                                                                                  temperature_c=temperature),
-                                                                 self._wander, figures):
+        for sensor, output, wander, (density, resolution) in zip(SENSORS, self._answered(time, motion), self._wander, figures):
             white = self._rng.normal(0.0, density * np.sqrt(self.options.imu_rate), output.shape)
             outputs.append(clip(self.model, sensor, self.values, output=quantise(output + white + wander.take(len(output)), resolution)))
         jitter = np.round(self._rng.normal(0.0, noise.stamp_jitter * 1e9, len(time))).astype(np.int64) if noise.stamp_jitter else 0
         stamps = self._stamps(time) + jitter
         return ImuSamples(stamps, *outputs, self.options.frame_id), self._truth(stamps, motion)
+
+    def _answered(self, time, motion):
+        """Return what the sensors answer without noise."""
+        answered = predict(self.model, self.values, self.table, motion=motion, temperature_c=temperature_at(time, self.options))
+        if not self.causes:
+            return answered
+        truth = self._truth(np.zeros(len(time), np.int64), motion)
+        felt = Felt(truth.force_s, truth.rate_s, *answered)
+        for cause in self.causes:
+            felt = cause(felt)
+        return felt.force, felt.rate
 
     def _truth(self, stamps, motion):
         felt = [warped_reference(self.model, sensor, self.table, motion=motion) for sensor in SENSORS]

@@ -1,0 +1,86 @@
+"""What may be wrong with a simulated IMU beyond its model, by the physics of each cause; nothing here knows the catalogue of effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from imu_calibration.constants import DEG, DEG_H, STANDARD_GRAVITY
+from imu_calibration.errors import InputError
+
+
+class Felt(NamedTuple):
+    """What the housing feels, and what its sensing elements answer so far; all shape (n, 3)."""
+
+    true_force: np.ndarray
+    """Specific force, m/s^2."""
+    true_rate: np.ndarray
+    """Rate, rad/s."""
+    force: np.ndarray
+    """Output of the accelerometers, m/s^2."""
+    rate: np.ndarray
+    """Output of the gyroscopes, rad/s."""
+
+
+Cause = Callable[[Felt], Felt]
+
+
+def _two_half_ranges(rng: np.random.Generator) -> Cause:
+    """Each gyroscope's electrodes have a gain of their own for either sense of the turn, 0.2 to 0.4 % apart."""
+    gap = rng.uniform(2e-3, 4e-3, 3) * rng.choice([-1, 1], 3)
+
+    def answer(felt: Felt) -> Felt:
+        gain = np.where(felt.true_rate > 0, 0.5 * gap, -0.5 * gap)
+        return felt._replace(rate=felt.rate + gain * felt.true_rate)
+    return answer
+
+
+def _unbalanced_mass(rng: np.random.Generator) -> Cause:
+    """The gyroscopes' masses hang beside their axes: specific force turns them, 20 to 60 deg/h per g."""
+    per_force = rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
+    return lambda felt: felt._replace(rate=felt.rate + felt.true_force @ per_force.T)
+
+
+def _soft_spring(rng: np.random.Generator) -> Cause:
+    """The accelerometers' springs grow softer one way: a parabola in the force along each axis, 0.2 to 0.5 mg at 1 g."""
+    per_square = rng.uniform(2e-4, 5e-4, 3) * rng.choice([-1, 1], 3) / STANDARD_GRAVITY
+    return lambda felt: felt._replace(force=felt.force + per_square * felt.true_force**2)
+
+
+def _gain_by_sense(rng: np.random.Generator) -> Cause:
+    """Each accelerometer's amplifier has a gain of its own for either sign, 0.05 to 0.1 % apart."""
+    gap = rng.uniform(5e-4, 1e-3, 3) * rng.choice([-1, 1], 3)
+
+    def answer(felt: Felt) -> Felt:
+        return felt._replace(force=felt.force + np.where(felt.true_force > 0, 0.5 * gap, -0.5 * gap) * felt.true_force)
+    return answer
+
+
+def _narrow_range(rng: np.random.Generator) -> Cause:
+    """The gyroscopes' converter ends at 100 to 120 deg/s."""
+    most = rng.uniform(100.0, 120.0) * DEG
+    return lambda felt: felt._replace(rate=np.clip(felt.rate, -most, most))
+
+
+CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
+    'two_half_ranges': _two_half_ranges, 'unbalanced_mass': _unbalanced_mass, 'soft_spring': _soft_spring, 'gain_by_sense': _gain_by_sense,
+    'narrow_range': _narrow_range}
+"""Name -> function of a generator that draws the size and returns what the cause does; `narrow_range` belongs last."""
+
+
+def hidden_causes(names: Sequence[str], seed: int) -> list[Cause]:
+    """
+    Return the causes of those names, each drawn from a generator of its own.
+
+    Raises
+    ------
+    InputError
+        When a name is unknown.
+
+    """
+    for name in names:
+        if name not in CAUSES:
+            raise InputError(f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them")
+    return [CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])) for name in CAUSES if name in names]

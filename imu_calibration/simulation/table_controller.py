@@ -1,0 +1,155 @@
+"""What drives the simulated table: a profile, then the trajectories that come, as joint_trajectory_controller and real joints take them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from imu_calibration.errors import InputError
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.motion_limits import MotionLimits, free_limits
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.settings import setting
+from imu_calibration.simulation.joint_trajectory import JointTrajectory, braking_from, excess, trajectory_from
+from imu_calibration.simulation.motion_builder import Profile
+
+ROUNDING = 1e-6
+"""What a trajectory may lie beyond a limit, relative to it."""
+LIMIT_CHOICES = ('refuse', 'slow', 'none')
+KEPT = 8
+"""Motions that are remembered; whoever asks looks back by less."""
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """How the joints take a trajectory, and what goes wrong with them."""
+
+    limits: str = setting('refuse', '', 'what becomes of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
+                          'is followed as slowly as speed and acceleration ask; beyond the range it is refused) or none (it is followed)',
+                          symptom='trajectories are not followed, or further and faster than the joints can')
+    lag: float = setting(0.0, 's', 'the joints move so much later than a trajectory says', (0.0, 10.0), 'measured joints are late')
+    speed_scaling: float = setting(1.0, '1', 'share of their speed at which trajectories are followed', (0.01, 1.0),
+                                   'motions take longer than they say')
+    refuse_after: int = setting(-1, '1', 'trajectories that are followed before every further one is refused; -1: all are followed',
+                                (-1, 1_000_000), 'trajectories are not followed')
+    stall_joint: str = setting('', '', 'joint that stalls', symptom='no joint stalls, or another one')
+    stall_time: float = setting(0.0, 's', 'simulated time at which it stalls', (0.0, 1e7), 'the joint moves on, or never moved')
+
+
+class TableController:
+    """
+    What the table does at any time: a profile, once or again and again, until a trajectory takes over.
+
+    Parameters
+    ----------
+    profile : Profile or None
+        None: rest until a trajectory comes.
+    joint_names : sequence of str
+        Joints in the order of the columns.
+    limits : MotionLimits, optional
+        Default: joints without an end.
+    settings : ControllerSettings
+    repeat : bool
+        Whether the profile starts again at its end, from the angles reached.
+
+    Raises
+    ------
+    InputError
+        When a setting names what is not there.
+
+    """
+
+    def __init__(self, profile: Profile | None, joint_names: tuple[str, ...], *, limits: MotionLimits | None = None,
+                 settings: ControllerSettings = ControllerSettings(), repeat: bool = False):
+        self.joint_names, self.limits, self.settings = tuple(joint_names), limits or free_limits(len(joint_names)), settings
+        if settings.limits not in LIMIT_CHOICES:
+            raise InputError(f"setting 'limits' must be one of {', '.join(LIMIT_CHOICES)}, got '{settings.limits}'; choose one")
+        if settings.stall_joint and settings.stall_joint not in self.joint_names:
+            raise InputError(f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one")
+        self._profile, self._repeat, self._n_followed = profile, repeat, 0
+        self._home = np.clip(np.zeros(len(joint_names)), self.limits.lower, self.limits.upper)
+        self._taken: list[tuple[float, JointTrajectory]] = []
+        self._stalled: JointTrajectory | None = None
+
+    @property
+    def end(self) -> float:
+        """When the motion ends, s; infinite when it repeats or waits for trajectories."""
+        return np.inf if self._profile is None or self._repeat or self._taken else self._profile.duration
+
+    def follow(self, now: float, points: TrajectoryPoints) -> None:
+        """
+        Let a trajectory that arrives at the time `now` take over; without points the joints brake and rest.
+
+        Raises
+        ------
+        InputError
+            When it is refused; the joints then do what they did.
+
+        """
+        points = points.ordered(self.joint_names)
+        begin = now + self.settings.lag
+        start = self._commanded(np.array([begin]))
+        if not len(points):
+            return self._take(begin, braking_from(start, self.limits))
+        if 0 <= self.settings.refuse_after <= self._n_followed:
+            raise InputError(f'the controller takes no more than {self.settings.refuse_after} trajectories; it was told so')
+        points = points.slowed(self.settings.speed_scaling)
+        trajectory = trajectory_from(start, points)
+        if self.settings.limits != 'none':
+            trajectory = self._within_limits(start, points, trajectory)
+        self._n_followed += 1
+        return self._take(begin, trajectory)
+
+    def _take(self, begin, trajectory):
+        self._taken = [*self._taken, (begin, trajectory)][-KEPT:]
+
+    def _within_limits(self, start, points, trajectory):
+        beyond, speed, acceleration = excess(trajectory, self.limits)
+        if beyond > ROUNDING:
+            raise InputError(f'a trajectory must stay within the range of the joints, it leaves it by {beyond:.3g} rad or m; '
+                             'see the limits in the description of the table')
+        fastest = max(speed, np.sqrt(acceleration))
+        if fastest <= 1.0 + ROUNDING:
+            return trajectory
+        if self.settings.limits == 'refuse':
+            raise InputError(f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '
+                             f'{acceleration:.2f} times the other; give it more time')
+        return trajectory_from(start, points.slowed(1.0 / fastest))
+
+    def at(self, time: np.ndarray) -> JointMotion:
+        """Return the JointMotion at `time`, shape (m,)."""
+        time = np.atleast_1d(np.asarray(time, float))
+        motion = self._commanded(time)
+        late = time > self.settings.stall_time
+        if not self.settings.stall_joint or not late.any():
+            return motion
+        if self._stalled is None:
+            self._stalled = braking_from(self._commanded(np.array([self.settings.stall_time])), self.limits)
+        column, stuck = self.joint_names.index(self.settings.stall_joint), self._stalled.at(time[late])
+        for field in fields(JointMotion)[1:]:
+            getattr(motion, field.name)[late, column] = getattr(stuck, field.name)[:, column]
+        return motion
+
+    def _commanded(self, time):
+        """What the joints would do if none of them stalled."""
+        begins = np.array([begin for begin, _ in self._taken])
+        which = np.searchsorted(begins, time, side='right') - 1
+        parts = np.zeros((4, len(time), len(self.joint_names)))
+        for k in np.unique(which):
+            mask = which == k
+            part = self._before(time[mask]) if k < 0 else self._taken[k][1].at(time[mask])
+            parts[:, mask] = part.position, part.rate, part.acceleration, part.jerk
+        return JointMotion(time, *parts)
+
+    def _before(self, time):
+        """What the joints do before the first trajectory."""
+        if self._profile is None:
+            zero = np.zeros((len(time), len(self.joint_names)))
+            return JointMotion(time, zero + self._home, zero, zero, zero)
+        if not self._repeat:
+            return self._profile.at(time)
+        turns = np.floor(time / self._profile.duration)
+        motion = self._profile.at(time - turns * self._profile.duration)
+        first, last = self._profile.at(np.array([0.0, self._profile.duration])).position
+        return replace(motion, time=time, position=motion.position + turns[:, None] * (last - first))
