@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
 """Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports nothing by itself."""
-EDGE = {'cli', 'nodes', 'resources', 'use_cases', '__main__'}
-ROS = {'rclpy', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
+EDGE = {'cli', 'nodes', 'ros2', 'resources', 'use_cases', '__main__'}
+ROS = {'rclpy', 'ros2cli', 'ros2doctor', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
 LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
 
 BLOCKED_IMPORTS = '''
@@ -114,7 +114,7 @@ def test_adapters_know_no_node_and_no_command_line(path):
 
 ORDER = (('constants', 'errors', 'samples'), ('settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
          ('estimation', 'preflight', 'simulation', 'compensation'), ('selection', 'allan'), ('calibration', 'papers'), ('by_hand', 'exports'), ('diagnosis',), ('report',),
-         ('files', 'resources'), ('use_cases',), ('cli', 'nodes'), ('__main__',))
+         ('files', 'resources'), ('use_cases',), ('cli', 'nodes'), ('ros2', '__main__'))
 """Packages and root modules from the ground up: each may import what stands in an earlier row."""
 
 

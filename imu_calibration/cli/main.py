@@ -2,6 +2,7 @@
 
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 
 from imu_calibration.cli.hints import hints_of
@@ -15,7 +16,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code (0 done, 1 refused, 3 written but not everything was determined or usable)."""
     from imu_calibration.cli.parser import make_parser  # numpy counts its threads when it is imported
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = make_parser(*arguments[:1]).parse_args(arguments)
+    return run(make_parser(*arguments[:1]).parse_args(arguments))
+
+
+def run(options: Namespace) -> int:
+    """Run the verb that was parsed; return its exit code."""
     try:
         return options.run(options)
     except ImuCalibrationError as error:

@@ -1,0 +1,30 @@
+"""``ros2 imu VERB``: the verbs of the plain command, from the same table, with the same options, output and exit codes."""
+
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from types import MethodType
+
+from ros2cli.command import CommandExtension
+
+from imu_calibration.cli.main import run
+from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, add_verbs
+
+
+class ImuCommand(CommandExtension):
+    """Calibrate, compensate and diagnose inertial measurement units."""
+
+    def add_arguments(self, parser: ArgumentParser, cli_name: str, *, argv: Sequence[str] | None = None) -> None:
+        """Add the verbs; of the one that is called, only its module is imported."""
+        self._parser, parser.epilog = parser, EXIT_CODES
+        setattr(parser, 'error', MethodType(OneLineParser.error, parser))   # one line, and the exit code of the plain command
+        words = list(sys.argv[1:] if argv is None else argv)
+        after = words[words.index(cli_name.split()[-1]) + 1:][:1] if cli_name.split()[-1] in words else []
+        add_verbs(parser, *after, required=False)
+
+    def main(self, *, args: Namespace, **_: ArgumentParser) -> int:
+        """Run the verb and return its exit code; without one say which there are, as `ros2` commands do."""
+        if getattr(args, 'verb', None) is None:
+            self._parser.print_help()
+            return 0
+        return run(args)

@@ -1,0 +1,114 @@
+"""The Imu topics of a running system, heard for a few seconds and looked at by preflight."""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+from sensor_msgs.msg import Imu
+
+from imu_calibration.nodes.inputs import BatchInput
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.preflight.finding import GOOD, REFUSE, WARNING, CheckFinding
+from imu_calibration.preflight.message_checks import check_messages
+from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from msg_adapters.imu_heads import ImuHeads
+from msg_adapters.live import LiveGatherer
+
+TYPE = 'sensor_msgs/msg/Imu'
+SECONDS = 3.0
+"""How long topics are listened to."""
+DISCOVERY = 2.0
+"""Seconds in which the nodes of the system are found."""
+NAMES = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
+"""Endings of topics that carry Imu messages by convention (REP 145)."""
+NOT_MEASURED = ('/imu/residual',)
+"""Endings of topics of that type which are no measurement."""
+
+
+@dataclass(frozen=True)
+class StreamFindings:
+    """What is known of one topic."""
+
+    topic: str
+    """Full name."""
+    source: str
+    """Its publishers and how reliable they are."""
+    findings: tuple[CheckFinding, ...]
+    """What looks right and wrong."""
+
+
+def look(node: Node, spin_once: Any) -> list[StreamFindings]:
+    """
+    Listen to every Imu topic for `SECONDS` and return what was found, by name.
+
+    Parameters
+    ----------
+    node : Node
+        Subscribes for that time.
+    spin_once : callable
+        Lets the node work once; called with the node and ``timeout_sec=``.
+
+    """
+    _spin(node, spin_once, DISCOVERY)
+    topics = {name: types for name, types in sorted(node.get_topic_names_and_types())
+              if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)}
+    streams = [_Stream(node, name) for name in topics]
+    _spin(node, spin_once, 0.2)
+    for stream in streams:
+        stream.input.look()   # asks for what the publishers offer
+    _spin(node, spin_once, SECONDS)
+    return [stream.findings() for stream in streams]
+
+
+def _spin(node, spin_once, seconds):
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        spin_once(node, timeout_sec=left)
+
+
+class _Stream:
+    """One topic that is listened to."""
+
+    def __init__(self, node, topic):
+        self.node, self.topic, self.heads, self.gatherer = node, topic, ImuHeads(), LiveGatherer()
+        self.by_wall_clock = not node.count_publishers('/clock')   # else stamps belong to the time that is played
+        self.input = BatchInput(node, Imu, topic, self._add)
+
+    def _add(self, data, sent_ns):
+        self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)
+        self.gatherer.add_imu(data, sent_ns)
+
+    def findings(self):
+        """Return the StreamFindings."""
+        self.input.look()
+        preflight = Preflight(strict=False)
+        deque(BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]), maxlen=0)
+        found = (*self._publishers(), *self._listeners(), *check_messages(self.heads.evidence()), *preflight.findings)
+        return StreamFindings(self.topic, self.input.source(), found)
+
+    def _publishers(self):
+        for other in self.input.others:
+            yield CheckFinding('type', REFUSE, f'a topic must have one type, {other.node_name} publishes {other.topic_type} here instead '
+                               f'of {TYPE}; rename its topic')
+        names = sorted(self.input.names())
+        if len(names) > 1:
+            yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): what they '
+                               'send mixes; stop all but one, or rename their topics')
+        if names and not self.heads.evidence().frame_ids:
+            yield CheckFinding('silence', WARNING, f'messages must come, none came in {SECONDS:g} s; look at the driver')
+
+    def _listeners(self):
+        wrong = 0
+        for listener in self.node.get_subscriptions_info_by_topic(self.topic):
+            for publisher in self.input.publishers:
+                answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
+                if answer == QoSCompatibility.ERROR:
+                    wrong += 1
+                    yield CheckFinding('qos', REFUSE, f'who listens must ask for no more than is offered, {listener.node_name} hears '
+                                       f'nothing of {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
+        if self.input.publishers and not wrong:
+            reliable = 'reliable' if self.input.reliable else 'best effort: what the network loses is lost'
+            yield CheckFinding('qos', GOOD, f'published {reliable}')

@@ -1,0 +1,112 @@
+"""`ros2 imu VERB` beside the plain command, and `ros2 doctor` on Imu topics, with the real `ros2` in a workspace."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from imu_calibration.cli.parser import VERBS
+
+pytest.importorskip('rclpy')
+from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
+from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.dds]
+TABLE = ROOT / 'bags/sample_session/table.yaml'
+TRUTH = ROOT / 'bags/sample_session/truth.yaml'
+FAULTY = '''
+import sys, rclpy
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Imu, MagneticField
+rclpy.init()
+node = rclpy.create_node('driver')
+good, bad = node.create_publisher(Imu, 'good/imu/data_raw', 10), node.create_publisher(Imu, 'bad/imu/data_raw', qos_profile_sensor_data)
+other = node.create_publisher(MagneticField, 'strange/imu/data', 10)
+listener = node.create_subscription(Imu, 'bad/imu/data_raw', lambda message: None, QoSProfile(depth=5))
+counter = [0]
+def publish():
+    counter[0] += 1
+    wobble = 1e-3 * ((counter[0] * 37) % 11 - 5)
+    for publisher, unit, frame, variance in ((good, 9.81, 'imu_link', 1e-4), (bad, 1.0, '', -1e-4)):
+        message = Imu()
+        message.header.stamp = node.get_clock().now().to_msg()
+        message.header.frame_id = frame
+        message.linear_acceleration.x, message.linear_acceleration.y, message.linear_acceleration.z = wobble, -wobble, unit + wobble
+        message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z = wobble, -wobble, 2 * wobble
+        message.linear_acceleration_covariance[0] = message.linear_acceleration_covariance[4] = message.linear_acceleration_covariance[8] = 1e-4
+        message.angular_velocity_covariance[0] = message.angular_velocity_covariance[4] = 1e-4
+        message.angular_velocity_covariance[8] = variance
+        message.orientation_covariance[0] = -1.0
+        publisher.publish(message)
+node.create_timer(0.005, publish)
+print('ready', flush=True)
+rclpy.spin(node)
+'''
+
+
+@pytest.fixture(scope='module')
+def place(tmp_path_factory):
+    """(a folder to work in, what runs a line of shell there with `ros2` on PATH)."""
+    folder = tmp_path_factory.mktemp('ros2_imu')
+    environment = with_ros2(tmp_path_factory.mktemp('ros2'))
+    build(folder)
+    domain_id, lock = free_domain()
+    environment |= {**STAY_LOCAL, 'ROS_DOMAIN_ID': str(domain_id)}
+
+    def shell(line):
+        return subprocess.run(sourced(folder, line), cwd=folder, env=environment, capture_output=True, text=True, timeout=180, stdin=subprocess.DEVNULL)
+
+    yield folder, shell, environment
+    shell('ros2 daemon stop')
+    lock.close()
+
+
+def test_every_verb_of_the_plain_command_is_offered(place):
+    _, shell, _ = place
+    found = re.findall(r'^    ([a-z]+)(?: |$)', shell('ros2 imu --help').stdout, re.MULTILINE)
+    assert tuple(found) == VERBS
+    assert re.search(r'^ +imu +Calibrate, compensate and diagnose', shell('ros2 --help').stdout, re.MULTILINE)
+    assert shell('ros2 imu').returncode == 0
+
+
+@pytest.mark.parametrize('line', [
+    f'inspect {ROOT}/bags/sample_session',
+    f'inspect {ROOT}/bags/sample_session --table {TABLE}',
+    f'compare {TRUTH} {TRUTH}',
+    f'calibrate {ROOT}/bags/sample_session --table {TABLE} --output WHERE --no-report',
+    'export --list',
+    f'export {TRUTH} --to json --output WHERE.json',
+    f'compare {TRUTH} nowhere.yaml',
+    'calibrate --output WHERE',
+    'calibrat session'])
+def test_output_and_exit_code_are_those_of_the_plain_command(place, line):
+    folder, shell, _ = place
+    plain = shell('imu_calibration ' + line.replace('WHERE', 'result'))
+    written = {path: path.read_bytes() for path in [*folder.glob('result/*'), *folder.glob('result.json')]}
+    by_ros2 = shell('ros2 imu ' + line.replace('WHERE', 'result'))
+    assert by_ros2.returncode == plain.returncode and by_ros2.stdout == plain.stdout
+    assert by_ros2.stderr.replace('ros2 imu', 'imu_calibration') == plain.stderr
+    assert written == {path: path.read_bytes() for path in written}
+
+
+def test_the_doctor_names_what_is_wrong_with_imu_topics_and_leaves_a_good_one_in_peace(place):
+    folder, shell, environment = place
+    with subprocess.Popen([sys.executable, '-c', FAULTY], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as driver:
+        try:
+            assert driver.stdout.readline() == 'ready\n'
+            told = shell('ros2 doctor --exclude-packages')
+            report = shell('ros2 doctor --exclude-packages --report').stdout
+        finally:
+            os.kill(driver.pid, signal.SIGKILL)
+    lines = [line for line in told.stderr.splitlines() if 'imu_calibration' in line]
+    ours = [line.partition('Warning: ')[2] for line in lines]
+    for words in ('ERROR: /bad/imu/data_raw: force unit: .*it looks like g', 'ERROR: /bad/imu/data_raw: qos: .*driver hears nothing of driver',
+                  '/bad/imu/data_raw: frame: .*empty frame_id', '/bad/imu/data_raw: covariance: variances of the angular rate .*-0.0001',
+                  'ERROR: /strange/imu/data: type: .*sensor_msgs/msg/MagneticField'):
+        assert any(re.match(words, line) for line in ours), (words, told.stderr)
+    assert not any('/good/' in line for line in ours), told.stderr
+    assert 'imu' in told.stdout.partition('Failed modules:')[2].split(), told.stdout
+    assert re.search(r'topic *: /good/imu/data_raw from /driver, reliable', report) and re.search(r'topic *: /bad/imu/data_raw from /driver, best effort', report)
