@@ -77,6 +77,11 @@ def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, d
     return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
 
 
+def read_effects(path: str | PathLike[str], catalogue: Catalogue = CATALOGUE) -> Catalogue:
+    """Return the catalogue with the effects that a YAML file defines, a file of effects or a calibration."""
+    return read_mapping(path, 'file of effects', catalogue.with_document)
+
+
 def read_robot_description(path: str | PathLike[str]) -> str:
     """Return the text of a robot description; macros of a .xacro file are expanded."""
     if Path(path).suffix != '.xacro':

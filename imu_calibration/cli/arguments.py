@@ -44,6 +44,7 @@ def add_model_arguments(parser: ArgumentParser) -> _ArgumentGroup:
     group.add_argument('--gyroscope-model', metavar='MODEL', help='the same for the gyroscope; default bias+matrix')
     group.add_argument('--reference-model', metavar='MODEL', help="effects of table and clock joined by +, or 'none'; default table_tilt, "
                        'and earth_rate when only the azimuth is unknown')
+    add_effects_argument(group)
     group.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
     group.add_argument('--nominal', metavar='FILE', help='YAML with accelerometer_offset, accelerometer_scale, gyroscope_offset, '
                        'gyroscope_scale for recordings in volts or counts')
@@ -52,6 +53,12 @@ def add_model_arguments(parser: ArgumentParser) -> _ArgumentGroup:
                        help='how windows are found; may be repeated: '
                        + ', '.join(f'{d.name} [{d.unit}]' for d in describe(WindowSettings)))
     return group
+
+
+def add_effects_argument(group: ArgumentParser | _ArgumentGroup) -> None:
+    """Add the option of effects that the catalogue does not have."""
+    group.add_argument('--effects', dest='catalogue', metavar='FILE', help='effects of your own beside the catalogue: YAML with effects: '
+                       'NAME: {sensor, column, unit, tolerance, text}, or a calibration.yaml that has some')
 
 
 def choices_of(options: Namespace) -> Choices:

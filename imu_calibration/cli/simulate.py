@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_stand_arguments, stand_of
+from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
 from imu_calibration.cli.parser import OneLineParser
 from imu_calibration.simulation.profiles import profile_names
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -12,7 +12,7 @@ from msg_adapters.storages import identifiers
 NAME = 'simulate'
 HELP = 'Write a bag from a simulated session on a turntable, and truth.yaml beside its data.'
 NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
-         'stamp_jitter_us', 'temperature')
+         'stamp_jitter_us', 'temperature', 'catalogue')
 """Options that are arguments of `simulate` by the same name."""
 
 
@@ -23,6 +23,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
     parser.add_argument('--size', type=float, default=0.3,
                         help='size of added effects as a share of the largest plausible one, default 0.3')
+    add_effects_argument(parser)
     parser.add_argument('--profile', metavar='NAME', default='calibration', help='motion: ' + ', '.join(profile_names()))
     parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     parser.add_argument('--seed', type=int, default=0, help='seed of noise and motion, default 0')

@@ -9,11 +9,13 @@ from imu_calibration.effects.base import SECTIONS, Effect
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
 from imu_calibration.effects.term import from_definition
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, shortened
 from imu_calibration.reference.joint import JointNames
 
 JOINTS = ('outer', 'middle', 'inner')
 """Joint names where no table says other ones."""
+MOST_ADDED = 50
+"""Effects that a document may add at most."""
 UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'reference temperature'}
 """Quantities that compensation knows of a sample."""
 
@@ -85,7 +87,38 @@ class Catalogue:
     @classmethod
     def from_definitions(cls, definitions: dict[str, Any]) -> 'Catalogue':
         """Return the catalogue with the effects of {name: plain data}."""
-        return cls().with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
+        return cls().with_definitions(definitions)
+
+    def with_definitions(self, definitions: dict[str, Any]) -> 'Catalogue':
+        """
+        Return a catalogue with the effects of {name: plain data} too.
+
+        Raises
+        ------
+        InputError
+            As `with_effects` and `term`; also when there are far too many.
+
+        """
+        if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
+            raise InputError(f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit, tolerance, text}}, got '
+                             f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it')
+        return self.with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
+
+    def with_document(self, document: dict[str, Any]) -> 'Catalogue':
+        """
+        Return a catalogue with what a document defines under `effects`: a file of effects, or a calibration, which carries its own.
+
+        Raises
+        ------
+        InputError
+            When there is no such part, or when a file of effects holds something else too.
+
+        """
+        strange = [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')
+        if strange or 'effects' not in document:
+            raise InputError('a file of effects must hold effects: NAME: {sensor, column, unit, tolerance, text}, it holds '
+                             f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it')
+        return self.with_definitions(document['effects'] or {})
 
 
 CATALOGUE = Catalogue()
@@ -93,7 +126,7 @@ CATALOGUE = Catalogue()
 
 
 def _check(effect, taken):
-    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken:
+    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {'effects'}:
         raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; choose another one")
     if effect.sensor not in SECTIONS:
         raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")

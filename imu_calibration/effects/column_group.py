@@ -5,7 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, array_function, names_in, products, read
+from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, array_function, may_fail, names_in, products, read
+from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference
 
 STEP = 1e-30
@@ -56,6 +57,10 @@ class ColumnGroup:
         return array_function(self._trees)
 
     @cached_property
+    def _may_fail(self):
+        return any(map(may_fail, self._trees))
+
+    @cached_property
     def _places(self):
         return [(name, field, (slice(None), *index)) for name in sorted(self.names) for field, *index in [PLACES[name]] if field]
 
@@ -70,16 +75,25 @@ class ColumnGroup:
         point : dict
             'temperature_ref_c', and effect name -> values where columns depend on them (``SensorModel.full_point``).
 
+        Raises
+        ------
+        InputError
+            When a column is not finite everywhere.
+
         """
         values = {name: getattr(ref, field)[index] for name, field, index in self._places}
-        values['temperature_ref_c'] = point.get('temperature_ref_c', 25.0)
+        values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
         if 'tau' in self.names:
             values['tau'] = point[self.owner][-1] + 1j * STEP
-        for k, column in enumerate(self._function(values)):
-            result[:, k] = column.real if self.width > count else column
-            if self.width > count:
-                result[:, count + k] = column.imag / STEP
+        with np.errstate(all='ignore'):
+            for k, column in enumerate(self._function(values)):
+                result[:, k] = np.real(column)
+                if self.width > count:
+                    result[:, count + k] = np.imag(column) / STEP
+        if self._may_fail and not np.all(np.isfinite(result)):
+            raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; divide by nothing that "
+                             'passes through zero, and take no root or logarithm of what may be negative')
         return result
 
     def products(self, known: dict[str, dict[tuple[str], float]]) -> list[dict[tuple[str, ...], float]]:

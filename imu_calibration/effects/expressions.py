@@ -7,6 +7,7 @@ from which the compensation of one sample is written. Text may come from a docum
 
 import ast
 import math
+import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -27,50 +28,95 @@ QUANTITIES = {
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
-LONGEST, HIGHEST_POWER, MOST_PRODUCTS = 400, 9, 200
-"""Characters, exponents and products at most, so that no document costs more than arithmetic should."""
+LONGEST, DEEPEST, HIGHEST_POWER, MOST_PRODUCTS, LARGEST = 400, 30, 9, 200, 1e30
+"""Characters, depth, exponents, products and size of numbers at most, so that no document costs more than arithmetic should."""
+UNBOUNDED = ('sqrt', 'exp', 'expm1', 'log')
+"""Functions without a finite value everywhere."""
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 SIGNS = (ast.UAdd, ast.USub)
 
 
 def read(text: str) -> ast.expr:
     """
-    Return the syntax tree of a column.
+    Return the syntax tree of a column, with whatever is constant in it worked out.
 
     Raises
     ------
     InputError
-        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument.
+        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; it says where.
 
     """
     try:
+        text = ' '.join(text.split())
         if len(text) > LONGEST:
-            raise ValueError
-        tree = ast.parse(text.strip(), mode='eval').body
-        _check(tree)
-    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
-        raise InputError(f'a column must be arithmetic of at most {LONGEST} characters in {", ".join(PLACES)} with {", ".join(FUNCTIONS)} and powers up to '
-                         f'{HIGHEST_POWER}, got {str(text)[:60]!r}; correct it') from error
-    return tree
+            raise _Refused(LONGEST, 'too long')
+        if not text.isascii():
+            raise _Refused(next(k for k, letter in enumerate(text) if not letter.isascii()), 'a letter that is not ASCII')
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', SyntaxWarning)
+            tree = ast.parse(text, mode='eval').body
+        return _checked(tree, text, 0)
+    except SyntaxError as error:
+        raise _refusal(text, (error.offset or 1) - 1, 'this cannot be read') from error
+    except _Refused as error:
+        raise _refusal(text, error.place, error.why) from error
+    except (AttributeError, TypeError, ValueError, RecursionError, MemoryError) as error:
+        raise _refusal(text, 0, 'this cannot be read') from error
 
 
-def _check(node):
+class _Refused(Exception):
+    """What a column may not hold, and where it stands."""
+
+    def __init__(self, place, why):
+        super().__init__(why)
+        self.place, self.why = place, why
+
+
+def _refusal(text, place, why):
+    shown = ' '.join(str(text)[place:place + 30].split())
+    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {", ".join(PLACES)} with {", ".join(FUNCTIONS)} and powers up to '
+                      f'{HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it')
+
+
+def _checked(node, text, depth):
+    """Return the node with constants folded into finite floats: a whole number could grow without end, a float raises."""
+    if depth > DEEPEST:
+        raise _Refused(node.col_offset, 'too many brackets')
+
+    def inner(part):
+        return _checked(part, text, depth + 1)
     match node:
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
-            if isinstance(op, ast.Pow) and not (isinstance(right, ast.Constant) and right.value in range(HIGHEST_POWER + 1)):
-                raise ValueError
-            _check(left)
-            _check(right)
+            if isinstance(op, ast.Pow):
+                if not (isinstance(right, ast.Constant) and type(right.value) is int and 0 <= right.value <= HIGHEST_POWER):
+                    raise _Refused(right.col_offset, f'a power that is not a whole number up to {HIGHEST_POWER}')
+                return _folded(ast.BinOp(inner(left), op, right), node)
+            return _folded(ast.BinOp(inner(left), op, inner(right)), node)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
-            _check(operand)
+            return _folded(ast.UnaryOp(op, inner(operand)), node)
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
-            _check(argument)
+            return _folded(ast.Call(node.func, [inner(argument)], []), node)
         case ast.Name(id=name) if name in PLACES:
-            pass
-        case ast.Constant(value=value) if type(value) in (int, float) and math.isfinite(value):
-            pass
-        case _:
-            raise ValueError
+            return ast.copy_location(ast.Name(name, ast.Load()), node)
+        case ast.Name(id=name):
+            raise _Refused(node.col_offset, f"the unknown name '{name[:30]}'")
+        case ast.Constant(value=value) if type(value) in (int, float) and abs(value) < LARGEST:
+            return ast.copy_location(ast.Constant(float(value)), node)
+    raise _Refused(node.col_offset, 'something else than arithmetic')
+
+
+def _folded(node, source):
+    """Return the node, or the number that it is."""
+    parts = [node.left, node.right] if isinstance(node, ast.BinOp) else [node.operand] if isinstance(node, ast.UnaryOp) else node.args
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and isinstance(node.right, ast.Constant) and node.right.value == 0.0:
+        raise _Refused(source.col_offset, 'a division by zero')
+    if not all(isinstance(part, ast.Constant) for part in parts):
+        return ast.copy_location(node, source)
+    with np.errstate(all='ignore'):
+        value = float(array_function([node])({})[0])
+    if not abs(value) < LARGEST:
+        raise _Refused(source.col_offset, 'a number that is not finite')
+    return ast.copy_location(ast.Constant(value), source)
 
 
 def names_in(tree: ast.expr) -> set[str]:
@@ -78,12 +124,27 @@ def names_in(tree: ast.expr) -> set[str]:
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in PLACES}
 
 
+def may_fail(tree: ast.expr) -> bool:
+    """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
+    divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant) for node in ast.walk(tree) if isinstance(node, ast.BinOp))
+    return divides or any(node.func.id in UNBOUNDED for node in ast.walk(tree) if isinstance(node, ast.Call))
+
+
 def array_function(trees: Sequence[ast.expr]) -> Callable:
     """Return ``function({name: array or number}) -> tuple of arrays``, one for each tree."""
     source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
     code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
-    known = {'__builtins__': {}, **{name: getattr(np, name) for name in FUNCTIONS}}
+    known = {'__builtins__': {}, **{name: getattr(np, name) for name in FUNCTIONS}, 'abs': _abs, 'sign': _sign}
     return lambda values: eval(code, known, values)   # the trees hold arithmetic alone: see `read`
+
+
+def _sign(x):
+    return np.sign(np.real(x))
+
+
+def _abs(x):
+    """Keep the derivative that an imaginary part carries, which the modulus of a complex number does not."""
+    return np.where(np.real(x) < 0, -x, x) if np.iscomplexobj(x) else np.abs(x)
 
 
 def products(tree: ast.expr, known: dict[str, dict[tuple[str], float]]) -> dict[tuple[str, ...], float]:

@@ -68,7 +68,10 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | Non
     if len(columns) not in (1, 3):
         raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it")
     group = ColumnGroup(name, columns, name)
-    settles, thermal = 'time constant' in group.uses, 'temperature' in group.uses
+    try:
+        settles, thermal = 'time constant' in group.uses, 'temperature' in group.uses
+    except InputError as error:
+        raise error.named(f"effect '{name}'") from error
     definition = {'sensor': sensor, 'column': column if isinstance(column, str) else list(columns), 'unit': unit, 'text': text,
                   'tolerance_reason': tolerance_reason or None, **numbers}
     if not settles:

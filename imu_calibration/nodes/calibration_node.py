@@ -20,6 +20,7 @@ from imu_calibration import files
 from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
@@ -70,6 +71,9 @@ class CalibrationNodeSettings:
                                    fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='good parameters are called weak', session=True)
+    effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, tolerance, text}, '
+                                'or a calibration that has some; a model may name them then', symptom='the node refuses a model that names them',
+                                session=True, fixed='motion is gathered for the model')
     save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, also when '
                              'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, with ~/save alone',
                              symptom='the node says at its start that the place is not writable', live=True, session=True)
@@ -126,9 +130,10 @@ class CalibrationNode(Node):
 
     def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
         settings = self.settings
-        tolerances = files.read_tolerances(files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml'))
+        catalogue = files.read_effects(files.user_path(settings.effects_file)) if settings.effects_file else CATALOGUE
+        place = files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml')
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
-                                  tolerances, windows)
+                                  files.read_tolerances(place, catalogue), windows, catalogue=catalogue)
 
     def _make_live(self, saved: bytes | None = None) -> LiveCalibration | LiveByHand:
         if self._table is None:

@@ -43,8 +43,8 @@ class Choices(TypedDict, total=False):
     """File or scaling of recordings in volts or counts."""
     noise: str | PathLike | NoiseFigures | None
     """noise.yaml of this IMU: how its biases move, instead of what the recording says of it; needs a table."""
-    catalogue: Catalogue
-    """The effects that there are; default the package's own."""
+    catalogue: Catalogue | str | PathLike | Mapping | None
+    """The effects that there are, or what adds to them: a file with `effects`, or {name: definition}; default the package's own."""
     setting: Sequence[str] | Mapping[str, float]
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
 
@@ -68,13 +68,22 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
 
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     """Return what to estimate and how to judge it."""
-    catalogue = choices.get('catalogue', CATALOGUE)
+    catalogue = catalogue_of(choices.get('catalogue'))
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
     return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
                               read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
                               nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue, noise_of(choices.get('noise')),
                               as_asked=bool(choices.get('model_as_asked')))
+
+
+def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalogue:
+    """Return the effects that there are, read where they are in a file."""
+    if isinstance(chosen, Catalogue):
+        return chosen
+    if isinstance(chosen, (str, PathLike)):
+        return files.read_effects(chosen)
+    return CATALOGUE.with_definitions(dict(chosen or {}))
 
 
 def kept(choices: Mapping[str, Any]) -> dict[str, Any]:

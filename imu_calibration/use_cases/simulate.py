@@ -1,7 +1,7 @@
 """From a profile of motions to a session of a simulated IMU: in memory, or as a bag with the truth beside its data."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from imu_calibration import documents, files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
@@ -23,6 +23,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
 from imu_calibration.simulation.session import simulate as run_session
+from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 
@@ -55,7 +56,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
              calibration: str | PathLike | Calibration | None = None, effects: Sequence[str] = (), size: float = 0.3,
              grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None, duration: float | None = None, imu_rate: float = 100.0,
              joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0, stamp_jitter_us: float = 0.0,
-             temperature: bool = False, catalogue: Catalogue = CATALOGUE) -> Simulated:
+             temperature: bool = False, catalogue: Catalogue | str | PathLike | Mapping | None = None) -> Simulated:
     """
     Simulate a session on a turntable.
 
@@ -81,8 +82,8 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
         Step of the joint positions, deg; standard deviation of the IMU stamps, microseconds.
     temperature : bool
         Whether there is a temperature, which warms up from 25 C; thermal effects bring it too.
-    catalogue : Catalogue
-        The effects that a random IMU may have.
+    catalogue : Catalogue, path-like or mapping, optional
+        The effects that a random IMU may have, or what adds to the package's own: a file with `effects`, or {name: definition}.
 
     Raises
     ------
@@ -93,7 +94,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     given = table_of(table or config_file('table_three_axis.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
-    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue)
+    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue_of(catalogue))
     for name in effects:
         model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, share=size))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)

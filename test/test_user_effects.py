@@ -1,0 +1,156 @@
+"""A file adds an effect: every verb and the node take it, a result carries it, and nothing but arithmetic passes."""
+
+import random
+import string
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from imu_calibration import documents, files
+from imu_calibration.cli.main import main
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.effects.expressions import PLACES, read
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.reference.reference_motion import Reference
+
+MINE = """
+effects:
+  gyro_warm_force:
+    sensor: gyroscope
+    column: "f_x * (temperature_c - 25)"
+    unit: (rad/s)/(m/s^2)/K
+    tolerance: 1.0e-6
+    largest: 1.0e-4
+    text: The gyroscopes respond to the force along x, the more the warmer they are.
+"""
+
+
+@pytest.fixture
+def mine(tmp_path):
+    (tmp_path / 'mine.yaml').write_text(MINE)
+    return tmp_path / 'mine.yaml'
+
+
+def reference(n=50):
+    rng = np.random.default_rng(1)
+    vectors = [rng.normal(0.0, size, (n, 3)) for size in (8.0, 2.0, 5.0)]
+    return Reference(np.linspace(0.0, 400.0, n), np.broadcast_to(np.eye(3), (n, 3, 3)), *vectors, 9.8, np.full(n, 30.0))
+
+
+@pytest.mark.slow
+def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(mine, tmp_path, capsys):
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    assert main(['simulate', '--effects', str(mine), '--effect', 'gyro_warm_force', '--size', '0.5', '--profile', 'quick', '--seed', '5',
+                 '--output', str(bag)]) == 0
+    model = ['--effects', str(mine), '--gyroscope-model', 'bias+matrix+gyro_warm_force']
+    table = ['--table', str(bag / 'table.yaml')]
+    assert main(['calibrate', str(bag), *table, *model, '--output', str(out)]) in (0, 3)
+    mine.unlink()   # from here on the calibration is all there is
+    found, truth = (files.read_calibration(path) for path in (out / 'calibration.yaml', bag / 'truth.yaml'))
+    value, true = (each.value('gyroscope', 'gyro_warm_force') for each in (found, truth))
+    np.testing.assert_allclose(value, true, atol=4 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max())
+    assert np.abs(true).min() > 20 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max()
+    assert main(['compensate', str(bag), '--calibration', str(out / 'calibration.yaml'), '--anyway', '--output', str(tmp_path / 'bag2')]) in (0, 3)
+    assert main(['check', str(bag), '--calibration', str(out / 'calibration.yaml'), *table]) == 0
+    again = tmp_path / 'again'
+    assert main(['calibrate', str(bag), *table, '--effects', str(out / 'calibration.yaml'), *model[2:], '--output', str(again)]) in (0, 3)
+    np.testing.assert_array_equal(files.read_calibration(again / 'calibration.yaml').values, found.values)
+    assert 'gyro_warm_force' in (out / 'report.html').read_text()
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('text, said', [
+    ('a: 1', 'must hold effects: NAME:'), ('effects: 3', 'must be given as at most'), ('effects: [1]', 'must be given as at most'),
+    ('effects:\n  mine: 3', "effect 'mine' must have sensor"), ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'must have'),
+    (MINE.replace('f_x', 'f_q'), "the unknown name 'f_q' at character 1: 'f_q * (temperature_c - 25)'"),
+    (MINE.replace('f_x', 'f_q'), "effect 'gyro_warm_force': a column must be arithmetic"),
+    (MINE.replace('- 25', '- 25 ** 0.5'), 'a power that is not a whole number up to 9 at character 30'),
+    (MINE.replace('- 25)', '- 25'), "this cannot be read at character 7"),
+    (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'must have a name of its own'),
+    (MINE.replace('gyro_warm_force', 'effects'), 'must have a name of its own'),
+    (MINE + 'other: 1', 'it holds other'), (MINE.replace('tolerance', 'tolerence'), 'tolerence'),
+    ('effects:\n' + ''.join(f'  e{k}: {{}}\n' for k in range(60)), 'at most 50')])
+def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, said):
+    (tmp_path / 'wrong.yaml').write_text(text)
+    with pytest.raises(InputError) as caught:
+        files.read_effects(tmp_path / 'wrong.yaml')
+    assert said in str(caught.value) and 'wrong.yaml' in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_a_choice_may_be_a_mapping_too():
+    from imu_calibration.use_cases.choices import catalogue_of
+    found = catalogue_of(documents.from_text(MINE)['effects'])
+    assert ('gyroscope', 'gyro_warm_force') in found.effects() and catalogue_of(None) is not found
+    assert catalogue_of(CATALOGUE) is CATALOGUE
+
+
+@pytest.mark.parametrize('column', ['9**9**9', '(((9**9)**9)**9)**9', '1/0', 'f_x / (1 - 1)', '1e300 * 1e300', 'log(-1)', 'sqrt(0 - 2)',
+                                    'exp(999)', '1' * 200])
+def test_numbers_cannot_grow_without_end(column):
+    with pytest.raises(InputError, match='a column must be arithmetic'):
+        read(column)
+
+
+@pytest.mark.parametrize('column', ['f_x / (time - time)', 'log(f_x)', 'sqrt(f_x)', '1 / (temperature_ref_c - temperature_ref_c)',
+                                    'exp(exp(f_x ** 9))', 'f_x / (w_x - w_x)'])
+def test_a_column_without_a_value_is_refused_in_one_line(column):
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        with pytest.raises(InputError, match="the columns of 'mine' must be finite"):
+            ColumnGroup('mine', (column,)).columns(reference(), {})
+
+
+def _random_column(rng):
+    """Return arithmetic, Python, and noise, mixed."""
+    atoms = [*PLACES, '1', '2.5', '1e9', '__import__', "'os'", 'eval', 'open', 'lambda', 'f_x.real', '__builtins__', '[', ']', '{', '}', ':=',
+             'if', 'else', 'for', 'in', 'abs', 'sqrt', 'exp', '0x10', '1j', 'True', 'None', '"', '#', '\\', '\n', ';', '\x00', 'é', '９']
+    glue = ['+', '-', '*', '/', '**', '(', ')', ',', ' ', '.', '=', '<', '@', '//', '%', '~', '&']
+    if rng.random() < 0.3:
+        return ''.join(rng.choice(string.printable) for _ in range(rng.randint(0, 40)))
+    if rng.random() < 0.5:
+        return ''.join(rng.choice(list(PLACES)) + rng.choice(['+', '-', '*', '/', '**2*', '*sin(2)+', '+(', ')*', '**']) for _ in range(rng.randint(1, 12))) + '1'
+    return ''.join(rng.choice(rng.choice([atoms, glue])) for _ in range(rng.randint(1, 30)))
+
+
+def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
+    """Ten thousand random columns: read and worked out to finite numbers, or refused in one line; nothing is called or imported."""
+    called, armed = [], False
+
+    def watch(event, _arguments):
+        if armed and event.split('.')[0] in ('open', 'import', 'os', 'subprocess', 'socket', 'shutil', 'ctypes'):
+            called.append(event)
+    sys.addaudithook(watch)
+    rng, ref, passed = random.Random(1), reference(), 0
+    point = {'mine': np.array([0.0, 0.0, 0.0, 300.0])}
+    ColumnGroup('mine', ('sin(f_x)',), 'mine').columns(ref, point)
+    armed = True
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        for _ in range(10_000):
+            text = _random_column(rng)
+            try:
+                columns = ColumnGroup('mine', (text,), 'mine').columns(ref, point)
+            except InputError as error:
+                assert '\n' not in str(error) and isinstance(error, ImuCalibrationError)
+            else:
+                passed += 1
+                assert columns.shape[0] == len(ref)
+    armed = False
+    assert not called and passed > 300
+
+
+def test_the_node_reads_the_file(mine):
+    program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
+               'from imu_calibration.resources import config_file\n'
+               'given = {"effects_file": sys.argv[1], "table_file": config_file("table_three_axis.yaml"),\n'
+               '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
+               'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'
+               'node = CalibrationNode()\n'
+               'print(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\n'
+               'node.close(); node.destroy_node(); rclpy.shutdown()')
+    done = subprocess.run([sys.executable, '-c', program, str(mine)], capture_output=True, text=True, timeout=120)
+    assert "dict_keys(['gyro_warm_force'])" in done.stdout, done.stderr
