@@ -1,18 +1,24 @@
 """One mind for two verbs: what a recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration import spread_windows
-from imu_calibration.calibration.by_evidence import _disagreement
+from imu_calibration.calibration import by_evidence, spread_windows
+from imu_calibration.calibration.by_evidence import _disagreement, stands_out
 from imu_calibration.calibration.spread_windows import SpreadWindows
+from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
+from imu_calibration.selection import questions
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair
@@ -103,3 +109,48 @@ def test_windows_for_the_search_are_spread_and_bounded(monkeypatch):
     assert some.n_samples == sum(len(w.time) for w in some.windows) <= 4000
     assert {w.kind for w in some.windows} == {w.kind for w in windows}
     assert some.windows[-1].time[0] > 0.7 * windows[-1].time[0]
+
+
+def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
+    """Whichever a search met first, the delay that the world holds wins, and the lag that a fit takes for it is as large."""
+    windows, table = calibrated(late[0]).windows, late[1]
+    model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
+    used = [window for window in windows if window.kind != 'unused']
+    effects = questions.without_saturation(questions.testable_effects(model, table, used)[0])
+    attempted = partial(Attempt, used, table, model, effects=effects)
+    first = attempted()
+    by_name = {question.name: question for question in first.questions}
+    for start in ('time_offset', 'gyro_bandwidth'):
+        settled, near = settle_rivals(first, [by_name[start]], attempted)
+        assert settled.search.run()[0].name == 'time_offset' and not near
+    lag = attempted(point=first.point([by_name['gyro_bandwidth']]))
+    assert lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')] > 0.01
+    assert settle_rivals(first, [by_name['gyro_quadratic']], attempted) == (first, [])
+
+
+def investigated(late):
+    """Return what the search finds in the session beyond biases and matrices."""
+    return investigate(calibrated(late[0]).windows, late[1], SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names)))
+
+
+def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late):
+    found = investigated(late)
+    names = found.attempt.baseline.param_names
+    question = found.named[0]
+    rivals = [Rival(question, question, behind, {names[0]: 0.3}) for behind in (0.0, 800.0)]
+    added = [_disagreement(replace(found, denied=[], rivals=[rival]), names)[0, 0] for rival in rivals]
+    assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
+    mates = told(found.used, late[1], replace(found, rivals=[replace(rivals[0], other=found.attempt.questions[0])])).findings[0].indistinguishable_from
+    assert mates[0] == found.attempt.questions[0].name
+
+
+def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(late, asked, monkeypatch):
+    found = investigated(late)
+    solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
+    question = found.named[0]
+    assert stands_out(solution, question) and not stands_out(replace(solution, covariance=1e9 * solution.covariance), question)
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
+    faint = imu.calibrate(late[0].block, late[1]).calibration
+    assert 'time_offset' in faint.statistics['denied'] and 'added' not in faint.statistics and OFFSET not in faint.param_names
+    place, was = (calibration.param_names.index('gyroscope.matrix.xx') for calibration in (faint, asked.calibration))
+    assert faint.sd[place] > 5 * asked.calibration.sd[was]

@@ -2,13 +2,15 @@
 One mind for `calibrate` and `diagnose`: what a recording demands is in the model.
 
 The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
-names joins the model; a choice on which the halves of the recording disagree does not, and widens the standard deviations instead.
+names joins the model; what parts of the recording deny, or what is no more than chance once the standard deviations allow for all that the model
+misses, does not, and widens the standard deviations instead, as does what would do nearly as well as a choice.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.model_changes import ModelChanges
@@ -17,9 +19,13 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation, investigate
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import FAMILY_WISE
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +64,17 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         return EvidentResult(conclude(*first, table=table, options=options, provenance=provenance), None)
     found = investigate(windows, table, baseline_model(options, table, solution.model), progress=asking,
                         bias_processes=options.bias_processes)
-    added = [question for question in found.named if (question.sensor, question.name) not in model.slices]
-    if added:
-        options = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
-        solution, gathered, model = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names)
+    asked = model.slices
+    while added := [question for question in found.named if (question.sensor, question.name) not in asked]:
+        extended = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
+        solution, gathered, model = solve_recordings(sources, table, extended, progress=progress, mapper=mapper, names=names)
+        faint = [question for question in added if not stands_out(solution, question)]
+        if not faint:
+            options = extended
+            break
+        found = replace(found, named=[question for question in found.named if question not in faint], denied=[*found.denied, *faint])
+    else:
+        solution, gathered, model = first
     solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
     if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
         solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named,
@@ -69,6 +82,17 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
     changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
     return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
+
+
+def stands_out(solution: Solution, question: Question) -> bool:
+    """Return whether an effect differs from nothing by more than chance, with standard deviations that allow for what the model misses."""
+    effect, part = question.effect, solution.model.slices[question.sensor, question.name]
+    at = np.arange(part.start, part.stop - effect.time_constant)
+    at = at[~solution.held[at]]
+    if not len(at):
+        return False
+    far = (solution.values - make_prior(solution.model).mean)[at]
+    return bool(chi2.sf(far @ np.linalg.solve(solution.covariance[np.ix_(at, at)], far), len(at)) < FAMILY_WISE)
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
@@ -101,10 +125,11 @@ def _point(found):
 
 
 def _disagreement(found, names):
-    """Return the covariance of what choices on which the halves disagree would have moved the parameters by."""
+    """Return the covariance of what other choices would have moved the parameters by: those that parts of the recording deny, and rivals."""
+    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in found.denied]
+    moves += [(rival.moves, rival.weight) for rival in found.rivals]
     total = np.zeros((len(names),) * 2)
-    for question in found.denied:
-        moved = found.attempt.moved_by(found.named, question)
+    for moved, weight in moves:
         shift = np.array([moved.get(name, 0.0) for name in names])
-        total += np.outer(shift, shift)
+        total += weight * np.outer(shift, shift)
     return total

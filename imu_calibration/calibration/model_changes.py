@@ -10,7 +10,7 @@ class ModelChanges:
     added: tuple[str, ...] = ()
     """Taken into the model because the recording demands them."""
     denied: tuple[str, ...] = ()
-    """Not taken in because the halves of the recording disagree on them; the standard deviations allow for them."""
+    """Not taken in because parts of the recording disagree on them; the standard deviations allow for them."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""

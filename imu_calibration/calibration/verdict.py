@@ -209,7 +209,7 @@ def _adopted(calibration):
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, f'added to the model, because the recording demands it: {", ".join(_with_size(calibration, name) for name in added)}',
                     "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
-    notes += [Reason(NOTE, f'the halves of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
+    notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
     strange = calibration.statistics.get('not_believed') or {}
     return notes + ([Reason(NOTE, f'held, because only what the model misses gives them a value, and one that no sensor has: {_strange(strange)}',

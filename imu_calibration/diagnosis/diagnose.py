@@ -90,7 +90,7 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
     findings += [finding(attempt.search, named, place, solution=told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
-                         shows=shows)
+                         shows=shows, rivals=[rival.other for rival in found.rivals if rival.question.name == named[place].name])
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named),

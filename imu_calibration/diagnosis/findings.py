@@ -11,7 +11,7 @@ from imu_calibration.selection.search import Search
 
 
 def finding(search: Search, named: Sequence[Question], place: int, *, solution: Solution, share: Callable, gain_of: Callable,
-            motion_of: Callable, shows: Callable = lambda place, mate, gain: True) -> Finding:
+            motion_of: Callable, shows: Callable = lambda place, mate, gain: True, rivals: Sequence[Question] = ()) -> Finding:
     """
     Return the Finding of the effect at `place` among those named.
 
@@ -31,12 +31,15 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
         ``motion_of(question, mate)``: the motion that would tell two effects apart.
     shows : callable
         ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor that shows this one.
+    rivals : sequence of Question
+        Effects known to do nearly as well in its place.
 
     """
     question = named[place]
     score = search.score([q for q in named if q is not question], question)
     parameters, gain = parameters_of(solution, question.sensor, question.name), gain_of(place)
-    mates = [mate for mate, _ in search.class_mates(named, question) if shows(place, mate, gain)]
+    mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
+                        if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
     return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
                    share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '',
                    question.effect.against)

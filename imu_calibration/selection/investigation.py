@@ -15,6 +15,7 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
+from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 from imu_calibration.selection.saturation import (
     Saturation,
     find_saturation,
@@ -51,7 +52,9 @@ class Investigation:
     not_testable: list[dict]
     """Effects that could not be asked about."""
     denied: Sequence[Question] = field(default_factory=list)
-    """Questions that would have become findings, but the halves of the recording disagree on them."""
+    """Questions that would have become findings, but the parts of the recording disagree on them."""
+    rivals: Sequence[Rival] = field(default_factory=list)
+    """What would do nearly as well in the place of a finding."""
 
 
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
@@ -87,8 +90,12 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     effects, not_testable = testable_effects(model, table, used)
     asked = without_saturation(effects)
     attempted = partial(Attempt, used, table, model, effects=asked, bias_processes=bias_processes)
-    attempt = attempted(progress=lambda share: report(0.5 * share))
+    attempt = attempted(progress=lambda share: report(0.4 * share))
     chosen = attempt.search.run()
+    settled, rivals = settle_rivals(attempt, chosen, attempted)
+    if settled is not attempt:
+        attempt, chosen = settled, settled.search.run()
+    report(0.5)
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
@@ -104,9 +111,11 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
             break
         attempt = attempted(point=attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
-        again, denied = ([next(q for q in attempt.questions if q.label == question.label) for question in some] for some in (named, denied))
+        again, denied = (same_questions(attempt, some) for some in (named, denied))
         named = _that_help(attempt, explained, pruned(again, explained.share))
-    return Investigation(used, attempt, explained, named, limits, not_testable, denied)
+    names = {question.name for question in named}
+    rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
+    return Investigation(used, attempt, explained, named, limits, not_testable, denied, rivals)
 
 
 def too_few_windows(count: int) -> NotObservableError:
