@@ -166,13 +166,17 @@ class MotionBuilder:
     Angles in degrees here, as people state motions; the segments hold radians. Where joints slide, use the methods that speak SI.
     """
 
-    def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None):
-        """Start at rest at zero; `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps."""
+    def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None, *, start: np.ndarray | None = None):
+        """
+        Start at rest at zero, or at the positions `start`.
+
+        `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps.
+        """
         self.segments: list[Segment] = []
         self.dwell = dwell
         self.limits = limits or free_limits(n_joints)
         self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
-        self._position = self.home
+        self._position = self.home if start is None else np.asarray(start, float)
 
     @property
     def n_joints(self) -> int:

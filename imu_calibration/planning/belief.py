@@ -1,0 +1,136 @@
+"""What is known in the middle of a plan: parameters, and the biases as they stand now, jointly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.planning.windows import PlannedWindow
+
+
+class Belief:
+    """
+    Covariance of the coordinates z and of every bias process of every axis.
+
+    Between motions the processes forget, ``u <- exp(-dt / time) u + noise``, so that what was seen of a bias long ago says little of it
+    now: a dwell saturates, a return does not. Within one motion they are taken as constant.
+
+    Parameters
+    ----------
+    information : ndarray, shape (n, n)
+        Of z, the prior included.
+    noise : dict
+        Sensor -> NoiseModel.
+
+    """
+
+    def __init__(self, information: np.ndarray, noise: dict[str, NoiseModel]):
+        self.size, self.noise = len(information), noise
+        processes = [process for sensor in SENSORS for process in noise[sensor].bias_processes for _ in range(3)]
+        self._power = np.array([process.sd**2 for process in processes])
+        self._times = np.array([process.time for process in processes])
+        total = self.size + len(processes)
+        self.covariance = np.zeros((total, total))
+        self.covariance[:self.size, :self.size] = np.linalg.inv(information)
+        self.covariance[self.size:, self.size:] = np.diag(self._power)
+        self._last = 0.0
+
+    @property
+    def known(self) -> np.ndarray:
+        """Covariance of z, shape (n, n)."""
+        return self.covariance[:self.size, :self.size]
+
+    def information_of(self, windows: Sequence[PlannedWindow]) -> np.ndarray:
+        """Return the information about z and the biases in the windows of a motion, shape (m, m)."""
+        total = np.zeros_like(self.covariance)
+        for window in windows:
+            first = self.size
+            for sensor in SENSORS:
+                noise = self.noise[sensor]
+                total[:self.size, :self.size] += window.within[sensor]
+                rows = np.zeros((3, len(total)))
+                rows[:, :self.size] = window.means[sensor]
+                for number in range(3 * len(noise.bias_processes)):
+                    rows[number % 3, first + number] = 1.0
+                first += 3 * len(noise.bias_processes)
+                variance = noise.low_variance / window.samples + noise.offset_sd**2
+                total += rows.T @ (rows / variance[:, None])
+        return total
+
+    def after(self, information: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+        """
+        Return the covariances after each of several motions.
+
+        Parameters
+        ----------
+        information : ndarray, shape (k, m, m)
+            Of `information_of`.
+        seconds : ndarray, shape (k,)
+            Their lengths.
+
+        Returns
+        -------
+        ndarray, shape (k, m, m)
+
+        """
+        return np.linalg.inv(np.linalg.inv(self._forgotten(0.5 * (self._last + seconds))) + information)
+
+    def take(self, information: np.ndarray, seconds: float) -> None:
+        """Go on by a motion that was chosen."""
+        self.covariance = self.after(information[None], np.array([seconds]))[0]
+        self._last = seconds
+
+    def _forgotten(self, steps):
+        decay = np.ones((len(steps), len(self.covariance)))
+        decay[:, self.size:] = np.exp(-steps[:, None] / self._times)
+        spread = decay[:, :, None] * self.covariance * decay[:, None, :]
+        at = np.arange(self.size, len(self.covariance))
+        spread[:, at, at] += (1 - decay[:, at]**2) * self._power
+        return spread
+
+
+def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise: dict[str, NoiseModel]) -> np.ndarray:
+    """
+    Return the information about z of the windows of a whole plan, as the calibration weighs them, shape (n, n).
+
+    Parameters
+    ----------
+    windows : sequence of PlannedWindow
+    times : ndarray, shape (k,)
+        Middles of the windows since the beginning, s.
+    noise : dict
+        Sensor -> NoiseModel.
+
+    """
+    total = np.sum([window.within[sensor] for window in windows for sensor in SENSORS], axis=0)
+    samples = np.array([window.samples for window in windows])
+    for sensor in SENSORS:
+        model = noise[sensor]
+        variance = model.low_variance / samples[:, None] + model.offset_sd**2
+        whitening = Whitening(variance, times, [np.arange(len(times))], processes=model.bias_processes)
+        rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(-1, len(total))
+        total = total + rows.T @ rows
+    return total
+
+
+def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel]) -> np.ndarray:
+    """
+    Return an information matrix that bounds from above what a window adds in any plan, shape (n, n).
+
+    The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an Ornstein-Uhlenbeck process seen at the middles
+    of the windows, whose inverse is tridiagonal. Its rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller
+    distance to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g is at least half the window's
+    own length. A larger covariance says less: with every G_j replaced by its bound the means are independent, and information adds up.
+    """
+    total = np.zeros_like(window.within[SENSORS[0]])
+    for sensor in SENSORS:
+        model = noise[sensor]
+        floor = sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
+        variance = model.low_variance / window.samples + model.offset_sd**2 + floor
+        rows = window.means[sensor]
+        total += window.within[sensor] + rows.T @ (rows / variance[:, None])
+    return total

@@ -1,0 +1,59 @@
+"""Where the joints may stand: attitudes spread over all that the chain reaches within its limits."""
+
+import numpy as np
+from scipy.stats import qmc
+
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.motion_limits import MotionLimits
+from imu_calibration.reference.table import Table
+
+N_TRIED = 512
+"""Positions that places are chosen from: a power of two, as the sequence wants it."""
+GRID = np.pi / 4
+"""Joints of a table with few of them stand at multiples of this, so that faces, edges and corners are among the places."""
+HEADING = 0.4
+"""Weight of the horizontal axes beside the vertical where attitudes are compared: headings show the tilt, attitudes all the rest."""
+
+
+def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends within which places are taken: one turn of endless joints."""
+    return np.where(limits.endless, -np.pi, limits.lower), np.where(limits.endless, np.pi, limits.upper)
+
+
+def rest_at(position: np.ndarray) -> JointMotion:
+    """Return rest at each of the positions, shape (n, n_joints)."""
+    zero = np.zeros_like(position)
+    return JointMotion(np.zeros(len(position)), position, zero, zero, zero)
+
+
+def candidates(limits: MotionLimits) -> np.ndarray:
+    """Return positions to choose from, the first that nearest to zero, shape (n, n_joints)."""
+    lower, upper = reachable(limits)
+    home = np.clip(np.zeros(len(limits)), limits.lower, limits.upper)
+    spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
+    parts = [home[None], spread]
+    if len(limits) <= 3:
+        steps = [np.arange(np.ceil(a / GRID - 1e-9), np.floor(b / GRID + 1e-9) + 1) * GRID if turning else np.linspace(a, b, 3)
+                 for a, b, turning in zip(lower, upper, limits.turns, strict=True)]
+        grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
+        parts.insert(1, grid[np.lexsort(np.abs(grid).T)])
+    return np.concatenate(parts)
+
+
+def choose_places(table: Table, limits: MotionLimits, count: int) -> np.ndarray:
+    """
+    Return places whose attitudes lie as far from one another as can be, the first at home, shape (n, n_joints).
+
+    One after the other that whose attitude is furthest from those chosen; of equals the one nearest to zero, which the order of
+    `candidates` sees to. Where all attitudes that are left are as good as there already, fewer are returned.
+    """
+    tried = candidates(limits)
+    mats = reference_motion(table, rest_at(tried)).mat_sn
+    features = np.concatenate([mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1)
+    chosen, distance = [0], np.linalg.norm(features - features[0], axis=1)
+    while len(chosen) < count and distance.max() > 0.05:
+        nearly = distance > distance.max() - 1e-6
+        chosen.append(int(np.argmax(nearly)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return tried[chosen]

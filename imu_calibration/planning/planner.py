@@ -1,0 +1,192 @@
+"""
+The planner: what to do next, and the whole plan, so that every parameter comes within its tolerance in little time.
+
+Use it in three steps, as often as anything new is known::
+
+    planner = make_planner(table, tolerances={...}, noise=noise_of_grade(GRADES['industrial'].noise, 100.0))
+    step = planner.next_motion(position)     # NextMotion: .motion is None when all is done, .reason says why in words
+    points = step.motion.points(position)    # TrajectoryPoints: positions, velocities, accelerations, at rest at the end
+    planner.take(calibration)                # what was really learnt replaces what was hoped for
+    plan = planner.plan(position)            # Plan: motions, predicted sd, seconds, lower_bound_seconds
+
+Between two calls of `take` the planner counts on the motions that it gave out. All joints are in the order of ``table.joint_names``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.motions import MotionKind, PlannedMotion
+from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.planning.search import LEAST_GAIN, Offers, exchanged, greedy
+from imu_calibration.planning.situation import Situation
+from imu_calibration.reference.motion_limits import MotionLimits, limits_of
+from imu_calibration.reference.table import Table
+
+DONE = 'every parameter is within its tolerance'
+STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
+
+
+@dataclass(frozen=True, eq=False)
+class NextMotion:
+    """What to do next."""
+
+    motion: PlannedMotion | None
+    """None: nothing more to do."""
+    reason: str
+    """Why this, or why nothing."""
+    seconds: float = 0.0
+    """Length with the way to it, s."""
+    missing: tuple[str, ...] = ()
+    """Parameters that are not within their tolerance before it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Motions one after the other, and what they promise."""
+
+    model: SensorModel
+    """What is to be determined."""
+    motions: tuple[PlannedMotion, ...]
+    """In the order of time."""
+    start: np.ndarray
+    """Where the joints are at the beginning, shape (n_joints,)."""
+    ends: np.ndarray
+    """When each motion ends, the way to it included, s, shape (n_motions,)."""
+    sd: np.ndarray
+    """Predicted standard deviation of each parameter, SI, shape (n_params,)."""
+    tolerances: np.ndarray
+    """SI, shape (n_params,)."""
+    wanted: np.ndarray
+    """Whether each parameter is asked for, shape (n_params,)."""
+    history: np.ndarray
+    """Standard deviations in tolerances before the first motion and after each, of the parameters asked for, shape (n_motions + 1, k)."""
+    lower_bound_seconds: float
+    """No plan made of these motions meets the tolerances in less, s."""
+
+    @property
+    def seconds(self) -> float:
+        """Total time, s."""
+        return float(self.ends[-1]) if len(self.ends) else 0.0
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Parameters that stay outside their tolerance."""
+        far = self.wanted & (self.sd > self.tolerances * (1 + 1e-6))
+        return tuple(name for name, flag in zip(self.model.param_names, far, strict=True) if flag)
+
+
+class Planner:
+    """
+    Plans motions of one chain for one model.
+
+    Parameters
+    ----------
+    situation : Situation
+        Motions, model in tolerances, noise.
+    known : ndarray, optional
+        Information about the coordinates beside the prior.
+
+    """
+
+    def __init__(self, situation: Situation, known: np.ndarray | None = None):
+        self.situation, self.known = situation, known
+        self._belief = situation.belief(known)
+        self._visited: set[int] = set()
+
+    def take(self, calibration: Calibration) -> None:
+        """Replace what was hoped for by what a calibration knows: its covariance, for the parameters that the model shares with it."""
+        names = {name: k for k, name in enumerate(calibration.param_names)}
+        self.known = self.situation.coordinates.information_from(names, calibration.covariance)
+        self._belief = self.situation.belief(self.known)
+
+    @property
+    def excess(self) -> dict[str, float]:
+        """Standard deviation over tolerance of each parameter asked for, as far as is known or hoped for now."""
+        coordinates = self.situation.coordinates
+        names = np.array(coordinates.model.param_names)[coordinates.wanted]
+        return dict(zip(names.tolist(), self.situation.excess(self._belief.known).tolist(), strict=True))
+
+    def next_motion(self, position: np.ndarray) -> NextMotion:
+        """Return the motion with the largest gain per second from where the joints are, and count on it."""
+        missing = tuple(name for name, excess in self.excess.items() if excess > 1.0)
+        if not missing:
+            return NextMotion(None, DONE)
+        place = self.situation.place_near(position)
+        choice = Offers(self.situation, self._belief, place)
+        number = choice.best if self._visited or self.known is not None else self.situation.first_rest(place)
+        if self._visited and choice.gain[number] < LEAST_GAIN and choice.left[number] > 0:
+            return NextMotion(None, STUCK, missing=missing)
+        self._belief.take(choice.information[number], float(choice.seconds[number]))
+        motion = self._named(number)
+        return NextMotion(motion, f'it gains most per second for {", ".join(missing[:3])}', motion.seconds_from(position), missing)
+
+    def plan(self, position: np.ndarray | None = None, *, progress: Callable[[float], None] | None = None,
+             with_bound: bool = True) -> Plan:
+        """Return a whole plan from where the joints are (default: at home)."""
+        situation = self.situation
+        start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
+        place = situation.place_near(start)
+        first = () if self.known is not None else (situation.first_rest(place),)
+        sequence = greedy(situation, place, known=self.known, first=first, progress=progress)
+        sequence = exchanged(situation, sequence, place, known=self.known, fixed=len(first))
+        bound = situation.relaxation(self.known).seconds if with_bound else float('nan')
+        return self._plan_of(sequence, start, place, bound)
+
+    def _plan_of(self, sequence, start, place, bound):
+        situation, coordinates = self.situation, self.situation.coordinates
+        covariance, _ = situation.covariance_after(sequence, place, self.known)
+        steps = [situation.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
+        self._visited.clear()
+        return Plan(coordinates.model, tuple(self._named(number) for number in sequence), start,
+                    np.array([seconds for _, seconds in steps[1:]]), coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
+                    np.array([situation.excess(step) for step, _ in steps]), bound)
+
+    def _named(self, number: int) -> PlannedMotion:
+        """Return a motion of the repertoire; a rest where there was one already is a return."""
+        motion, place = self.situation.motions[number], int(self.situation.repertoire.place_of[number])
+        if motion.kind is MotionKind.POSE:
+            motion = replace(motion, kind=MotionKind.RETURN) if place in self._visited else motion
+            self._visited.add(place)
+        return motion
+
+
+def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: dict | None = None, rate: float = 100.0,
+                 options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None,
+                 calibration: Calibration | None = None) -> Planner:
+    """
+    Return the planner of a table or an arm.
+
+    Parameters
+    ----------
+    table : Table
+    noise : mapping
+        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`.
+    tolerances : mapping, optional
+        {section: {effect: tolerance}}, SI.
+    rate : float
+        Samples of the IMU per second.
+    options : CalibrationOptions
+        What is to be estimated.
+    limits : MotionLimits, optional
+        Default those of the table.
+    calibration : Calibration, optional
+        What is known already.
+
+    """
+    model = choose_model(options, table)
+    values = None if calibration is None else model.start_from(calibration.model, calibration.values)
+    coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
+    planner = Planner(Situation(Repertoire(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate))
+    if calibration is not None:
+        planner.take(calibration)
+    return planner

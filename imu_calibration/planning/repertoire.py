@@ -1,0 +1,177 @@
+"""Everything that a planner chooses from: rests, spins in either sense, swings and joint turns at places of the chain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from imu_calibration.constants import DEG
+from imu_calibration.planning.motions import MotionKind, PlannedMotion, motion_at
+from imu_calibration.planning.places import choose_places, reachable
+from imu_calibration.reference.motion_limits import MotionLimits
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
+
+MARGIN = 0.98
+"""Share of speeds and accelerations that is used, so that splines between the points of a trajectory keep the limits too."""
+DWELLS = (1.8, 2.5, 4.0, 6.5, 10.0, 16.0)
+"""Seconds of rest; the first half second settles, and a second is the shortest window."""
+SPIN_TIME = (2.0, 7.0)
+"""Seconds for which a constant rate is held at least."""
+SWING_TIME = (4.0, 10.0)
+"""Seconds of a swing."""
+FREQUENCIES = (0.35, 1.0)
+"""Swings, Hz."""
+SPEEDS = (1.0, 0.5)
+"""Spins, as shares of the largest speed."""
+LARGEST_SWING = {True: 120.0 * DEG, False: 0.3}
+"""Amplitude of a swing of a joint that turns, rad, or slides, m, at most."""
+REST_PLACES, SPIN_PLACES, SWING_PLACES = 20, 4, 3
+"""Places for rests; for spins and for swings of each joint."""
+
+
+class Repertoire:
+    """
+    The motions of a chain within its limits, and the places where they start and end.
+
+    Parameters
+    ----------
+    table : Table
+    limits : MotionLimits
+
+    """
+
+    def __init__(self, table: Table, limits: MotionLimits):
+        self.table = table
+        self.limits = MotionLimits(limits.lower, limits.upper, MARGIN * limits.speed, MARGIN * limits.acceleration, limits.turns)
+        self.names = tuple(table.joint_names)
+        self.spread = choose_places(table, self.limits, REST_PLACES)
+        self.motions = list(self._made())
+        self.places = np.unique(np.round([motion.place for motion in self.motions], 9), axis=0)
+        self.place_of = np.array([int(np.argmin(np.abs(self.places - motion.place).sum(axis=1))) for motion in self.motions])
+
+    def _made(self) -> Iterator[PlannedMotion]:
+        number = 0
+        for kind, place, segments, text in (*self._rests(), *self._spins(), *self._swings(), *self._together()):
+            yield PlannedMotion(kind, self.names, place, segments, text, self.limits, number)
+            number += 1
+
+    def _rests(self):
+        for place in self.spread:
+            yield MotionKind.MOVE, place, (), ''
+            for dwell in DWELLS:
+                builder = self._builder(place)
+                builder.rest(dwell)
+                yield MotionKind.POSE, place, tuple(builder.segments), f'rest for {dwell:g} s'
+
+    def _spins(self):
+        moving = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
+        for joint in moving:
+            for place in self._subset(SPIN_PLACES, int(joint)):
+                for share in SPEEDS:
+                    for sense in (1.0, -1.0):
+                        for seconds in SPIN_TIME:
+                            rates = np.zeros(len(self.names))
+                            rates[joint] = sense * share * self.limits.speed[joint]
+                            made = self._whole_turns(place, rates, seconds) if self.limits.endless[joint] else self._sweep(place, rates)
+                            if made:
+                                yield MotionKind.SPIN, *made
+
+    def _swings(self):
+        for joint in np.flatnonzero(self.limits.upper > self.limits.lower):
+            for place in self._subset(SWING_PLACES, int(joint) + 1):
+                for frequency in FREQUENCIES:
+                    shares = np.zeros(len(self.names))
+                    shares[joint] = 1.0
+                    for seconds in SWING_TIME:
+                        yield MotionKind.SWING, *self._swing(place, shares, frequency, seconds)
+
+    def _together(self):
+        moving = np.flatnonzero(self.limits.upper > self.limits.lower)
+        pairs = [pair for pair in combinations(moving, 2)][-6:]
+        sets = [*pairs, *([tuple(moving)] if len(moving) > 2 else [])]
+        for number, joints in enumerate(sets):
+            for place in self._subset(2, number + 2):
+                frequency = np.full(len(self.names), 0.5)
+                frequency[list(joints)] = 0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)[:len(joints)]
+                for seconds in SWING_TIME:
+                    yield MotionKind.TOGETHER, *self._swing(place, np.isin(np.arange(len(self.names)), joints), frequency, seconds)
+        for pair in pairs:
+            if self.limits.endless[list(pair)].all():
+                for place in self._subset(2, sum(pair)):
+                    for sense in (1.0, -1.0):
+                        rates = np.zeros(len(self.names))
+                        rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array([1.0, sense])
+                        yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
+
+    def _subset(self, count: int, first: int) -> np.ndarray:
+        """Return some of the places, others for other motions."""
+        some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
+        return self.spread[np.unique(some)]
+
+    def _builder(self, place):
+        return MotionBuilder(len(self.names), limits=self.limits, start=place)
+
+    def _whole_turns(self, place, rates, seconds):
+        """Turn at constant rates for at least `seconds`, and so long that endless joints come back to where they were."""
+        speed = np.abs(rates).max()
+        ramp = self._spun(place, rates, 1.0)
+        extra = np.abs(sum(segment.end - segment.start for segment in ramp)).max() - speed
+        turns = np.ceil((seconds * speed + extra) / (2 * np.pi))
+        held = (2 * np.pi * turns - extra) / speed
+        ending = 'turn' if turns == 1 else 'turns'
+        return place, self._spun(place, rates, held), f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
+
+    def _sweep(self, place, rates):
+        """Turn a joint with ends at a constant rate one way and back, as far as it goes; None where it is too short for a window."""
+        joint = int(np.argmax(np.abs(rates)))
+        lower, upper = self.limits.lower[joint], self.limits.upper[joint]
+        sense = np.sign(rates[joint])
+        start = place.copy()
+        start[joint] = lower + 0.02 * (upper - lower) if sense > 0 else upper - 0.02 * (upper - lower)
+        there = np.stack([rates, -rates])
+        for share in (1.0, 0.6, 0.35, 0.2, 0.1):
+            held = self._longest(start, share * there, joint)
+            if held >= SPIN_TIME[0]:
+                segments = self._spun(start, share * there, min(held, SPIN_TIME[1]))
+                return start, segments, f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f} s and back'
+        return None
+
+    def _longest(self, start, rates, joint):
+        """Return how long a rate can be held before the end comes, s."""
+        trial = self._spun(start, rates, 1.0)
+        time = np.linspace(0.0, sum(segment.duration for segment in trial), 400)
+        reached = np.abs(motion_at(trial, time).position[:, joint] - start[joint]).max()
+        return 1.0 + (0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - reached) / np.abs(rates[0, joint])
+
+    def _spun(self, place, rates, seconds) -> tuple[Segment, ...]:
+        builder = self._builder(place)
+        builder.spin(np.degrees(rates), seconds)
+        return tuple(builder.segments)
+
+    def _swing(self, place, shares, frequency, seconds):
+        """Swing as far as range, speed and acceleration allow."""
+        frequency = np.broadcast_to(frequency, place.shape).astype(float)
+        unit = np.where(shares, 1.0, 0.0)
+        builder = self._builder(np.zeros(len(place)))
+        builder.swing(unit, frequency, seconds)
+        motion = motion_at(tuple(builder.segments), np.linspace(0.0, seconds, int(60 * seconds)))
+        most = [np.maximum(np.abs(values).max(axis=0), 1e-9) for values in (motion.position, motion.rate, motion.acceleration)]
+        lower, upper = reachable(self.limits)
+        room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
+        reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
+                 np.array([LARGEST_SWING[bool(turning)] for turning in self.limits.turns])]
+        amplitude = 0.99 * unit * np.minimum.reduce(reach)
+        away = amplitude * most[0]
+        middle = np.where(self.limits.endless, place, np.clip(place, self.limits.lower + away, self.limits.upper - away))
+        builder = self._builder(middle)
+        builder.swing(amplitude, frequency, seconds)
+        far = ', '.join(f'{name} by {value:.0f}° at {hertz:.2g} Hz' if turning else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
+                        for name, size, value, hertz, turning, on in
+                        zip(self.names, amplitude, np.degrees(amplitude), frequency, self.limits.turns, unit, strict=True) if on)
+        return middle, tuple(builder.segments), f'swing {far} for {seconds:g} s'
+
+    def _rate_words(self, rates: Sequence[float]) -> str:
+        return ' and '.join(f'{name} at {np.degrees(rate):+.0f} deg/s' for name, rate in zip(self.names, rates, strict=True) if rate)

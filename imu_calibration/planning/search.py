@@ -1,0 +1,99 @@
+"""Finding a plan: greedily by gain per second, then by exchange until nothing makes it shorter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from imu_calibration.planning.belief import Belief
+from imu_calibration.planning.situation import Situation
+
+MOST_MOTIONS = 400
+"""Motions of a plan at most."""
+LEAST_GAIN = 2e-3
+"""A motion must lower the sum of logarithms of excess over tolerance by so much to be worth its while."""
+
+
+def shortfall(situation: Situation, covariance: np.ndarray) -> np.ndarray:
+    """Return for each of the covariances of z ``sum_i max(0, ln(sd_i / tolerance_i))``, shape (k,): zero when every tolerance is met."""
+    asked = situation.coordinates.asked
+    variance = np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True)
+    return 0.5 * np.maximum(np.log(np.maximum(variance, 1e-300)), 0.0).sum(axis=1)
+
+
+class Offers:
+    """The gain of every motion from where the joints are."""
+
+    def __init__(self, situation: Situation, belief: Belief, place: int):
+        self.places = situation.repertoire.place_of
+        self.seconds = situation.seconds + situation.way_seconds[place, self.places]
+        size = belief.size
+        self.information = situation.information + situation.way_information[place, self.places]
+        self.possible = self.seconds > 0
+        after = belief.after(self.information, self.seconds)
+        before = shortfall(situation, belief.known[None])[0]
+        self.left = shortfall(situation, after[:, :size, :size])
+        self.gain = np.where(self.possible, before - self.left, 0.0)
+
+    @property
+    def best(self) -> int:
+        """The motion with the largest gain per second."""
+        return int(np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf)))
+
+
+def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
+           progress: Callable[[float], None] | None = None, longest: float = np.inf) -> list[int]:
+    """
+    Return motions that bring every parameter within its tolerance, or as near as it can be brought, each the best per second at its time.
+
+    Parameters
+    ----------
+    situation : Situation
+    start : int
+        Place where the joints are.
+    known : ndarray, optional
+        Information about z beside the prior.
+    first : sequence of int
+        Motions that come first anyway.
+    progress : callable, optional
+        Told the share of the way that is done.
+    longest : float
+        Time at most, s.
+
+    """
+    belief, place, chosen, spent = situation.belief(known), start, [], 0.0
+    beginning = shortfall(situation, belief.known[None])[0]
+    while len(chosen) < MOST_MOTIONS and spent < longest:
+        choice = Offers(situation, belief, place)
+        must = len(chosen) < len(first)
+        number = first[len(chosen)] if must else choice.best
+        if not must and choice.gain[number] < LEAST_GAIN and choice.left[number] > 0:
+            break
+        belief.take(choice.information[number], float(choice.seconds[number]))
+        chosen.append(number)
+        spent += float(choice.seconds[number])
+        place = int(situation.repertoire.place_of[number])
+        left = shortfall(situation, belief.known[None])[0]
+        if progress is not None:
+            progress(1.0 - left / max(beginning, 1e-9))
+        if left == 0.0 and len(chosen) >= len(first) and meets(situation, chosen, start, known=known):
+            break
+    return chosen
+
+
+def meets(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
+    """Return whether motions bring every parameter within its tolerance."""
+    return bool(situation.excess(situation.covariance_after(sequence, start, known)[0]).max() <= 1.0)
+
+
+def exchanged(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
+              fixed: int = 0) -> list[int]:
+    """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
+    goal = np.maximum(situation.excess(situation.covariance_after(sequence, start, known)[0]), 1.0) * (1 + 1e-9)
+    best = list(sequence)
+    for place in range(len(best) - 1, fixed - 1, -1):
+        trial = best[:place] + best[place + 1:]
+        if np.all(situation.excess(situation.covariance_after(trial, start, known)[0]) <= goal):
+            best = trial
+    return best

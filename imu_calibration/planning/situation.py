@@ -1,0 +1,142 @@
+"""What a plan is made for: the chain, the model in tolerances, the noise; and what every motion would say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.planning.belief import Belief, additive_bound, exact_information
+from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.motions import MotionKind, PlannedMotion
+from imu_calibration.planning.relaxation import Relaxation, relax
+from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.planning.windows import PlannedWindow, WindowPredictor
+from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
+
+FIRST_REST = 4.0
+"""Seconds of the first rest at least: what the noise of the IMU is read from."""
+
+
+class Situation:
+    """
+    What a planner chooses from and judges with.
+
+    Parameters
+    ----------
+    repertoire : Repertoire
+    coordinates : Coordinates
+    noise : dict
+        Sensor -> NoiseModel of single samples.
+    rate : float
+        Samples per second.
+
+    """
+
+    def __init__(self, repertoire: Repertoire, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
+        self.repertoire, self.coordinates, self.noise, self.rate = repertoire, coordinates, noise, rate
+        self.predictor = WindowPredictor(repertoire.table, coordinates, noise, rate=rate)
+
+    @property
+    def motions(self) -> list[PlannedMotion]:
+        """Motions to choose from."""
+        return self.repertoire.motions
+
+    @cached_property
+    def seconds(self) -> np.ndarray:
+        """Length of each motion without the way to it, s, shape (k,)."""
+        return np.array([motion.seconds for motion in self.motions])
+
+    @cached_property
+    def windows(self) -> list[list[PlannedWindow]]:
+        """Windows of each motion."""
+        return self.predictor.predict([motion.segments for motion in self.motions])
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """What each motion says about z and the biases as they are then, shape (k, m, m)."""
+        belief = self.belief()
+        return np.array([belief.information_of(windows) for windows in self.windows])
+
+    @cached_property
+    def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
+        """(place, place) -> the move from one to the other."""
+        places, found = self.repertoire.places, {}
+        for a, start in enumerate(places):
+            for b, end in enumerate(places):
+                builder = MotionBuilder(len(start), limits=self.repertoire.limits, start=start)
+                builder.move_to(end)
+                found[a, b] = tuple(builder.segments)
+        return found
+
+    @cached_property
+    def way_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:
+        """(place, place) -> the windows of that move."""
+        return dict(zip(self.ways, self.predictor.predict(list(self.ways.values())), strict=True))
+
+    @cached_property
+    def way_seconds(self) -> np.ndarray:
+        """Length of each move, s, shape (n_places, n_places)."""
+        seconds = np.array([sum(segment.duration for segment in way) for way in self.ways.values()])
+        return seconds.reshape((len(self.repertoire.places),) * 2)
+
+    @cached_property
+    def way_information(self) -> np.ndarray:
+        """What each move says about z and the biases, shape (n_places, n_places, m, m)."""
+        belief, count = self.belief(), len(self.repertoire.places)
+        return np.array([[belief.information_of(self.way_windows[a, b]) for b in range(count)] for a in range(count)])
+
+    def belief(self, known: np.ndarray | None = None) -> Belief:
+        """Return the belief before any motion, with information about z beside the prior."""
+        prior = self.coordinates.prior_information
+        return Belief(prior if known is None else prior + known, self.noise)
+
+    def place_near(self, position: np.ndarray) -> int:
+        """Return the number of the place nearest to a position, endless joints counted without whole turns."""
+        away = self.repertoire.places - position
+        turns = np.where(self.repertoire.limits.endless, np.round(away / (2 * np.pi)), 0.0)
+        return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
+
+    def first_rest(self, place: int) -> int:
+        """Return the rest with which a session begins, at the place where rest is nearest: it shows the noise, and moves little."""
+        rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE and motion.seconds >= FIRST_REST]
+        return min(rests, key=lambda k: (self.way_seconds[place, self.repertoire.place_of[k]], self.seconds[k]))
+
+    def relaxation(self, known: np.ndarray | None = None) -> Relaxation:
+        """Return the lower bound on the time of every plan made of these motions and the moves between their places."""
+        edges = [key for key, windows in self.way_windows.items() if windows]
+        own = np.flatnonzero(self.seconds > 0)
+        everything = [*(self.windows[number] for number in own), *(self.way_windows[key] for key in edges)]
+        empty = np.zeros_like(self.coordinates.prior_information)
+        most = np.array([sum((additive_bound(window, self.noise) for window in windows), empty) for windows in everything])
+        cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
+        prior = self.coordinates.prior_information + (0.0 if known is None else known)
+        return relax(most, cost, prior, asked=self.coordinates.asked)
+
+    def timed(self, sequence: Sequence[int], start: int) -> tuple[list[PlannedWindow], np.ndarray, float]:
+        """Return (windows, their middles, total time) of motions one after the other from a place, with the ways between them."""
+        windows, times, now, place = [], [], 0.0, start
+        for number in sequence:
+            target = int(self.repertoire.place_of[number])
+            way = (self.way_windows[place, target], self.way_seconds[place, target])
+            for part, seconds in (way, (self.windows[number], self.seconds[number])):
+                windows += part
+                times += [now + window.middle for window in part]
+                now += seconds
+            place = target
+        return windows, np.array(times), float(now)
+
+    def covariance_after(self, sequence: Sequence[int], start: int, known: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+        """Return (covariance of z, total time) after motions one after the other from a place."""
+        windows, times, seconds = self.timed(sequence, start)
+        total = self.coordinates.prior_information + (0.0 if known is None else known)
+        if windows:
+            total = total + exact_information(windows, times, self.noise)
+        return np.linalg.inv(total), seconds
+
+    def excess(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the standard deviations of the parameters asked for, in tolerances, shape (p,)."""
+        asked = self.coordinates.asked
+        return np.sqrt(np.einsum('pn,nm,pm->p', asked, covariance, asked))
