@@ -67,6 +67,11 @@ class Transfer:
                              'correct it')
         return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
 
+    def is_close(self, other: 'Transfer | None') -> bool:
+        """Return whether another transfer has the same frames and, within a micrometre and a microradian, the same pose."""
+        return other is not None and self.frame_id == other.frame_id and np.allclose(self.mat_ts, other.mat_ts, rtol=0, atol=1e-6) \
+            and np.allclose(self.arm_t, other.arm_t, rtol=0, atol=1e-6)
+
     @cached_property
     def _quaternion_st(self):
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())

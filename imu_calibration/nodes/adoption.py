@@ -7,11 +7,19 @@ from imu_calibration.calibration import trust
 from imu_calibration.calibration.comparison import moved_beyond_sd
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.measured_noise import with_measured_noise
+from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.compensation.health import CalibrationHealth, HealthOptions
+from imu_calibration.compensation.stop_watch import StopWatch
 from imu_calibration.compensation.stream import requested_transfer
 from imu_calibration.documents import version_of
 from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.message_compensation import LiveCompensation
+from imu_calibration.nodes.static_frames import TOPIC, StaticFrames
+
+
+class Awaited(ImuCalibrationError):
+    """Nothing is wrong, but something else must come first; the text says what."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +51,14 @@ class Adopted:
         return moved_beyond_sd(other.calibration, self.calibration)
 
 
-def adopt(text: str, source: str, settings: CompensatorSettings, before: Adopted | None = None) -> Adopted:
+def adopt(text: str, source: str, settings: CompensatorSettings, frames: StaticFrames, *, before: Adopted | None = None) -> Adopted:
     """
     Return the calibration in a document, ready to take the place of `before`.
 
     Raises
     ------
+    Awaited
+        While the transform into the target frame has not come.
     ImuCalibrationError
         When it is none, something speaks against it, or it is for another sensor; whatever else goes wrong is told in the same way.
 
@@ -58,26 +68,58 @@ def adopt(text: str, source: str, settings: CompensatorSettings, before: Adopted
         if not settings.anyway:
             trust.refuse_untrusted(calibration)
         _require_same_frame(calibration, before)
-        return Adopted(calibration, _prepared(calibration, settings, before), version_of(text), source)
+        return Adopted(calibration, _prepared(calibration, settings, frames, before), version_of(text), source)
     except ImuCalibrationError:
         raise
     except Exception as error:   # whatever a document does, it must not end the node
         raise DocumentError('a calibration must be usable, this one is not: ' + shortened(f'{type(error).__name__}: {error}', 200)) from error
 
 
-def again(adopted: Adopted, settings: CompensatorSettings) -> Adopted:
-    """Return the same calibration under other settings."""
-    return replace(adopted, compensation=_prepared(adopted.calibration, settings, adopted))
+def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
+    """Return the same calibration under other settings or transforms."""
+    return replace(adopted, compensation=_prepared(adopted.calibration, settings, frames, adopted))
 
 
-def _prepared(calibration: Calibration, settings: CompensatorSettings, before: Adopted | None) -> LiveCompensation:
+def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> bool:
+    """Return whether the static transforms now say another pose than the one in force."""
+    found = _transfer(adopted.calibration, settings, frames)
+    return found is not None and not found.is_close(adopted.compensation.transfer)
+
+
+def _transfer(calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames) -> Transfer | None:
+    """Return where the readings are to be moved: by the pose in the parameters, without one by the static transforms."""
+    target, given = settings.target_frame, any(settings.target_xyz) or any(settings.target_rpy)
+    if not target or given or target == calibration.frame_id:
+        return requested_transfer(target, settings.target_xyz, settings.target_rpy)
+    if not calibration.frame_id:
+        raise DocumentError(f"to move readings to '{target}' by {TOPIC} the calibration must name the frame of the sensor, it names none; give "
+                            'target_xyz and target_rpy')
+    pose = frames.pose(target, calibration.frame_id)
+    if pose is None:
+        raise Awaited(frames.waits_for(target, calibration.frame_id))
+    xyz_t, mat_ts = pose
+    return Transfer(target, mat_ts, xyz_t)
+
+
+def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames, before: Adopted | None) -> LiveCompensation:
     if settings.noise_file:
         calibration = with_measured_noise(calibration, files.read_noise(files.user_path(settings.noise_file)))
-    transfer = requested_transfer(settings.target_frame, settings.target_xyz, settings.target_rpy)
-    compensation = LiveCompensation(calibration, transfer, settings.check_frame_id, settings.parameter_covariance, settings.correct_stamps)
+    transfer = _transfer(calibration, settings, frames)
+    compensation = LiveCompensation(calibration, transfer, settings.check_frame_id, settings.parameter_covariance, settings.correct_stamps,
+                                    watch=_watch(calibration, transfer, settings, before))
     if before is not None:
         compensation.prepare(before.compensation)
     return compensation
+
+
+def _watch(calibration: Calibration, transfer: Transfer | None, settings: CompensatorSettings, before: Adopted | None) -> StopWatch:
+    """Return who looks at the stops: the one that does already, where nothing changes for it."""
+    options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
+    if before is not None and before.calibration is calibration and before.compensation.watch.health.options == options:
+        was = before.compensation.transfer
+        if was is transfer or (transfer is not None and transfer.is_close(was)):
+            return before.compensation.watch
+    return StopWatch(CalibrationHealth(calibration, transfer, options))
 
 
 def _require_same_frame(calibration: Calibration, before: Adopted | None) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
+from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, WAITING
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.segmentation.stamping import COUNTED
 
@@ -19,6 +20,7 @@ ANOTHER_RATE = 0.1
 """Relative change of the period from which the stamps are worth another line."""
 COLD = 10.0
 """Seconds without a temperature after which diagnostics say so; drivers send one per second."""
+HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR}
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
@@ -59,7 +61,20 @@ class CompensatorDiagnostics:
         notes += [] if calibration is None else node.adopted.caveats
         level = ERROR if serious else WARN if notes else OK
         message = '; '.join(serious + notes) or f'corrected with calibration {node.adopted.version} ({trust.standing(calibration)})'
-        return [make_status(level, 'compensation', message, self._values(), '' if calibration is None else calibration.frame_id)]
+        frame_id = '' if calibration is None else calibration.frame_id
+        return [*self._health(compensation, frame_id), make_status(level, 'compensation', message, self._values(), frame_id)]
+
+    def _health(self, compensation, frame_id):
+        """Return a status that says whether the calibration still holds, and tell when it no longer does."""
+        if compensation is None:
+            return []
+        state = compensation.watch.health.state
+        warm = [] if compensation.needs_temperature or self._temperature is None else \
+            outside_conditions(compensation.calibration, np.zeros((1, 3)), [self._temperature])
+        level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
+        grave = HEALTH_LEVELS[state.word] == ERROR
+        self._node.complaints.now('health', [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm], [state.message] * grave)
+        return [make_status(level, 'health', '; '.join([state.message, *warm]), {'outcome': state.word, **state.values}, frame_id)]
 
     def _stream(self, compensation):
         """Return what is wrong with the stream of messages, and log where it comes from when it begins."""
@@ -89,7 +104,7 @@ class CompensatorDiagnostics:
             serious.append(node.problem + (f'; calibration {node.adopted.version} stays' if node.adopted else ''))
         if compensation is None:
             what = 'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
-            waiting = f'waiting for a calibration, {what}'
+            waiting = f'waiting for {node.awaited}; {what}' if node.awaited else f'waiting for a calibration, {what}'
             return (serious + [waiting], []) if node.problem else (serious, [waiting])
         notes = []
         for reason, count in self._new_counts(compensation).items():

@@ -19,7 +19,7 @@ from imu_calibration import files
 from imu_calibration.compensation.stream import refuse_corrected
 from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes import relay_loop
-from imu_calibration.nodes.adoption import Adopted, adopt, again
+from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.complaints import ERROR, Complaints
@@ -28,6 +28,7 @@ from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.static_frames import StaticFrames
 
 MARK = '/correction'
 """Behind the name of a corrected topic: a latched topic that says which calibration made it, and that it is corrected."""
@@ -46,7 +47,8 @@ class CompensatorNode(Node):
         self.settings = declare_parameters(self, CompensatorSettings)
         self.adopted: Adopted | None = None
         self._current = self._wanted = self._told = None
-        self.problem, self.corrected_already, self._heard = '', '', ''
+        self.problem, self.corrected_already, self._heard, self.awaited = '', '', '', ''
+        self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
         self.complaints = Complaints(self.get_logger())
         self.by_wait_set = relay_loop.available() and not self.settings.public_executor
@@ -132,7 +134,7 @@ class CompensatorNode(Node):
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
-        self._put_in_force(adopt(text, source, settings, self.adopted))
+        self._put_in_force(adopt(text, source, settings, self._frames, before=self.adopted))
         if self.adopted.says_more_than(self._told):
             self._told = self.adopted
             self.get_logger().info(self.adopted.line())
@@ -141,7 +143,8 @@ class CompensatorNode(Node):
 
     def _put_in_force(self, adopted: Adopted) -> None:
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
-        if adopted.compensation.needs_temperature and self.temperature is None:
+        self.awaited = ''
+        if self.temperature is None and (adopted.compensation.needs_temperature or adopted.calibration.conditions.get('temperature_range_c')):
             self.temperature = MatchedInput(self, Temperature, 'imu/temperature', self._guarded(self._on_temperature), depth=10, raw=False)
             self.inputs.append(self.temperature)
         self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
@@ -156,11 +159,31 @@ class CompensatorNode(Node):
         try:
             action(*arguments)
             return ''
+        except Awaited as awaited:
+            self.awaited = str(awaited)
+            self.get_logger().info(f'waits for {awaited}')
+            self.diagnostics.publish_now()
+            return f'waiting for {awaited}'
         except ImuCalibrationError as error:
             why = error.told(HINTS['compensator_node'])
         self.problem = f'the calibration from {source} was refused: {why}'
         self.diagnostics.publish_now()
         return why
+
+    def _on_transforms(self) -> None:
+        """Go on with what waited for a transform, or follow one that has moved."""
+        if self.awaited:
+            self._retry()
+        elif self.adopted is not None and has_moved(self.adopted, self.settings, self._frames):
+            self._put_in_force(again(self.adopted, self.settings, self._frames))
+            self.get_logger().warning(f"the static transform to '{self.settings.target_frame}' has moved: readings follow it")
+
+    def _retry(self) -> None:
+        if self.settings.takes_topic and self._heard:
+            source = f'topic {self.documents.topic_name}'
+            self._try(source, self._adopt, self._heard, source, self.settings)
+        elif self.settings.calibration_file:
+            self._try("parameter 'calibration_file'", self._load_file, self.settings)
 
     def _on_reload(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.settings.calibration_file:
@@ -178,10 +201,12 @@ class CompensatorNode(Node):
         elif settings.takes_topic and self._heard and (insists or not old.takes_topic):
             self._adopt(self._heard, f'topic {self.documents.topic_name}', settings)
         elif self.adopted is not None:
-            self._put_in_force(again(self.adopted, settings))
+            self._put_in_force(again(self.adopted, settings, self._frames))
         if settings.covariance_rate != old.covariance_rate:
             self._set_refresh(settings.covariance_rate)
         self.settings = settings
+        if self.awaited:
+            self._retry()
 
     def _on_temperature(self, message: Temperature) -> None:
         self.diagnostics.note_temperature(message.temperature)

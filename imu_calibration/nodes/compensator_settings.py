@@ -28,11 +28,12 @@ class CompensatorSettings:
                            symptom='the correction may make the readings worse', live=True)
     passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
                                 symptom='uncorrected messages on the corrected topic', live=True)
-    target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to; empty: the frame of the sensor',
+    target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, or where both are '
+                                'zero by the transforms on /tf_static; empty: the frame of the sensor',
                                 symptom='frame_id is not the one that others expect', live=True, session=True)
-    target_xyz: tuple = setting((0.0, 0.0, 0.0), 'm', 'place of the sensor in the target frame',
+    target_xyz: tuple = setting((0.0, 0.0, 0.0), 'm', 'place of the sensor in the target frame; with target_rpy zero too: from /tf_static',
                                 symptom='specific force is wrong while the body turns, right at rest', live=True, session=True)
-    target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame',
+    target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame; with target_xyz zero too: from /tf_static',
                                 symptom='gravity points along the wrong axis', live=True, session=True)
     check_frame_id: bool = setting(True, '', 'correct only messages that carry the frame_id of the calibration',
                                    symptom='nothing is published, diagnostics name both frames; if false, another sensor may pass unnoticed',
@@ -46,6 +47,14 @@ class CompensatorSettings:
                               live=True, session=True)
     covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; 0: only with a new calibration',
                                      (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
+    gravity: float = setting(0.0, 'm/s^2', 'gravity where the robot drives, for what stops say of the calibration; 0: that of the calibration, within '
+                             'the half per cent by which places differ', (0.0, 20.0), 'a scale that is off by less than half a per cent goes unnoticed',
+                             live=True)
+    update_gyro_bias: bool = setting(False, '', 'take off the bias of the gyroscope that stops show beyond the calibration',
+                                     symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at "rest", that '
+                                     'turn is taken for a bias', live=True)
+    gyro_bias_time: float = setting(600.0, 's', 'in which such an update loses its meaning while the robot does not stop', (10.0, 86400.0),
+                                    'too long: the bias of long ago is believed; too short: it is forgotten between stops', live=True)
     public_executor: bool = setting(False, '', "use rclpy's public executor, four times slower, instead of a wait set of our own",
                                     symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
 

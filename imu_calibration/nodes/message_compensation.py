@@ -29,11 +29,14 @@ class LiveCompensation(SampleCompensation):
         Whether the uncertainty of the calibration enters the covariances.
     correct_stamps : bool
         Whether the stamps are moved back by the calibration's time_offset.
+    watch : StopWatch, optional
+        Looks at the stops, and may take off what they show.
 
     """
 
-    def __init__(self, calibration, transfer=None, check_frame=True, with_parameters=True, correct_stamps=False):
+    def __init__(self, calibration, transfer=None, check_frame=True, with_parameters=True, correct_stamps=False, *, watch=None):
         super().__init__(calibration, transfer, with_parameters)
+        self.watch = watch
         self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
         self._message = ImuStream(transfer and transfer.frame_id, late_ns(calibration, correct_stamps))
         self._taken, self._rate_cov, self._force_cov = -1, b'', b''
@@ -74,6 +77,8 @@ class LiveCompensation(SampleCompensation):
         corrected = self.correct(stamp_ns or sent_ns, *readings)
         if corrected is None:
             return None
+        if self.watch is not None:
+            corrected = self.watch.follow(stamp_ns or sent_ns, readings, corrected)
         if self._odd:
             self.counts['covariance not finite'] += 1
         rate_cov, force_cov = self._marked(readings) if self._can_saturate else (self._rate_cov, self._force_cov)
@@ -104,7 +109,9 @@ class LiveCompensation(SampleCompensation):
         self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT) for cov in given]
         self._absent = any(absent)
         self._odd = any(np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent))
-        found = self.covariances(*(None if missing else cov for cov, missing in zip(given, absent)))
+        found = list(self.covariances(*(None if missing else cov for cov, missing in zip(given, absent))))
+        if self.watch is not None:
+            found[1] = found[1] + self.watch.rate_cov
         self._force_cov, self._rate_cov = (self._message.packed(cov if missing else new) for cov, new, missing in zip(given, found, absent))
 
     def _mixed(self, of_absent, of_present):

@@ -1,0 +1,142 @@
+"""Does the calibration still hold? At every stop the rate must be zero and specific force as long as gravity, within what is known."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from imu_calibration.compensation.bias_update import EARTH_RATE, GyroBiasUpdate
+from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.compensation.fitted import FittedErrors
+from imu_calibration.compensation.stops import Stop
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
+
+LIMIT = 4.0
+"""Standard deviations; three axes pass it by chance once in five thousand calibrations."""
+LEAST = 2.0
+"""Seconds that a stop must last before it says anything."""
+PLACE = 0.005
+"""Share by which gravity differs between places."""
+WORSE = 1.5
+"""Times the error without calibration, from which a calibration does harm rather than too little."""
+
+
+class HealthWord(StrEnum):
+    """Whether a calibration still holds."""
+
+    WAITING = 'waiting'
+    """The robot has not stopped yet."""
+    HOLDS = 'holds'
+    MOVED = 'moved'
+    """Something has moved by more than its standard deviation allows."""
+    FOLLOWED = 'followed'
+    """The bias of the gyroscope has moved, and an update takes it off."""
+    HARMS = 'harms'
+    """At rest, readings are farther from the truth with the calibration than without."""
+
+
+WAITING, HOLDS, MOVED, FOLLOWED, HARMS = HealthWord
+
+
+@dataclass(frozen=True)
+class HealthState:
+    """What the last stop said."""
+
+    word: HealthWord
+    """Whether the calibration holds."""
+    message: str
+    """One line for people."""
+    values: dict = field(default_factory=dict)
+    """Figures by name, with units."""
+
+
+@dataclass(frozen=True)
+class HealthOptions:
+    """What is known of where the robot drives, and what is allowed."""
+
+    gravity: float = 0.0
+    """Local gravity, m/s^2; 0: that of the calibration, within what places differ by."""
+    update: bool = False
+    """Whether the bias of the gyroscope follows the stops."""
+    bias_time: float = 600.0
+    """Seconds in which an update loses its meaning."""
+
+
+class CalibrationHealth:
+    """
+    Judges stops of a stream of corrected readings.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    transfer : Transfer, optional
+        Frame of the corrected readings.
+    options : HealthOptions
+
+    """
+
+    def __init__(self, calibration: FittedErrors, transfer: Transfer | None, options: HealthOptions):
+        self.options, self.n_stops = options, 0
+        sensors = ('accelerometer', 'gyroscope')
+        found = [calibration.noise(sensor) for sensor in sensors]
+        turn = np.eye(3) if transfer is None else transfer.mat_ts
+        self.noise_sd = np.concatenate([np.sqrt(turn**2 @ np.square(sd)) for sd, _ in found])
+        wander = np.repeat([float(np.max(offset))**2 for _, offset in found], 3)
+        parameters = Uncertainty(calibration, transfer).at().parameters
+        self._known = parameters + np.diag(wander)
+        given = options.gravity or calibration.conditions.get('gravity')
+        self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * PLACE if options.gravity else PLACE
+        self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None
+        self._judged: float | None = None
+        self.state = HealthState(WAITING, 'no stop of two seconds yet')
+
+    def judge(self, stop: Stop) -> None:
+        """
+        Take a stop as it grows.
+
+        Parameters
+        ----------
+        stop : Stop
+            Of corrected readings without any update; its `others` are the measured specific force and rate.
+
+        """
+        if stop.seconds < LEAST:
+            return
+        if self._judged != stop.start:
+            self._judged, self.n_stops = stop.start, self.n_stops + 1
+        of_mean = np.square(np.maximum(stop.shake_sd, self.noise_sd)) / stop.n_samples
+        total = self._known + np.diag(of_mean)
+        if self.update is not None:
+            self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
+        along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
+        rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
+        gravity_sd = float(np.sqrt(along @ total[:3, :3] @ along))
+        self.state = self._told(stop, rate_off, gravity_sd)
+
+    def _told(self, stop, rate_off, gravity_sd):
+        rate, length = stop.mean[3:], float(np.linalg.norm(stop.mean[:3]))
+        force_off = max(abs(length - self._gravity) - self._place * self._gravity, 0) / gravity_sd
+        axis = int(np.argmax(rate_off))
+        values = {'stops': self.n_stops, 'seconds of the last stop': f'{stop.seconds:.1f}',
+                  'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate), 'rate at rest [sd]': f'{rate_off.max():.1f}',
+                  'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}', 'gravity off [sd]': f'{force_off:.1f}'}
+        lines = []
+        if rate_off[axis] > LIMIT:
+            lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd')
+        if force_off > LIMIT:
+            lines.append(f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what places differ by')
+        if self.update is not None:
+            bias, variance = self.update.predict(stop.end)
+            values |= {'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
+                       'bias update, sd [deg/s]': ', '.join(f'{value / DEG:.4f}' for value in np.sqrt(variance))}
+        if not lines:
+            return HealthState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {rate_off.max():.1f} and {force_off:.1f} sd', values)
+        measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
+        harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
+            force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
+        if harms:
+            return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again', values)
+        if self.update is not None and force_off <= LIMIT:
+            return HealthState(FOLLOWED, '; '.join(lines) + ': taken off as long as stops show it', values)
+        return HealthState(MOVED, '; '.join(lines) + ': calibrate again', values)

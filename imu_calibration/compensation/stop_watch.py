@@ -1,0 +1,55 @@
+"""The tap in a stream of corrected samples: keeps them for a quarter of a second, looks for stops, and takes off what they showed."""
+
+import numpy as np
+
+from imu_calibration.compensation.health import CalibrationHealth
+from imu_calibration.compensation.stops import BLOCK, StopDetector
+
+SIX = tuple[float, ...]
+
+
+class StopWatch:
+    """
+    Follows a `CalibrationHealth` sample by sample; between two looks it costs an append.
+
+    Parameters
+    ----------
+    health : CalibrationHealth
+
+    """
+
+    def __init__(self, health: CalibrationHealth):
+        self.health, self._detector = health, StopDetector(health.noise_sd)
+        self._waiting: list[tuple[float, ...]] = []
+        self._first_ns = self._look = 0
+        self._offset: tuple[float, float, float] | None = None
+
+    def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
+        """Take a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one less the update of the bias."""
+        since = stamp_ns - self._first_ns
+        self._waiting.append((since, corrected, measured))
+        if since >= self._look or since < 0:
+            self._take(stamp_ns)
+        if self._offset is None:
+            return corrected
+        bx, by, bz = self._offset
+        return (corrected[0] - bx, corrected[1] - by, corrected[2] - bz, *corrected[3:])
+
+    @property
+    def rate_cov(self) -> np.ndarray:
+        """Covariance of what is taken off the rate, shape (3, 3)."""
+        if self._offset is None:
+            return np.zeros((3, 3))
+        return np.diag(self.health.update.predict(self._look * 1e-9)[1])
+
+    def _take(self, stamp_ns):
+        if stamp_ns < self._first_ns or not self._first_ns:   # the beginning, or a clock set back
+            self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
+            return
+        since, corrected, measured = map(np.array, zip(*self._waiting, strict=True))
+        self._waiting, self._look = [], int(since[-1]) + round(1e9 * BLOCK)
+        stop = self._detector.push(np.column_stack([since * 1e-9, corrected[:, 3:], corrected[:, :3], measured[:, 3:], measured[:, :3]]))
+        if stop is not None:
+            self.health.judge(stop)
+        if self.health.update is not None and self.health.update.n_stops:
+            self._offset = tuple(self.health.update.predict(since[-1] * 1e-9)[0].tolist())

@@ -1,0 +1,118 @@
+"""When an IMU on a robot stands still: short blocks whose means stay where they are, in a stream of any length."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BLOCK = 0.25
+"""s; means over it are steady at rest even where a motor shakes the robot."""
+N_BLOCKS = 4
+"""Blocks in a row that must agree, one second."""
+MOST_RATE = 0.1
+"""rad/s; no gyroscope that is worth a calibration reads more at rest, and who turns faster does not stand."""
+MOST_SHAKE = np.array([0.6] * 3 + [0.06] * 3)
+"""Standard deviation within a block, m/s^2 and rad/s: an idling engine stays below, driving over a floor does not."""
+STEADY = np.array([0.05] * 3 + [3e-3] * 3)
+"""How far means of blocks may be apart beyond what noise explains, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2 degrees per second."""
+LONGEST = 30.0
+"""s; a longer stand counts as several, so that a bias that drifts while the robot is parked is followed."""
+TIMES_NOISE = 6.0
+"""Range of four means of noise, in their standard deviations: exceeded once in ten thousand times by three axes of two sensors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A stand of the IMU until now."""
+
+    start: float
+    """When it began, s."""
+    end: float
+    """The end of its last block, s."""
+    n_samples: int
+    """Samples in it."""
+    mean: np.ndarray
+    """Mean of specific force and rate, m/s^2 and rad/s, shape (6,)."""
+    others: np.ndarray
+    """Mean of the further columns that were pushed, shape (k,)."""
+    shake_sd: np.ndarray
+    """Standard deviation of the samples in its blocks, shape (6,)."""
+
+    @property
+    def seconds(self) -> float:
+        """Length, s."""
+        return self.end - self.start
+
+
+class StopDetector:
+    """
+    Takes readings in any pieces; how they are cut does not matter.
+
+    A robot that turns steadily at less than `MOST_RATE` about the vertical looks the same and cannot be told from one that stands.
+
+    Parameters
+    ----------
+    noise_sd : ndarray, shape (6,)
+        Standard deviation of a sample at rest, force then rate.
+
+    """
+
+    def __init__(self, noise_sd: np.ndarray):
+        self._noise_sd = np.asarray(noise_sd, float)
+        self._rest: np.ndarray = np.zeros((0, 1))
+        self._blocks: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
+        self._sums: tuple[float, float, int, np.ndarray, np.ndarray] | None = None
+
+    def push(self, rows: np.ndarray) -> Stop | None:
+        """
+        Take samples; return the stop that goes on at their end, or None while the IMU moves.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n, 7 + k)
+            Time in s, specific force, rate, and columns of which the means are wanted as well.
+
+        """
+        rows = np.concatenate([self._rest, rows]) if len(self._rest) else rows
+        while len(rows) and rows[-1, 0] - rows[0, 0] >= BLOCK:
+            n = max(int(np.searchsorted(rows[:, 0], rows[0, 0] + BLOCK)), 1)
+            self._take(rows[:n])
+            rows = rows[n:]
+        self._rest = rows
+        return self.present()
+
+    def present(self) -> Stop | None:
+        """Return the stop that goes on, or None."""
+        if self._sums is None:
+            return None
+        start, end, n, sums, variances = self._sums
+        return Stop(start, end, n, sums[:6] / n, sums[6:] / n, np.sqrt(variances / n))
+
+    def _take(self, rows):
+        """Take one block, or start anew after a gap."""
+        if self._blocks and rows[0, 0] - self._blocks[-1][1] > BLOCK:
+            self._blocks, self._sums = [], None
+        block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
+        self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
+        if not self._is_still():
+            self._sums = None
+        elif self._sums is not None and block[1] - self._sums[0] > LONGEST:
+            self._sums = None
+            self._add(*block)
+        else:
+            for each in self._blocks if self._sums is None else [block]:
+                self._add(*each)
+
+    def _is_still(self):
+        if len(self._blocks) < N_BLOCKS:
+            return False
+        means = np.array([mean[:6] for _, _, _, mean, _ in self._blocks])
+        shake = np.sqrt(np.max([variance for *_, variance in self._blocks], axis=0))
+        least = min(n for _, _, n, _, _ in self._blocks)
+        apart = np.ptp(means, axis=0)
+        # What shakes the robot is noise for the means as well.
+        allowed = STEADY + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
+        return bool((apart <= allowed).all() and (shake <= MOST_SHAKE + 4 * self._noise_sd).all() and np.linalg.norm(means[-1, 3:]) < MOST_RATE)
+
+    def _add(self, start, end, n, mean, variance):
+        before = self._sums or (start, end, 0, np.zeros_like(mean), np.zeros(6))
+        self._sums = (before[0], end, before[2] + n, before[3] + n * mean, before[4] + n * variance)

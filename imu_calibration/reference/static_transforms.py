@@ -1,0 +1,70 @@
+"""Where frames of one rigid body are to each other: the tree of static transforms, and poses through it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+NAMED = 6
+"""Frames that are named at most in a line for people."""
+
+
+class StaticTransforms:
+    """Transforms from parent to child frames; the newest of each child counts, as in tf2."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
+
+    def add(self, parent: str, child: str, *, xyz: Sequence[float], quaternion: Sequence[float]) -> bool:
+        """
+        Take the pose of a child frame in its parent: translation in m, quaternion (x, y, z, w).
+
+        Returns
+        -------
+        bool
+            Whether it was usable: finite, a quaternion that turns, two frames.
+
+        """
+        xyz, quaternion = np.array(xyz, float), np.array(quaternion, float)
+        if not (np.isfinite(xyz).all() and np.isfinite(quaternion).all() and np.linalg.norm(quaternion) > 0.5) or parent == child:
+            return False
+        self._parents[child] = (parent, xyz, Rotation.from_quat(quaternion).as_matrix())
+        return True
+
+    def pose(self, target: str, source: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """
+        Return the pose of `source` in `target`, or None when nothing connects them.
+
+        Returns
+        -------
+        xyz_t : ndarray
+            Origin of the source in the target frame, m, shape (3,).
+        mat_ts : ndarray
+            Turns source vectors into target vectors, shape (3, 3).
+
+        """
+        ups, downs = self._to_root(source), self._to_root(target)
+        if ups[-1][0] != downs[-1][0]:
+            return None
+        (_, xyz_s, mat_rs), (_, xyz_t, mat_rt) = ups[-1], downs[-1]
+        return mat_rt.T @ (xyz_s - xyz_t), mat_rt.T @ mat_rs
+
+    def why_not(self, target: str, source: str) -> str:
+        """Return what is missing between two frames, for people."""
+        known = {*self._parents, *(parent for parent, _, _ in self._parents.values())}
+        if not known:
+            return 'no static transform has come'
+        absent = [f"'{name}'" for name in (target, source) if name not in known]
+        names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
+        return f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})' if absent else \
+            f"'{target}' and '{source}' are in trees that nothing static connects (roots: {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})"
+
+    def _to_root(self, frame):
+        """Return (ancestor, origin of `frame` in it, matrix from `frame` to it) from the frame itself up to its root; a ring ends where it closes."""
+        steps, seen = [(frame, np.zeros(3), np.eye(3))], {frame}
+        while (step := self._parents.get(steps[-1][0])) is not None and step[0] not in seen:
+            parent, xyz, mat = step
+            _, origin, turned = steps[-1]
+            steps.append((parent, xyz + mat @ origin, mat @ turned))
+            seen.add(parent)
+        return steps

@@ -1,0 +1,87 @@
+"""compensator_node on a robot whose gyroscope warms up: the stops say so on /diagnostics, and an update takes it off where it is allowed."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.constants import DEG
+from msg_adapters.encode import encode_imu, rows
+from msg_adapters.imu_stream import ImuStream
+
+from worlds.drives import drive, plain_calibration
+
+pytest.importorskip('rclpy')
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import Temperature  # noqa: E402
+
+from imu_calibration.nodes import relay_loop  # noqa: E402
+from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
+
+from ros.one_process import OneProcess  # noqa: E402
+
+pytestmark = pytest.mark.dds
+OK, WARN, ERROR = range(3)
+STATUS = 'compensator_node: health'
+WORLD = drive(6, 6, warm_up=(0.0, 0.0, 0.3 * DEG))
+MESSAGES = [bytes(row) for row in rows(encode_imu(WORLD.imu))]
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Nodes in this process."""
+    monkeypatch.setattr(relay_loop, 'available', lambda: False)
+    made = OneProcess(monkeypatch)
+    yield made
+    made.close()
+
+
+def start(bench, tmp_path, conditions=None, **parameters):
+    """A node with a calibration that knows its bias."""
+    calibration = plain_calibration()
+    calibration.conditions.update(conditions or {})
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibration))
+    return bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml'), **parameters})
+
+
+def converted(node, messages=MESSAGES):
+    """(rates, last covariance of the rate) of what the node makes of messages."""
+    stream, out = ImuStream(), [node.convert(message, {'source_timestamp': 1}) for message in messages]
+    stream.open(out[-1])
+    return np.array([stream.read(message)[1][:3] for message in out]), stream.covariances(out[-1])[1]
+
+
+def test_a_drift_is_told_at_the_stops(bench, tmp_path):
+    node = start(bench, tmp_path)
+    bench.until(lambda: STATUS in bench.status, 'a first status')
+    assert bench.lines()[STATUS] == (OK, 'no stop of two seconds yet')
+    converted(node)
+    bench.until(lambda: bench.lines()[STATUS][0] == WARN, 'a warning')
+    assert 'the bias of the gyroscope has moved by +0.2' in bench.lines()[STATUS][1] and bench.heard('has moved by', 'warning') == 1
+    assert bench.figure(STATUS, 'outcome') == 'moved' and bench.figure(STATUS, 'stops') == '9'
+
+
+def test_an_update_is_taken_off_where_it_is_allowed_and_its_uncertainty_is_published(bench, tmp_path):
+    node = start(bench, tmp_path, update_gyro_bias=True)
+    rates, _ = converted(node)
+    left = rates[-3000:] - WORLD.imu.rate_s[-3000:] + WORLD.bias[-3000:]
+    assert np.abs(left).max() < 0.25 * np.abs(WORLD.bias[-3000:]).max()
+    bench.until(lambda: bench.figure(STATUS, 'outcome') == 'followed', 'word of it')
+    assert bench.lines()[STATUS][0] == OK and bench.figure(STATUS, 'bias update [deg/s]').split(', ')[2].startswith('+0.2')
+    node.compensation.refresh()
+    _, with_update = converted(node, MESSAGES[-1:])
+    assert node.compensation.watch.rate_cov[2, 2] > 0
+    watch = node.compensation.watch
+    assert node.set_parameters_atomically([Parameter('parameter_covariance', value=False)]).successful
+    assert node.compensation.watch is watch   # what the stops have shown is not forgotten
+    assert node.set_parameters_atomically([Parameter('update_gyro_bias', value=False)]).successful
+    _, without = converted(node, MESSAGES[-1:])
+    assert with_update[2, 2] > without[2, 2] + 0.9 * watch.rate_cov[2, 2]
+
+
+def test_a_temperature_outside_the_calibration_is_told(bench, tmp_path):
+    start(bench, tmp_path, {'temperature_range_c': [20.0, 30.0]})
+    publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)
+    bench.until(lambda: publisher.get_subscription_count(), 'the node to listen')
+    publisher.publish(Temperature(temperature=50.0))
+    bench.until(lambda: bench.lines().get(STATUS, (0, ''))[0] == WARN, 'a warning')
+    assert 'the temperature runs from 50.0 to 50.0 C, the calibration saw 20.0 to 30.0 C' in bench.lines()[STATUS][1]

@@ -1,0 +1,120 @@
+"""compensator_node with a target frame and no pose: waits for /tf_static, says what it waits for, then corrects as with the pose in parameters."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.samples import ImuSamples
+from msg_adapters.encode import encode_imu
+
+from worlds.compensation_cases import random_calibration
+
+pytest.importorskip('rclpy')
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from imu_calibration.nodes import relay_loop  # noqa: E402
+from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
+from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
+
+from ros.one_process import OneProcess  # noqa: E402
+
+pytestmark = pytest.mark.dds
+OK, WARN, ERROR = range(3)
+STATUS = 'compensator_node: compensation'
+XYZ, RPY = [0.3, -0.1, 0.05], [0.2, -0.4, 1.1]
+MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Nodes in this process; where tf2_msgs has no wheel, another type holds the place of the subscription and `take` gets the messages."""
+    monkeypatch.setattr(relay_loop, 'available', lambda: False)
+    try:
+        import tf2_msgs.msg  # noqa: F401
+    except ImportError:
+        for name in ('tf2_msgs', 'tf2_msgs.msg'):
+            monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        sys.modules['tf2_msgs.msg'].TFMessage = String
+    made = OneProcess(monkeypatch)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A file with a calibration of imu_link."""
+    path = tmp_path / 'good.yaml'
+    path.write_text(calibration_to_text(random_calibration(1)))
+    return str(path)
+
+
+def transforms(*steps):
+    """A message of (parent, child, xyz, quaternion) steps."""
+    made = []
+    for parent, child, xyz, quaternion in steps:
+        one = TransformStamped(child_frame_id=child)
+        one.header.frame_id = parent
+        for name, value in zip('xyz', xyz, strict=True):
+            setattr(one.transform.translation, name, float(value))
+        for name, value in zip('xyzw', quaternion, strict=True):
+            setattr(one.transform.rotation, name, float(value))
+        made.append(one)
+    return SimpleNamespace(transforms=made)
+
+
+POSE = ('base_link', 'imu_link', XYZ, Rotation.from_euler('xyz', RPY).as_quat())
+
+
+def corrected(node):
+    """What the node makes of the messages."""
+    return [node.convert(message, {'source_timestamp': 1}) for message in MESSAGES]
+
+
+def test_it_waits_and_says_for_what(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
+    bench.until(lambda: STATUS in bench.status, 'diagnostics')
+    level, message = bench.lines()[STATUS]
+    assert level == WARN and f"waiting for the transform from 'base_link' to 'imu_link' on {TOPIC}: no static transform has come; nothing is published" in message
+    node._frames.take(transforms(('map', 'odom', [0, 0, 0], [0, 0, 0, 1])))
+    bench.until(lambda: "'base_link' and 'imu_link' are in none that came (frames: map, odom)" in bench.lines()[STATUS][1], 'what came instead')
+    assert node.adopted is None and corrected(node) == [None] * len(MESSAGES)
+    assert bench.heard('waits for the transform') == 2 and node.get_subscriptions_info_by_topic(TOPIC)
+
+
+def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
+    node._frames.take(transforms(POSE))
+    told = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link', 'target_xyz': XYZ, 'target_rpy': RPY})
+    assert node.adopted.line().endswith('taken over') and not node.awaited
+    np.testing.assert_allclose(node.compensation.transfer.mat_ts, told.compensation.transfer.mat_ts, atol=1e-12)
+    np.testing.assert_allclose(node.compensation.transfer.arm_t, XYZ)
+    assert [made[:60] for made in corrected(node)] == [made[:60] for made in corrected(told)] and b'base_link' in corrected(node)[0]
+
+
+def test_a_transform_that_moves_is_followed_and_one_that_is_repeated_changes_nothing(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
+    node._frames.take(transforms(POSE))
+    before = node.compensation
+    node._frames.take(transforms(POSE, ('base_link', 'laser', [1, 0, 0], [0, 0, 0, 1])))
+    assert node.compensation is before
+    node._frames.take(transforms((*POSE[:2], [0.5, 0.0, 0.0], POSE[3])))
+    np.testing.assert_allclose(node.compensation.transfer.arm_t, [0.5, 0.0, 0.0])
+    assert bench.heard('has moved', 'warning') == 1
+
+
+def test_a_pose_in_parameters_ends_the_waiting(bench, place):
+    node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
+    assert node.awaited and node.set_parameters_atomically([Parameter('target_xyz', value=XYZ)]).successful
+    assert node.adopted is not None and not node.awaited
+
+
+def test_without_tf2_msgs_one_sentence_names_it(bench, place, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
+    assert 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy' in node.problem and node.adopted is None
