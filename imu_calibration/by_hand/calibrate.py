@@ -179,7 +179,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
     poses, turns, settings = data.poses, data.turns, options.settings
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
-    default, evidence = _gyroscope_effects(poses, settings)
+    default, evidence = default_gyroscope(poses, settings)
     reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
     sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
                           catalogue=options.catalogue)
@@ -235,7 +235,7 @@ def _check_temperature(model, poses):
         raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or leave it out')
 
 
-def _gyroscope_effects(poses, settings):
+def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:
     """Return (the gyroscope's effects when nothing is asked for, what the poses say about g-sensitivity)."""
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
         raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")

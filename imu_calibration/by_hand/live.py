@@ -218,12 +218,10 @@ class LiveByHand:
         if self.result is None or not poses:
             return None
         mean, hand = ImuSamples.concatenate(poses), self.result.hand
-        true, _ = hand.compensate(mean.force_s, mean.rate_s)
-        bias, matrix = hand.accelerometer
+        time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
+        true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
-        resting_bias, _, sensitivity = hand.gyroscope
-        rate_s = mean.rate_s - resting_bias - gravity_s @ sensitivity.T
-        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ matrix.T, rate_s, mean.frame_id)
+        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ hand.accelerometer[1].T, turning @ hand.gyroscope[1].T, mean.frame_id)
 
     def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""

@@ -52,7 +52,7 @@ class HandResult(CalibrationResult):
         hand, poses = self.hand, self.hand.poses
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
-        corrected_force, corrected_rate = hand.compensate(force, rate)
+        corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
         samples = max(int(poses.stop[-1]), 1)
         time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
         scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]

@@ -7,7 +7,8 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.by_hand.bias_movement import notes
-from imu_calibration.by_hand.calibrate import HandCalibration, gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.by_evidence import EvidentHand, solve_by_evidence
+from imu_calibration.by_hand.calibrate import gather_by_hand
 from imu_calibration.by_hand.equations import TurnData
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.proof import prove_by_hand
@@ -107,16 +108,23 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
 def calibrate_samples_by_hand(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
                               *, stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> HandResult:
     """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a look at the recording."""
+    return evident_result(recording, options, provenance, stills=stills, findings=findings)[0]
+
+
+def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
+                   stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = (),
+                   progress: Callable | None = None) -> tuple[HandResult, EvidentHand]:
+    """Return (the HandResult, what was found on the way to it); arguments as in `calibrate_samples_by_hand`, `progress` of the search."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, asked.settings, temperature_c=recording.temperature_c)
-    hand = solve_by_hand(data, asked)
-    return hand_result(hand, recording, options, provenance=provenance, findings=findings, turns=data.turns)
+    evident = solve_by_evidence(data, asked, as_asked=options.as_asked, progress=progress)
+    return hand_result(evident, recording, options, provenance=provenance, findings=findings, turns=data.turns), evident
 
 
-def hand_result(hand: HandCalibration, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
+def hand_result(evident: EvidentHand, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
                 provenance: dict | None = None, findings: Sequence[CheckFinding] = (), turns: Sequence[TurnData] = ()) -> HandResult:
     """
-    Return a HandCalibration as the result that reports and documents know, proven on its poses and `turns` where these are enough.
+    Return an EvidentHand as the result that reports and documents know, proven on its poses and `turns` where these are enough.
 
     Raises
     ------
@@ -124,13 +132,14 @@ def hand_result(hand: HandCalibration, recording: HandRecording, options: Calibr
         When the specific force at rest is plainly in another unit.
 
     """
+    hand = evident.hand
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     model, gathered = hand.model.model, recording.gathered
     gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     order = [hand.param_names.index(name) for name in model.param_names]
     covariance = hand.covariance[np.ix_(order, order)]
     held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
-    statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings)
+    statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
     calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import gather_by_hand
-from imu_calibration.by_hand.options import hand_options
-from imu_calibration.by_hand.workflow import hand_result, read_by_hand
+from imu_calibration.by_hand.inquiry import too_few_poses
+from imu_calibration.by_hand.workflow import evident_result, read_by_hand
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
+from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
@@ -111,13 +110,16 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     DiagnosisResult
 
     """
-    options = replace(options, accelerometer_model=options.accelerometer_model or BARE, gyroscope_model=options.gyroscope_model or BARE)
     preflight = Preflight(options.gravity)
     recording = read_by_hand(source(), options.nominal, [preflight])
-    data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-    found = diagnose_by_hand(data, hand_options(options), _percent(progress) if progress else None)
-    result = hand_result(found.hand, recording, options, provenance=provenance, findings=preflight.findings, turns=data.turns)
-    return DiagnosisResult(found.diagnosis, result.calibration, result.tolerances, result.needed, result.observations, options)
+    report = _percent(progress) if progress else None
+    result, evident = evident_result(recording, replace(options, as_asked=False), provenance, findings=preflight.findings, progress=report)
+    if evident.found is None:
+        raise too_few_poses(len(evident.hand.poses.start))
+    if report:
+        report(1.0)
+    return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed, result.observations,
+                           replace(options, accelerometer_model=options.accelerometer_model or BARE, gyroscope_model=options.gyroscope_model or BARE))
 
 
 def _percent(advance):

@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Callable, Sequence
 
 import numpy as np
-from scipy.stats import chi2
 
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
@@ -13,6 +12,7 @@ from imu_calibration.estimation.scaled_solve import quadratic, solve_normal
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.evidence import WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.halves import agree
 from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
 from imu_calibration.selection.normal_matrices import normal_matrix
 from imu_calibration.selection.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
@@ -24,8 +24,6 @@ from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
-DISAGREE = 1e-4
-"""Chance that the halves of a recording differ so much on an effect that they both show."""
 BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
@@ -109,21 +107,16 @@ class Attempt:
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether both halves of the recording show an effect alike, as far as they show it.
+        Return whether both halves of the recording show an effect alike (`halves.agree`).
 
-        They disagree when what they say differs by more than chance and by more than half of what the whole says. Effects that are smooth in
-        time are different in the halves by nature.
+        Effects that are smooth in time are different in the halves by nature.
         """
         if question.effect.smooth:
             return True
         used = self.search.used(chosen)
         at = [used.index(k) for k in question.parameters]
         fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean) for normal in self._halves]
-        whole, covariance = self.evidence.fit(used)
-        difference = (fits[0][0] - fits[1][0])[at]
-        apart = _squared(difference, sum(fit[1] for fit in fits)[np.ix_(at, at)])
-        known = np.linalg.inv(covariance[np.ix_(at, at)])
-        return bool(chi2.sf(apart, len(at)) > DISAGREE or difference @ known @ difference < 0.25 * whole[at] @ known @ whole[at])
+        return agree(fits, self.evidence.fit(used), at)
 
     @cached_property
     def _halves(self):
@@ -180,11 +173,6 @@ class Attempt:
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
-
-
-def _squared(difference, covariance):
-    """Return a difference in squared standard deviations."""
-    return float(difference @ np.linalg.solve(covariance, difference))
 
 
 def encoder_step(windows: Sequence[Window]) -> float:

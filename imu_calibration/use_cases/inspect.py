@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
 
+from imu_calibration.by_hand.by_evidence import EvidentHand
 from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.result import HandResult
@@ -90,7 +91,7 @@ def _by_hand(source, options, preflight):
             return None
         asked = hand_options(options)
         data = gather_by_hand(recording.imu, settings=asked.settings, temperature_c=recording.temperature_c)
-        return hand_result(solve_by_hand(data, asked), recording, options, findings=preflight.findings)
+        return hand_result(EvidentHand(solve_by_hand(data, asked)), recording, options, findings=preflight.findings)
     except ImuCalibrationError as error:
         return error
 

@@ -2,5 +2,5 @@
 What the model of a recording by hand gets wrong.
 
 In: poses, turns and a calibration by hand. Out: the same `Diagnosis` as on a table.
-Read `diagnose` first.
+Read `by_hand.inquiry` first, then `diagnose`.
 """

@@ -1,33 +1,18 @@
 """What the model of a calibration by hand gets wrong: the same search, on poses and turns instead of windows on a table."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
-
-from imu_calibration.by_hand.calibrate import HandCalibration, HandData, solve_by_hand
-from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.by_hand.model import possible_by_hand
+from imu_calibration.by_hand.by_evidence import extended_by_hand
+from imu_calibration.by_hand.calibrate import HandCalibration, HandData
+from imu_calibration.by_hand.inquiry import HandInvestigation, investigate_by_hand
 from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.diagnosis.by_hand.evidence import HandEvidence
 from imu_calibration.diagnosis.by_hand.result import as_solution, rest_of, traces_of
-from imu_calibration.diagnosis.by_hand.rows import build_rows
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import candidates_of
 from imu_calibration.diagnosis.separating_motion import motions_of
-from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.named_models import BASE
-from imu_calibration.errors import NotObservableError
-from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
-from imu_calibration.selection.gain import Gain, reduction_interval
-from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
-from imu_calibration.selection.search import Search
-
-OUTER = 12
-"""Times that the whole search is repeated without some of the poses, to measure the gain on them."""
-SPARE = 3
-"""Least number of poses beyond the nine parameters of the accelerometer."""
+from imu_calibration.effects.base import SENSORS
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,199 +25,34 @@ class HandDiagnosis:
     """The extended calibration; the baseline's when nothing was found."""
 
 
-class _Inquiry:
-    """Rows of a recording, the evidence on some of its poses, and the search."""
-
-    def __init__(self, blocks, space, questions, baseline):
-        smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
-        self.blocks, self.space, self.questions = blocks, space, questions
-        self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
-        self.search = Search(self.evidence, baseline, questions)
-
-    def without(self, poses):
-        """Return the same inquiry without some poses."""
-        blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
-        return _Inquiry([b for b in blocks if b.known.size > 3], self.space, self.questions, self.search.baseline)
-
-    def named(self):
-        """Return the findings: chosen, and each explaining most of what was unexplained."""
-        return pruned(self.search.run(), self.share)
-
-    def share(self, chosen, question):
-        """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
-        after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
-        removed, rest = 0.0, 0.0
-        for block, new, old in zip(self.blocks, after, before):
-            if block.sensor == question.sensor:
-                removed += np.sum((old**2 - new**2) / block.floor)
-                excess = np.sum(new**2 / block.floor) - new.size
-                rest += excess if excess > SIGNIFICANT_REST * np.sqrt(2 * new.size) else 0.0
-        return removed / (removed + rest) if removed > 0 else 0.0
-
-
 def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandDiagnosis:
     """
-    Say what a calibration by hand gets wrong, and why.
-
-    Every pose is held out in turn. The accelerometer is judged by the norm of gravity, the gyroscope by the rates at rest and by the
-    directions of gravity before and after each turn. Poses are few, so that variances are estimated along (F tests, losses
-    ``n log(mean square)``), with a bias process beside the scatter from pose to pose.
-
-    Parameters
-    ----------
-    data : HandData
-        From `gather_by_hand`.
-    options : HandOptions
-        Reference, tolerances, and the effects of the baseline: bias and matrix where none are asked for.
-    progress : callable, optional
-        Called with the share that is done.
+    Say what a calibration by hand gets wrong, and why; arguments and errors as in `investigate_by_hand`.
 
     Returns
     -------
     HandDiagnosis
 
-    Raises
-    ------
-    NotObservableError
-        With too few poses to hold any out.
-
     """
-    report = progress or (lambda share: None)
-    poses = data.poses
-    if len(poses.start) < 9 + SPARE:
-        raise NotObservableError(f'a diagnosis by hand needs at least {9 + SPARE} poses held still, so that some can be held out, '
-                                 f'{len(poses.start)} were found; hold the IMU still in more attitudes')
-    options = replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE)
-    baseline = solve_by_hand(data, options)
-    follows_gravity = shown(g_sensitivity_evidence(poses))
-    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
-    constants = time_constants(float(poses.time[-1]))
-    blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
-    report(0.1)
-    base = tuple(np.flatnonzero(~_held(baseline)))
-    questions = _questions(effects, blocks, space, base, not_testable)
-    inquiry = _Inquiry(blocks, space, questions, base)
-    named = inquiry.named()
-    report(0.3)
-    held_out = _held_out(inquiry, report) if named else None
-    while named:  # what does not predict poses that had no part in choosing it is no finding
-        gains = [_gain(inquiry, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
-        poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
-        if not poor:
-            break
-        named.remove(poor[-1])
-    hand = _extended(baseline, data, named, options, constants, inquiry)
-    result = _assembled(baseline, hand, inquiry, named, held_out, not_testable)
-    report(1.0)
+    found = investigate_by_hand(data, options, progress)
+    hand = extended_by_hand(data, found, options)
+    result = told_by_hand(found, hand)
+    if progress:
+        progress(1.0)
     return HandDiagnosis(result, hand)
 
 
-def _held(hand):
-    return np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == 'held' for name in hand.model.param_names])
-
-
-def _why_not(effect, poses, turns, follows_gravity):
-    if effect.role is Role.LIMIT:
-        return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
-    if not possible_by_hand(effect):
-        return 'gravity in poses and the turns between them do not show it', 'record on a table'
-    if 'temperature' in effect.needs and poses.temperature_c is None:
-        return 'no temperature was recorded', 'record imu/temperature'
-    if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
-        return f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only', 'record while the sensor warms up by at least some kelvins'
-    if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
-        return ('beside a bias that moves in time the rates at rest do not show it', 'hold each attitude again later, in another order')
-    moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
-    if moving and len([t for t in turns if t.rotation is None]) < 6:
-        return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
-    return None
-
-
-def _questions(effects, blocks, space, base, not_testable):
-    """Return the questions; an effect that the baseline imitates in these poses is moved to those not testable."""
-    by_name, asked = {e.name: e for e in effects}, []
-    probe = HandEvidence(blocks, space, (), baseline=base)
-    for label in space.names:
-        part, name = space.parts[label], label.split('@')[0]
-        parameters = tuple(range(part.start, part.stop))
-        rank = probe.rank(parameters, base)
-        if rank:
-            asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
-    lacking = sorted(by_name.keys() - {q.name for q in asked})
-    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it',
-                      'needs': 'more poses, in steps of 30 degrees about each axis'}
-                     for name in lacking]
-    return asked
-
-
-def _held_out(inquiry, report):
-    """Return fold -> (poses, what was named without them, evidence without them): the whole search, repeated."""
-    poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
-    found, times = [], min(OUTER, len(poses))
-    for number in range(times):
-        out = poses[number::times]
-        smaller = inquiry.without(out)
-        found.append((out, smaller.named(), smaller))
-        report(0.3 + 0.6 * (number + 1) / times)
-    return found
-
-
-def _predicted(inquiry, held_out, allowed):
-    """Return residuals per block of poses that had no part in the fit nor in the choice; only effects called `allowed` are used."""
-    found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
-    for out, named, smaller in held_out:
-        chosen = [q for q in named if q.name in allowed]
-        used = smaller.search.used(chosen)
-        values = smaller.evidence.fit(used)[0]
-        for residual, block in zip(found, inquiry.blocks):
-            rows = np.isin(block.pose, out)
-            residual[rows] = block.rows[rows, :, -1] - block.rows[rows][:, :, list(used)] @ values
-    return found
-
-
-def _gain(inquiry, held_out, before, after, sensor):
-    """Return the Gain of one choice over another on poses that took part neither in the fit nor in the choice."""
-    pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
-    inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
-    best = None
-    for k, block in enumerate(inquiry.blocks):
-        if block.sensor != sensor:
-            continue
-        fall = np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300)
-        if best is None or fall < best[0]:
-            best = (fall, k)
-    block = inquiry.blocks[best[1]]
-    poses = np.unique(block.pose)
-    sums = [(np.array([np.sum(p[best[1]][block.pose == pose]**2) for pose in poses]),
-             np.array([block.known[block.pose == pose].size for pose in poses], float)) for p in pair]
-    rms = [float(np.sqrt(squares.sum() / number.sum())) for squares, number in sums]
-    return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))
-
-
-def _extended(baseline, data, named, options, constants, inquiry):
-    if not named:
-        return baseline
-    names = {s: getattr(baseline.model.model, s) + tuple(q.name for q in named if q.sensor == s) for s in SENSORS}
-    point = {}
-    for question in named:
-        if '@' in question.label:
-            used = inquiry.search.used(named)
-            values = inquiry.evidence.fit(used)[0]
-            amplitude = [values[used.index(k)] for k in question.parameters]
-            point[question.name] = np.array([*amplitude, constants[int(question.label.split('@')[1])]])
-    return solve_by_hand(data, replace(options, **names), point)
-
-
-def _assembled(baseline, hand, inquiry, named, held_out, not_testable):
-    before, after = as_solution(baseline), as_solution(hand)
+def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
+    """Return what an investigation found as a Diagnosis; `hand` is a calibration with everything that was found."""
+    inquiry, named = found.inquiry, list(found.named)
+    before, after = as_solution(found.baseline), as_solution(hand)
 
     def gain_of(place):
-        return _gain(inquiry, held_out, named[:place], named[:place + 1], named[place].sensor)
+        return found.gain(named[:place], named[:place + 1], named[place].sensor)
 
     findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
                      for place in range(len(named)))
-    gain = _gain(inquiry, held_out, [], named, named[0].sensor) if named else None
-    count = len(baseline.poses.start)
-    return Diagnosis(findings, {s: rest_of(baseline, inquiry, named, sensor=s) for s in SENSORS}, candidates_of(inquiry.search, named),
-                     tuple(not_testable), before, after,
-                     gain, traces_of(baseline, hand), count, count if named else 0)
+    gain = found.gain([], named, named[0].sensor) if named else None
+    count = len(found.baseline.poses.start)
+    return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS}, candidates_of(inquiry.search, named),
+                     tuple(found.not_testable), before, after, gain, traces_of(found.baseline, hand), count, count if named else 0)

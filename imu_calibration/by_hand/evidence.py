@@ -6,7 +6,7 @@ from typing import Sequence
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from imu_calibration.diagnosis.by_hand.rows import Block, HandSpace
+from imu_calibration.by_hand.effect_rows import Block, HandSpace
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.whitening import Whitening

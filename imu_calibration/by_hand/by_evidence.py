@@ -1,0 +1,77 @@
+"""One mind for `calibrate` and `diagnose` by hand: what the poses and turns demand is in the model."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import HandCalibration, HandData, default_gyroscope, solve_by_hand
+from imu_calibration.by_hand.inquiry import POSES_LEAST, HandInvestigation, investigate_by_hand
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.calibration.model_changes import ModelChanges
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.named_models import BASE
+
+
+@dataclass(frozen=True, eq=False)
+class EvidentHand:
+    """A calibration by hand with what was found on the way to its model."""
+
+    hand: HandCalibration
+    """The calibration."""
+    found: HandInvestigation | None = None
+    """What was asked and answered; None with too few poses, or when nothing was asked."""
+    changes: ModelChanges = ModelChanges()
+    """What the recording did to the model that was asked for."""
+
+
+def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False,
+                      progress: Callable | None = None) -> EvidentHand:
+    """
+    Estimate from poses and turns, with what they demand on top of the model that is asked for (`investigate_by_hand`).
+
+    Parameters
+    ----------
+    data : HandData
+    options : HandOptions
+    as_asked : bool
+        Whether the model is exactly what was asked for.
+    progress : callable, optional
+        Called with the share of the search that is done.
+
+    Raises
+    ------
+    NotObservableError
+        As `solve_by_hand`.
+
+    """
+    if as_asked or len(data.poses.start) < POSES_LEAST:
+        return EvidentHand(solve_by_hand(data, options))
+    found = investigate_by_hand(data, options, progress)
+    asked, names = _asked(data, options), found.names
+    added = tuple(q.name for q in found.named if q.name not in asked[q.sensor])
+    changes = ModelChanges(added, tuple(question.name for question in found.denied))
+    base = found.baseline.model.model
+    if not found.denied and all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS):
+        return EvidentHand(found.baseline, found, changes)   # it is solved already
+    return EvidentHand(extended_by_hand(data, found, options), found, changes)
+
+
+def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
+    """Return the calibration with the model that is asked for and what was found; choices on which the halves disagree widen its covariance."""
+    asked, names = _asked(data, options), found.names
+    hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
+    covariance = hand.covariance.copy()
+    for question in found.denied:
+        moved = found.moved_by(question)
+        shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
+        covariance += np.outer(shift, shift)
+    return replace(hand, covariance=covariance)
+
+
+def _asked(data, options):
+    return {'accelerometer': options.accelerometer or BASE, 'gyroscope': options.gyroscope or default_gyroscope(data.poses, options.settings)[0]}
+
+
+def _joined(asked, found):
+    return asked + tuple(name for name in found if name not in asked)

@@ -1,0 +1,266 @@
+"""What a recording by hand says of every effect: the search of a diagnosis, on poses and turns instead of windows on a table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import HandCalibration, HandData, solve_by_hand
+from imu_calibration.by_hand.effect_rows import Block, HandSpace, build_rows
+from imu_calibration.by_hand.evidence import HandEvidence
+from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
+from imu_calibration.by_hand.model import possible_by_hand
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.calibration.status import HELD
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.named_models import BASE
+from imu_calibration.errors import NotObservableError
+from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
+from imu_calibration.selection.gain import Gain, reduction_interval
+from imu_calibration.selection.halves import agree
+from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
+from imu_calibration.selection.search import Search
+
+OUTER = 12
+"""Times that the whole search is repeated without some of the poses, to measure the gain on them."""
+SPARE = 3
+"""Least number of poses beyond the nine parameters of the accelerometer."""
+POSES_LEAST = 9 + SPARE
+"""Fewer poses leave none to hold out."""
+
+
+class Inquiry:
+    """Rows of a recording, the evidence on some of its poses, and the search."""
+
+    def __init__(self, blocks: Sequence[Block], space: HandSpace, questions: Sequence[Question], *, baseline: Sequence[int]):
+        smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
+        self.blocks, self.space, self.questions = blocks, space, questions
+        self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
+        self.search = Search(self.evidence, baseline, questions)
+
+    def without(self, poses: np.ndarray) -> 'Inquiry':
+        """Return the same inquiry without some poses."""
+        return Inquiry(self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline)
+
+    def _blocks_without(self, poses):
+        blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
+        return [block for block in blocks if block.known.size > 3]
+
+    def named(self) -> list[Question]:
+        """Return the findings: chosen, and each explaining most of what was unexplained."""
+        return list(pruned(self.search.run(), self.share))
+
+    def share(self, chosen: Sequence[Question], question: Question) -> float:
+        """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
+        after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
+        removed, rest = 0.0, 0.0
+        for block, new, old in zip(self.blocks, after, before):
+            if block.sensor == question.sensor:
+                removed += np.sum((old**2 - new**2) / block.floor)
+                excess = np.sum(new**2 / block.floor) - new.size
+                rest += excess if excess > SIGNIFICANT_REST * np.sqrt(2 * new.size) else 0.0
+        return removed / (removed + rest) if removed > 0 else 0.0
+
+    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
+        """Return whether the poses before and after the middle show an effect alike (`halves.agree`); smooth in time they differ by nature."""
+        if question.effect.smooth:
+            return True
+        used = self.search.used(chosen)
+        poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
+        # what the choice explains is no noise here, so that it is part of the baseline
+        first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
+                                for out in (*np.array_split(poses, 2), ()))
+        return agree((first, second), whole, [used.index(k) for k in question.parameters])
+
+
+@dataclass(frozen=True, eq=False)
+class HandInvestigation:
+    """What a search found, before it is put into words."""
+
+    baseline: HandCalibration
+    """The calibration that was asked what it lacks."""
+    inquiry: Inquiry
+    """Rows, evidence and search."""
+    named: Sequence[Question]
+    """Questions that became findings, in the order found."""
+    held_out: Sequence
+    """(poses, what was named without them, the inquiry without them), ...: the whole search, repeated."""
+    not_testable: list[dict]
+    """Effects that could not be asked about."""
+    constants: np.ndarray
+    """Time constants at which warm-ups were asked about, s."""
+    denied: Sequence[Question] = field(default_factory=list)
+    """Questions that would have become findings, but the halves of the recording disagree on them."""
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Sensor -> effects that became findings."""
+        return {sensor: tuple(q.name for q in self.named if q.sensor == sensor) for sensor in SENSORS}
+
+    def point(self) -> dict[str, np.ndarray]:
+        """Return effect -> values at which its columns are first taken, of the warm-ups that became findings."""
+        used = self.inquiry.search.used(self.named)
+        values, point = self.inquiry.evidence.fit(used)[0], {}
+        for question in self.named:
+            if '@' in question.label:
+                amplitude = [values[used.index(k)] for k in question.parameters]
+                point[question.name] = np.array([*amplitude, self.constants[int(question.label.split('@')[1])]])
+        return point
+
+    def moved_by(self, question: Question) -> dict[str, float]:
+        """Return parameter -> by how much an effect moves it, of the baseline, when it joins the findings."""
+        search, evidence = self.inquiry.search, self.inquiry.evidence
+        smaller, larger = search.used(self.named), search.used([*self.named, question])
+        moved = evidence.fit(larger)[0][:len(smaller)] - evidence.fit(smaller)[0]
+        names = self.baseline.model.param_names
+        return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
+
+    def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
+        """Return the Gain of one choice over another on poses that took part neither in the fit nor in the choice."""
+        return _gain(self.inquiry, self.held_out, before, after, sensor)
+
+
+def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandInvestigation:
+    """
+    Ask every effect that can be seen by hand on poses that are held out.
+
+    Every pose is held out in turn. The accelerometer is judged by the norm of gravity, the gyroscope by the rates at rest and by the
+    directions of gravity before and after each turn. Poses are few, so that variances are estimated along (F tests, losses
+    ``n log(mean square)``), with a bias process beside the scatter from pose to pose.
+
+    Parameters
+    ----------
+    data : HandData
+        From `gather_by_hand`.
+    options : HandOptions
+        Reference, tolerances, and the effects of the baseline: bias and matrix where none are asked for.
+    progress : callable, optional
+        Called with the share that is done.
+
+    Raises
+    ------
+    NotObservableError
+        With too few poses to hold any out.
+
+    """
+    report, poses = progress or (lambda share: None), data.poses
+    if len(poses.start) < POSES_LEAST:
+        raise too_few_poses(len(poses.start))
+    baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
+    follows_gravity = shown(g_sensitivity_evidence(poses))
+    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
+    constants = time_constants(float(poses.time[-1]))
+    blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
+    report(0.1)
+    base = tuple(np.flatnonzero(~_held(baseline)))
+    questions = _questions(effects, blocks, space, base, not_testable)
+    inquiry = Inquiry(blocks, space, questions, baseline=base)
+    named = inquiry.named()
+    report(0.3)
+    held_out = _held_out(inquiry, report) if named else []
+    named = _that_predict(inquiry, held_out, named)
+    denied = [question for question in named if not inquiry.agrees_in_halves(named, question)]
+    if denied:
+        named = _that_predict(inquiry, held_out, [question for question in named if question not in denied])
+    return HandInvestigation(baseline, inquiry, named, held_out, not_testable, constants, denied)
+
+
+def too_few_poses(count: int) -> NotObservableError:
+    """Return the error of a recording with so few poses that none can be held out."""
+    return NotObservableError(f'a diagnosis by hand needs at least {POSES_LEAST} poses held still, so that some can be held out, '
+                              f'{count} were found; hold the IMU still in more attitudes')
+
+
+def _that_predict(inquiry, held_out, named):
+    """Return the findings that predict poses which had no part in choosing them."""
+    named = list(named)
+    while named:
+        gains = [_gain(inquiry, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
+        poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
+        if not poor:
+            break
+        named.remove(poor[-1])
+    return named
+
+
+def _held(hand):
+    known = dict(zip(hand.param_names, hand.statuses))
+    return np.array([known.get(name) == HELD for name in hand.model.param_names])
+
+
+def _why_not(effect, poses, turns, follows_gravity):
+    if effect.role is Role.LIMIT:
+        return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
+    if not possible_by_hand(effect):
+        return 'gravity in poses and the turns between them do not show it', 'record on a table'
+    if 'temperature' in effect.needs and poses.temperature_c is None:
+        return 'no temperature was recorded', 'record imu/temperature'
+    if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
+        return f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only', 'record while the sensor warms up by at least some kelvins'
+    if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
+        return ('beside a bias that moves in time the rates at rest do not show it', 'hold each attitude again later, in another order')
+    moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
+    if moving and len([t for t in turns if t.rotation is None]) < 6:
+        return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
+    return None
+
+
+def _questions(effects, blocks, space, base, not_testable):
+    """Return the questions; an effect that the baseline imitates in these poses is moved to those not testable."""
+    by_name, asked = {e.name: e for e in effects}, []
+    probe = HandEvidence(blocks, space, (), baseline=base)
+    for label in space.names:
+        part, name = space.parts[label], label.split('@')[0]
+        parameters = tuple(range(part.start, part.stop))
+        rank = probe.rank(parameters, base)
+        if rank:
+            asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
+    lacking = sorted(by_name.keys() - {q.name for q in asked})
+    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it',
+                      'needs': 'more poses, in steps of 30 degrees about each axis'}
+                     for name in lacking]
+    return asked
+
+
+def _held_out(inquiry, report):
+    """Return fold -> (poses, what was named without them, evidence without them): the whole search, repeated."""
+    poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
+    found, times = [], min(OUTER, len(poses))
+    for number in range(times):
+        out = poses[number::times]
+        smaller = inquiry.without(out)
+        found.append((out, smaller.named(), smaller))
+        report(0.3 + 0.6 * (number + 1) / times)
+    return found
+
+
+def _predicted(inquiry, held_out, allowed):
+    """Return residuals per block of poses that had no part in the fit nor in the choice; only effects called `allowed` are used."""
+    found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
+    for out, named, smaller in held_out:
+        chosen = [q for q in named if q.name in allowed]
+        used = smaller.search.used(chosen)
+        values = smaller.evidence.fit(used)[0]
+        for residual, block in zip(found, inquiry.blocks):
+            rows = np.isin(block.pose, out)
+            residual[rows] = block.rows[rows, :, -1] - block.rows[rows][:, :, list(used)] @ values
+    return found
+
+
+def _gain(inquiry, held_out, before, after, sensor):
+    """Return the Gain of one choice over another on poses that took part neither in the fit nor in the choice."""
+    pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
+    inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
+    best = None
+    for k, block in enumerate(inquiry.blocks):
+        if block.sensor != sensor:
+            continue
+        fall = np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300)
+        if best is None or fall < best[0]:
+            best = (fall, k)
+    block = inquiry.blocks[best[1]]
+    poses = np.unique(block.pose)
+    sums = [(np.array([np.sum(p[best[1]][block.pose == pose]**2) for pose in poses]),
+             np.array([block.known[block.pose == pose].size for pose in poses], float)) for p in pair]
+    rms = [float(np.sqrt(squares.sum() / number.sum())) for squares, number in sums]
+    return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))

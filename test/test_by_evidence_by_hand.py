@@ -1,0 +1,95 @@
+"""By hand too, what the recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else."""
+
+import numpy as np
+import pytest
+from test_diagnosis_by_hand import HIDDEN, NOTHING
+from test_live_by_hand import assert_same, make_live, run
+
+import imu_calibration as imu
+from imu_calibration.by_hand.by_evidence import solve_by_evidence
+from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.samples import SampleBlock
+
+from worlds.hand_sessions import GRAVITY, PARAM_NAMES, simulate
+from worlds.physics_hand import hold_and_turn, warmed_up
+
+QUADRATIC = 'gyro_quadratic'
+ROWS = slice(12, 21)
+
+
+@pytest.fixture(scope='module')
+def bent():
+    """A session with gyroscopes whose output bends with the rate, and the true parameters."""
+    samples, _, truth = simulate(31, n_poses=36, spoil=HIDDEN[QUADRATIC])
+    return samples, truth
+
+
+@pytest.fixture(scope='module')
+def asked(bent):
+    return imu.calibrate(SampleBlock(bent[0]), gravity=GRAVITY)
+
+
+def rows_missed(calibration, truth):
+    """Errors of the gyroscope's matrix in reported standard deviations."""
+    return [abs(calibration.values[k] - true) / calibration.sd[k] for name, true in zip(PARAM_NAMES[ROWS], truth[ROWS])
+            for k in [calibration.param_names.index(name)]]
+
+
+def test_what_the_turns_demand_is_taken_in_and_said_in_one_line(bent, asked):
+    assert asked.calibration.statistics['added'] == [QUADRATIC]
+    assert len([line for line in asked.verdict.lines() if f'added to the model, because the recording demands it: {QUADRATIC} (' in line]) == 1
+    assert max(rows_missed(asked.calibration, bent[1])) < 4.5
+    plain = imu.calibrate(SampleBlock(bent[0]), gravity=GRAVITY, model_as_asked=True).calibration
+    assert 'added' not in plain.statistics and not any(QUADRATIC in name for name in plain.param_names)
+
+
+def test_diagnose_hands_over_what_calibrate_does(bent, asked):
+    found = imu.diagnose(SampleBlock(bent[0]), gravity=GRAVITY)
+    assert found.calibration.param_names == asked.calibration.param_names
+    np.testing.assert_array_equal(found.calibration.values, asked.calibration.values)
+    np.testing.assert_array_equal(found.calibration.sd, asked.calibration.sd)
+    name, (value, sd, _) = next(iter(found.findings[0].parameters.items()))
+    place = asked.calibration.param_names.index(name)
+    assert (value, sd) == (asked.calibration.values[place], asked.calibration.sd[place])
+
+
+def test_live_it_is_in_the_model_as_well(bent, asked):
+    live = make_live()
+    run(live, bent[0])
+    result = live.solve(pending=True)
+    assert result.calibration.statistics['added'] == [QUADRATIC]
+    assert_same(result, asked.result)
+    residual = live.residuals(run(make_live(), bent[0]))
+    assert np.abs(residual.rate_s).max() < 5e-3   # noise of a mean over two seconds, 2e-4, and the bias of each pose
+
+
+def test_what_only_one_half_shows_is_left_out_and_widens():
+    """What goes with the square of the rate grows threefold after the middle: something has changed, and it is no property of the sensor."""
+    def spoil(force, rate, time, pose):
+        return NOTHING, HIDDEN[QUADRATIC](force, rate, time, pose)[1] * (1 + 2 * (pose > 17)[:, None])
+    samples, ranges, _ = simulate(31, n_poses=36, spoil=spoil)
+    data, options = gather_by_hand(samples, ranges), HandOptions(GRAVITY)
+    evident = solve_by_evidence(data, options)
+    assert evident.changes.denied == (QUADRATIC,) and evident.changes.added == ()
+    plain = solve_by_hand(data, options)
+    np.testing.assert_array_equal(evident.hand.values, plain.values)
+    grown = evident.hand.sd[ROWS] / plain.sd[ROWS]
+    assert grown.min() >= 1.0 and grown.max() > 1.2
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_warm_up_is_not_sold_as_an_answer_to_gravity(seed):
+    samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0, still=3.0)
+    warm, _ = warmed_up(samples, seed, rate=0.01, time_constant=60.0)
+    names = solve_by_evidence(gather_by_hand(warm, ranges), HandOptions(GRAVITY)).hand.param_names
+    assert not any('gyro_g_sensitivity' in name for name in names)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_nothing_is_added_where_nothing_is_hidden(seed):
+    samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
+    data = gather_by_hand(samples, ranges)
+    evident = solve_by_evidence(data, HandOptions(GRAVITY))
+    assert evident.changes.to_mapping() == {}
+    np.testing.assert_array_equal(evident.hand.values, solve_by_hand(data, HandOptions(GRAVITY)).values)
