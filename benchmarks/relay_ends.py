@@ -86,7 +86,7 @@ def sink(topic):
         time.sleep(0.05)
     print('ready', flush=True)
     try:
-        relay_loop.relay(node, subscription, nowhere, record)
+        relay_loop.relay(node, subscription, nowhere, convert=record)
     except _Ended:
         pass
     late = np.array(late) * 1e-3

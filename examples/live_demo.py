@@ -45,7 +45,7 @@ class Watcher:
         self.node = rclpy.create_node('live_demo')
         self.streams = {topic: LiveGatherer() for topic in ('imu/data_raw', 'imu/data_corrected', 'imu/truth')}
         for topic, gatherer in self.streams.items():
-            BatchInput(self.node, Imu, topic, gatherer.add_imu)
+            BatchInput(self.node, Imu, topic, add=gatherer.add_imu)
         self.documents, self.status = [], {}
         self.node.create_subscription(String, 'imu/calibration', lambda message: self.documents.append(message.data), latched_qos())
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._note, 10)

@@ -70,7 +70,7 @@ class Topic:
 
 
 def test_the_guide_says_every_change_once(now):
-    guide = CalibrationGuide({'imu': Topic(), 'joints': Topic()}, 'the command that saves', 'window', lambda: now[0])
+    guide = CalibrationGuide({'imu': Topic(), 'joints': Topic()}, 'the command that saves', 'window', clock=lambda: now[0])
     counted = StreamState('good', 'Imu messages come', {}, (), ('imu', 'joints'), stamping=StampLine(COUNTED, 5e6, 0.0, 3.5e7, 8.0))
     states = [WorkerState(), WorkerState(streams=StreamState('good', '', {}, ('joints',), ('imu',))), WorkerState(streams=counted),
               WorkerState(streams=counted, gathered=3, verdict='weak', lines=('bias: known less well', 'next: turn about x')),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_by_hand import GRAVITY, load, simulate
 
-from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
+from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.by_hand.status import FACES, unseen
 from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
@@ -56,7 +56,7 @@ def test_another_gravity_changes_the_next_solution(session):
     live = make_live()
     run(live, session)
     before = live.solve(pending=True)
-    live.change(LiveByHandSettings(gravity=GRAVITY + 0.01))
+    live.change_by_hand(LiveByHandSettings(gravity=GRAVITY + 0.01))
     after = live.solve(pending=True)
     assert_same(after, offline(session, GRAVITY + 0.01))
     assert after.gravity - before.gravity == pytest.approx(0.01)

@@ -7,7 +7,8 @@ import pytest
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import calibrate, conclude, solve_gathered
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.live_settings import LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.effects.sensor_model import SensorModel

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from test_live_calibration import blocks
 
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.live_settings import LiveSettings
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis, RecentWindows, describe
 from imu_calibration.diagnosis.workflow import diagnose_recording

@@ -27,7 +27,7 @@ def interrupted(args=None):
 rclpy.init = interrupted
 def spin(node):
     raise SystemExit('it did not end')
-sys.exit(run_node(lambda: rclpy.create_node('early'), [], spin))
+sys.exit(run_node(lambda: rclpy.create_node('early'), [], spin=spin))
 '''
 
 
@@ -60,7 +60,7 @@ from types import SimpleNamespace
 from imu_calibration.nodes.lifecycle import run_node
 def spin(node):
     {what}
-sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin))
+sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin=spin))
 '''
 
 

@@ -8,10 +8,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 XYZ = {'x', 'y', 'z', 'wx', 'wy', 'wz', 'fx', 'fy', 'fz'}
 """Components of one vector, as what is called for every sample takes them."""
-UNTYPED = ('nodes',)
-"""Packages in which some of what is public does not say its types yet."""
-POSITIONAL = (*UNTYPED, 'settings.py')
-"""Packages in which some functions take more than three arguments by their place; settings are declared like rows of a table."""
+POSITIONAL = ('settings.py',)
+"""Where some functions take more than three arguments by their place: settings are declared like rows of a table."""
 
 
 def modules():
@@ -31,7 +29,7 @@ def public_functions(path):
                 yield entry, [*entry.args.posonlyargs, *entry.args.args][bound:]
 
 
-@pytest.mark.parametrize('path', [path for path, package in modules() if package not in UNTYPED], ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', [path for path, _ in modules()], ids=lambda path: path.stem)
 def test_it_says_its_types(path):
     found = [f'{entry.name} (line {entry.lineno})' for entry, arguments in public_functions(path)
              if any(argument.annotation is None for argument in arguments + entry.args.kwonlyargs)

@@ -3,7 +3,7 @@
 import copy
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,12 +12,13 @@ from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.result import HandResult
 from imu_calibration.by_hand.sample_store import HandStore
-from imu_calibration.by_hand.status import NOTHING, HandStatus, hand_status, look_for_poses
+from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
-from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -26,7 +27,6 @@ from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
 from imu_calibration.segmentation.window_settings import WindowSettings
-from imu_calibration.settings import setting
 
 SEARCH_SHARE = 0.05
 """Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
@@ -36,18 +36,6 @@ _FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes',
                 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
 MOST_POSES = 200
 """The time of the joint estimate grows with the third power of their number; the oldest are forgotten."""
-
-
-@dataclass(frozen=True)
-class LiveByHandSettings:
-    """What a calibration by hand keeps, and its reference."""
-
-    gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
-                             (0.0, 30.0), 'all three accelerometer scales are wrong together',
-                             live=True, session=True)
-    hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
-                                'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
-                                'too small: poses are forgotten, diagnostics say so', live=True)
 
 
 class LiveByHand:
@@ -85,7 +73,8 @@ class LiveByHand:
         if saved is not None:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
-        self.found, self.result = NOTHING, None
+        self.found = NOTHING
+        self.result: HandResult | None = None
         self._search(self._store)
 
     @property
@@ -94,8 +83,9 @@ class LiveByHand:
         asked = self._asked
         return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
 
-    needs_temperature = False
-    """Live, no temperatures are kept with the poses."""
+    observations = HandResult.observations
+    needs_joints, on_table = False, None
+    needs_temperature = False   # no temperatures are kept with the poses
 
     @property
     def frame_id(self) -> str:
@@ -108,7 +98,7 @@ class LiveByHand:
         self.options = replace(self.options, windows=windows)
         self._search(self._store)
 
-    def change(self, by_hand: LiveByHandSettings) -> None:
+    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
         """Take another gravity, or another number of samples to keep."""
         self.options = replace(self.options, gravity=by_hand.gravity or None)
         self._store.most = by_hand.hand_samples
@@ -229,8 +219,8 @@ class LiveByHand:
             return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
         return group_states(self.result)
 
-    def status(self, hints: dict[str, str] | None = None) -> HandStatus:
-        """Return the HandStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
+    def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
+        """Return the SessionStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
         status = hand_status(self.found, self.result and self.result.calibration, gravity_unknown=self.options.gravity is None, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 

@@ -11,6 +11,7 @@ from imu_calibration.by_hand.poses import average_poses, distinct_attitudes
 from imu_calibration.by_hand.turns import collect_turns
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import Progress
+from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.verdict import SCALES
 from imu_calibration.errors import with_hint
@@ -45,18 +46,6 @@ class Findings:
 NOTHING = Findings([], None, 0, 0, {}, 0.0)
 
 
-@dataclass(frozen=True)
-class HandStatus:
-    """How far a calibration by hand has come, for people."""
-
-    word: Progress
-    """WAITING before a solution is possible, WEAK while something is missing, or DETERMINED."""
-    message: str
-    """One line: what there is, and what to do next."""
-    values: dict
-    """Figures by name."""
-
-
 def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     """Return the Findings in ImuSamples with rising stamps."""
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
@@ -71,9 +60,9 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
 
 
 def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unknown: bool,
-                hints: dict[str, str] | None = None) -> HandStatus:
+                hints: dict[str, str] | None = None) -> SessionStatus:
     """
-    Return the HandStatus.
+    Return the SessionStatus.
 
     Parameters
     ----------
@@ -97,7 +86,7 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
     if found.resting:
         parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
     parts += [f'next: {need}' for need in needs] if needs else ['everything is determined: save it']
-    return HandStatus(word, '; '.join(parts), values)
+    return SessionStatus(word, '; '.join(parts), values)
 
 
 def unseen(found: Findings) -> list[str]:

@@ -1,7 +1,7 @@
 """Calibration while the motion goes on: windows as they complete, a solution after them, the same answer as offline."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +11,9 @@ from imu_calibration.calibration.effect_states import GroupState, group_states, 
 from imu_calibration.calibration.gathered import Gathered, merge
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.live_collector import LiveCollector, columns_at, copied
+from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.session import SessionStatus, TableSession
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
@@ -25,31 +27,9 @@ from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_settings import WindowSettings
-from imu_calibration.settings import setting
 
 HELD_BACK = 200
 """Blocks that wait for the first temperature at most, when a thermal effect needs one."""
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """How often to solve, and what is kept and told."""
-
-    solve_share: float = setting(0.1, '1', 'largest share of the time that solving after each window may take', (0.001, 1.0),
-                                 'too small: results come late; too large: the node takes a whole core', live=True)
-    residual_rate: float = setting(20.0, 'Hz', 'residuals published per second of data, the others are left out; 0: none', (0.0, 10000.0),
-                                   'too large: more time goes into publishing than into calibrating', live=True)
-    store_samples: int = setting(300_000, '1', 'samples in motion kept for effects that must be linearised anew (table tilt, delays); '
-                                 'about 200 bytes each', (0, 100_000_000),
-                                 'too small: with a strongly tilted table the answer is that of the first pass, diagnostics say so',
-                                 fixed='windows that were not kept are gone')
-    diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth '
-                                      'of the time at most; also when the streams stop and with ~/solve; 0: never', (0.0, 86400.0),
-                                      'too small: the diagnosis takes a core from other programs', live=True)
-    diagnosis_samples: int = setting(300_000, '1', 'samples of the last windows kept for the diagnosis, about 250 bytes each',
-                                     (1000, 100_000_000),
-                                     'too small: effects that need the whole session are not found',
-                                     fixed='windows that were not kept are gone')
 
 
 class LiveCalibration:
@@ -82,13 +62,17 @@ class LiveCalibration:
         self.table, self.options, self.settings, self.earlier = table, options, settings, None
         self._asked = choose_model(options, table)
         self._waiting, self._collector = [], None
-        self.result, self._too_far, self._designs = None, False, {}
-        self.open_windows = []
+        self.result: TableResult | None = None
+        self._too_far, self._designs = False, {}
+        self.open_windows: list[Window] = []
         """Windows that were still open at the last solution with `pending`, closed in a copy."""
         if saved is not None and self._asked.needs_temperature:
             self._begin(self._asked.with_reference_temperature(accumulator_state.saved_model(saved).temperature_ref_c), saved)
         elif not self._asked.needs_temperature:
             self._begin(self._asked, saved)
+
+    observations = TableResult.observations
+    needs_joints = True
 
     @property
     def n_windows(self) -> int:
@@ -125,6 +109,14 @@ class LiveCalibration:
         if self._collector is not None:
             self._collector.gatherer.change(windows)
         self.options = replace(self.options, windows=windows)
+
+    @property
+    def on_table(self) -> TableSession:
+        """The session itself: what the model gets wrong can be asked while it goes on."""
+        return self
+
+    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
+        """Do nothing: gravity is the table's."""
 
     @property
     def model(self) -> SensorModel | None:
@@ -259,3 +251,6 @@ class LiveCalibration:
         if self.result is None:
             return waiting_groups(self.model) if self.model is not None else []
         return group_states(self.result)
+
+    def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
+        """Return None: the groups tell what is missing."""

@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import Any
 
 from imu_calibration.calibration.by_evidence import baseline_model
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.session import TableSession
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words, nothing_named
@@ -102,8 +102,10 @@ class LiveDiagnosis:
         if self._most:
             self.recent.add(windows)
 
-    def question(self, live: LiveCalibration) -> 'DiagnosisQuestion | None':
-        """Return the DiagnosisQuestion about the last solution of a `LiveCalibration`, or None while there are too few windows."""
+    def question(self, live: TableSession | None) -> 'DiagnosisQuestion | None':
+        """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
+        if live is None:
+            return None
         windows = self.recent.list() + live.open_windows
         if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
             return None

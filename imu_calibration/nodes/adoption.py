@@ -51,7 +51,7 @@ class Adopted:
         return moved_beyond_sd(other.calibration, self.calibration)
 
 
-def adopt(text: str, source: str, settings: CompensatorSettings, frames: StaticFrames, *, before: Adopted | None = None) -> Adopted:
+def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: StaticFrames, before: Adopted | None = None) -> Adopted:
     """
     Return the calibration in a document, ready to take the place of `before`.
 
@@ -105,8 +105,8 @@ def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: S
     if settings.noise_file:
         calibration = with_measured_noise(calibration, files.read_noise(files.user_path(settings.noise_file)))
     transfer = _transfer(calibration, settings, frames)
-    compensation = LiveCompensation(calibration, transfer, settings.check_frame_id, settings.parameter_covariance, settings.correct_stamps,
-                                    watch=_watch(calibration, transfer, settings, before))
+    compensation = LiveCompensation(calibration, transfer, check_frame=settings.check_frame_id, with_parameters=settings.parameter_covariance,
+                                    correct_stamps=settings.correct_stamps, watch=_watch(calibration, transfer, settings, before))
     if before is not None:
         compensation.prepare(before.compensation)
     return compensation
@@ -115,10 +115,11 @@ def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: S
 def _watch(calibration: Calibration, transfer: Transfer | None, settings: CompensatorSettings, before: Adopted | None) -> StopWatch:
     """Return who looks at the stops: the one that does already, where nothing changes for it."""
     options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
-    if before is not None and before.calibration is calibration and before.compensation.watch.health.options == options:
+    watch = None if before is None or before.calibration is not calibration else before.compensation.watch
+    if before is not None and watch is not None and watch.health.options == options:
         was = before.compensation.transfer
         if was is transfer or (transfer is not None and transfer.is_close(was)):
-            return before.compensation.watch
+            return watch
     return StopWatch(CalibrationHealth(calibration, transfer, options))
 
 

@@ -42,7 +42,7 @@ class PlayerSettings:
 class BagPlayerNode(Node):
     """Publishes the messages of a recording."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('bag_player_node')
         self.settings = declare_parameters(self, PlayerSettings)
         self._bag = self._open()
@@ -50,12 +50,12 @@ class BagPlayerNode(Node):
         self._players = [self._publisher(name) for name in self._topics]
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
-        self._playback = Playback(self, self._players, self._batches(first), pace, first, self._players, self._ended)
+        self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players, on_end=self._ended)
         self.failed = self._is_over = False
         self._playback.start()
         self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: {", ".join(self._topics)}')
 
-    def close(self):
+    def close(self) -> str:
         """Stop publishing and close the files; return what became of it."""
         self._playback.end()
         self._bag.close()
@@ -128,7 +128,7 @@ def _message_class(message_type):
         return None
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
     return run_node(BagPlayerNode, arguments)
 

@@ -31,7 +31,7 @@ class CalibrationGuide:
 
     """
 
-    def __init__(self, inputs: Mapping[str, MatchedInput], save_command: str, noun: str, clock: Callable[[], float] = time.monotonic):
+    def __init__(self, inputs: Mapping[str, MatchedInput], save_command: str, noun: str, *, clock: Callable[[], float] = time.monotonic):
         self._inputs, self._save_command, self._noun, self._clock = inputs, save_command, noun, clock
         self._coming: set[str] = set()
         self._stamping = ''
@@ -85,7 +85,7 @@ class CalibrationGuide:
 
 def advice_of(state: WorkerState) -> str:
     """Return the motion or the thing that helps most now, '' when nothing is known."""
-    if state.hand is not None:
-        return state.hand.values.get('next', '')
+    if state.session is not None:
+        return state.session.values.get('next', '')
     steps = [line.removeprefix('next: ') for line in state.lines if line.startswith('next: ')]
     return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')

@@ -9,6 +9,7 @@ services: ~/solve, ~/save, ~/reset.
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -17,9 +18,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from imu_calibration import files
-from imu_calibration.by_hand.live import LiveByHand, LiveByHandSettings
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.session import LiveSession
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
@@ -33,6 +34,7 @@ from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.session_reference import reference_of
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting
@@ -43,8 +45,6 @@ INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
 MOST_WAITING = 200_000
 """Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
-NO_TABLE = ('', 'none')
-"""Values of `table_file` that mean: by hand. Launch arguments cannot be empty."""
 PATIENCE = 3.0
 """Seconds after the start from which a silent topic is worth a word."""
 
@@ -92,37 +92,33 @@ class CalibrationNode(Node):
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
         self._hand_settings = declare_parameters(self, LiveByHandSettings)
-        by_hand = self.settings.table_file in NO_TABLE
-        self._table = None if by_hand else files.read_table(files.user_path(self.settings.table_file))
+        self._reference = reference_of(self.settings.table_file)
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
-        self._gatherer = LiveGatherer(self._table and self._table.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
+        self._gatherer = LiveGatherer(self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
-        self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place, self.settings.autosave_period,
-                                        Listeners(self._publish_document, self._publish_residuals), by_hand, HINTS['calibration_node'])
+        self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
+                                        listeners=Listeners(self._publish_document, self._publish_residuals), hints=HINTS['calibration_node'])
         for what in ('solve', 'save', 'reset'):
-            self.create_service(Trigger, f'~/{what}', lambda request, response, what=what: self._serve(what, response))
+            self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
         self._listen()
         self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
-                                       'pose' if by_hand else 'window')
+                                       live.observations.removesuffix('s'))
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         groups = {'settings': self.settings, 'live': self._live_settings, 'windows': self._options.windows, 'by_hand': self._hand_settings}
-        watch_parameters(self, groups, self._change, HINTS['calibration_node'])
+        watch_parameters(self, groups, self._change, hints=HINTS['calibration_node'])
         self.worker.start()
 
     def _listen(self) -> None:
         topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu), 'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
-        if self._table is not None:
+        if self._reference.joint_names is not None:
             topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
-            on_what = f'on the table {files.user_path(self.settings.table_file)} with the joints {", ".join(self._table.joint_names)}'
-        else:
-            on_what = "by hand, since no 'table_file' was given: hold the IMU still in many attitudes and turn it in between"
-        self._inputs = {name: BatchInput(self, kind, topic, add, depth=INPUT_DEPTH, single=name != 'joints')
+        self._inputs = {name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
                         for name, (kind, topic, add) in topics.items()}
         watch_inputs(self, list(self._inputs.values()))
-        self.get_logger().info(f'calibrates {on_what}; ~/save writes {self.worker.place.calibration}')
+        self.get_logger().info(f'calibrates {self._reference.text}; ~/save writes {self.worker.place.calibration}')
 
     def close(self) -> str:
         """End the worker after what it is doing; return what became of the motion that is in no file."""
@@ -135,23 +131,21 @@ class CalibrationNode(Node):
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
                                   files.read_tolerances(place, catalogue), windows, catalogue=catalogue)
 
-    def _make_live(self, saved: bytes | None = None) -> LiveCalibration | LiveByHand:
-        if self._table is None:
-            return LiveByHand(self._options, self._live_settings, self._hand_settings, saved=saved)
-        return LiveCalibration(self._table, self._options, self._live_settings, saved=saved)
+    def _make_live(self, saved: bytes | None = None) -> LiveSession:
+        return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)
 
-    def _resumed(self, place: SessionFiles) -> LiveCalibration | LiveByHand:
+    def _resumed(self, place: SessionFiles) -> LiveSession:
         try:
             live = self._make_live(place.earlier())
         except ImuCalibrationError as error:
             kept = place.put_aside()   # a save would write over it
             say(self.get_logger(), ERROR, f'cannot go on where it was saved: {error}; starts anew, the earlier motion is kept in {kept}')
             return self._make_live()
-        self.get_logger().info(f'goes on with {live.n_windows} {"poses" if self._table is None else "windows"} from {place.accumulator}'
+        self.get_logger().info(f'goes on with {live.n_windows} {live.observations} from {place.accumulator}'
                                if live.n_windows else f'nothing to go on with in {place.accumulator}: starts anew')
         return live
 
-    def _serve(self, what: str, response: Trigger.Response) -> Trigger.Response:
+    def _serve(self, what: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         request = self.worker.ask(what)
         while not request.done.wait(0.005):
             for each in self._inputs.values():
@@ -177,8 +171,7 @@ class CalibrationNode(Node):
             self.worker.ask(lambda: self.worker.change_windows(group))
         elif name == 'by_hand':
             self._hand_settings = group
-            if self._table is None:
-                self.worker.ask(lambda: self.worker.change_by_hand(group))
+            self.worker.ask(lambda: self.worker.change_by_hand(group))
 
     def _publish_document(self, text: str) -> None:
         self._publish(self._document, String(data=text))
@@ -199,7 +192,7 @@ class CalibrationNode(Node):
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
         silent = [] if state.streams is None else [self._inputs[name].silence(state.streams.unusable.get(name, '')) for name in state.streams.silent]
-        if self._table is None and self.count_publishers(self.resolve_topic_name('joint_states')):
+        if 'joints' not in self._inputs and self.count_publishers(self.resolve_topic_name('joint_states')):
             about_topics.append("joint states are published and not listened to: to calibrate on a table give 'table_file'")
         trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
         if time.monotonic() - self._started > PATIENCE:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from imu_calibration.by_hand.status import HandStatus
+from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.diagnosis.live import DiagnosisState
 from imu_calibration.preflight.stream_watch import StreamState
 
@@ -29,8 +29,8 @@ class WorkerState:
     """Windows, or poses by hand."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
-    hand: HandStatus | None = None
-    """How far a calibration without a table has come."""
+    session: SessionStatus | None = None
+    """How far the session has come beyond what the groups tell: the poses of a calibration by hand."""
     diagnosis: DiagnosisState | None = None
     """What the model gets wrong; None without a table."""
     place: str = ''

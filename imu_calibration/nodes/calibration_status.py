@@ -18,15 +18,15 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     found = []
     if state.streams is not None:
         level = max(_STREAM_LEVELS[state.streams.word], WARN if stream_faults else OK)
-        found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), state.streams.values))
+        found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
     parts = [state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
     level = ERROR if state.faults else max(_VERDICT_LEVELS[state.verdict], WARN if state.trouble and state.verdict else OK)
-    found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), {'version': state.solution, **state.values}))
-    if state.hand is not None:
-        found.append(make_status(_HAND_LEVELS[state.hand.word], 'poses', state.hand.message, state.hand.values))
+    found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
+    if state.session is not None:
+        found.append(make_status(_HAND_LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
     if state.diagnosis is not None:
         found.append(make_status(_DIAGNOSIS_LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
-                                 {'outcome': state.diagnosis.word, **state.diagnosis.values}))
+                                 values={'outcome': state.diagnosis.word, **state.diagnosis.values}))
     return found + [_group_status(group) for group in state.groups]
 
 
@@ -39,4 +39,4 @@ def _group_status(group: GroupState):
                f'predicted after that motion [{group.unit}]': group.predicted_sd}
     values = {'parameter': group.parameter, 'needs': group.needs,
               **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)}}
-    return make_status(_GROUP_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values)
+    return make_status(_GROUP_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)

@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.pacing import SolvePacer
-from imu_calibration.calibration.result import summary
+from imu_calibration.calibration.result import CalibrationResult, summary
+from imu_calibration.calibration.session import LiveSession
 from imu_calibration.calibration.trust import missing
-from imu_calibration.diagnosis.live import LiveDiagnosis
+from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis
 from imu_calibration.errors import ImuCalibrationError, InputError, NotObservableError, shortened
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.preflight.stream_watch import StreamWatch
+from imu_calibration.segmentation.window_settings import WindowSettings
+from msg_adapters.live import LiveGatherer
 
 PERIOD = 0.1
 """Seconds between two looks at what arrived."""
@@ -36,7 +40,7 @@ class Listeners:
 
 class CalibrationWorker(threading.Thread):
     """
-    Runs a LiveCalibration, or a LiveByHand without a table.
+    Runs a session.
 
     Whatever fails is told and left out, and the session goes on: nothing that a message, a solution or a disk does ends it.
 
@@ -44,29 +48,26 @@ class CalibrationWorker(threading.Thread):
     ----------
     gatherer : LiveGatherer
         Where messages are added by another thread.
-    live : LiveCalibration or LiveByHand
-        The session.
+    live : LiveSession
     make_live : callable
         Returns a new one, for a reset.
     place : SessionFiles
     autosave_period : float
         Seconds between two savings of the accumulator; 0: only when asked.
     listeners : Listeners
-    by_hand : bool
-        Whether there is no table, and so no joint states.
     hints : dict, optional
         As for `errors.with_hint`.
 
     """
 
-    def __init__(self, gatherer, live, make_live, place: SessionFiles, autosave_period: float, listeners: Listeners, by_hand: bool = False,
-                 hints: dict[str, str] | None = None):
+    def __init__(self, gatherer: LiveGatherer, live: LiveSession, make_live: Callable[[], LiveSession], *, place: SessionFiles,
+                 autosave_period: float, listeners: Listeners, hints: dict[str, str] | None = None):
         super().__init__(name='calibration', daemon=True)
         self.gatherer, self.live, self.make_live = gatherer, live, make_live
         self.place, self.autosave_period, self.listeners = place, autosave_period, listeners
         self.hints = hints or {}
-        self._pacer, self._watch = SolvePacer(self.live.settings.solve_share), StreamWatch(not by_hand, self.live.needs_temperature)
-        self._by_hand, self._diagnosis = by_hand, DiagnosisThread(0.0 if by_hand else self.live.settings.diagnosis_period)
+        self._pacer, self._watch = SolvePacer(live.settings.solve_share), StreamWatch(live.needs_joints, live.needs_temperature)
+        self._diagnosis = DiagnosisThread(self._diagnosis_period)
         self._diagnosed, self._windows = 0, self._new_diagnosis()
         self._asked: list[Request] = []
         self._lock, self._wake, self._ending = threading.Lock(), threading.Event(), False
@@ -80,9 +81,13 @@ class CalibrationWorker(threading.Thread):
     @property
     def gathered(self) -> str:
         """What is gathered, for people."""
-        return 'poses' if self._by_hand else 'windows'
+        return self.live.observations
 
-    def ask(self, what: str | Callable[[], str]) -> 'Request':
+    @property
+    def _diagnosis_period(self) -> float:
+        return self.live.settings.diagnosis_period if self.live.on_table is not None else 0.0
+
+    def ask(self, what: str | Callable[[], tuple[bool, str]]) -> 'Request':
         """Ask for 'solve', 'save', 'reset' or a function to be called; return a Request whose `done` is set when the answer is there."""
         request = Request(getattr(self, f'_{what}') if isinstance(what, str) else what)
         with self._lock:
@@ -137,7 +142,7 @@ class CalibrationWorker(threading.Thread):
             self._closed = False
         if windows:
             self._new_windows = True
-            self._windows.add([] if self._by_hand else windows)
+            self._windows.add(windows)
             residuals = self.live.residuals(windows)
             if residuals is not None and len(residuals):
                 self.listeners.residuals(residuals)
@@ -172,11 +177,11 @@ class CalibrationWorker(threading.Thread):
 
     def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(lambda: self._windows.question(self.live), n_windows > self._diagnosed)
+        self._diagnosis.ask_when_due(lambda: self._windows.question(self.live.on_table), n_windows > self._diagnosed)
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
 
-    def _publish_solution(self, pending: bool) -> str:
+    def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
         start = time.monotonic()
         result = self.live.solve(pending, {'mode': 'live', 'solution': self._n_solutions + 1})
         self._n_solutions += 1
@@ -185,20 +190,19 @@ class CalibrationWorker(threading.Thread):
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
         self._pacer.note(start, time.monotonic())
-        return text
+        return result, text
 
     def _solve(self) -> tuple[bool, str]:
-        self._publish_solution(pending=True)
+        result, _ = self._publish_solution(pending=True)
         self._diagnosis.want()
-        verdict, lines = summary(self.live.result, self.hints)
+        verdict, lines = summary(result, self.hints)
         return True, f'{verdict} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
         try:
-            text = self._publish_solution(pending=True)
-            calibration = self.live.result.calibration
-            what = f'{calibration.verdict}: {missing(calibration) or "every parameter is determined"}'
+            result, text = self._publish_solution(pending=True)
+            what = f'{result.calibration.verdict}: {missing(result.calibration) or "every parameter is determined"}'
         except ImuCalibrationError as error:
             what = f'no calibration yet: {error.told(self.hints)}'
         if text is None and not self.live.n_windows:
@@ -208,8 +212,7 @@ class CalibrationWorker(threading.Thread):
         return whole and text is not None, f'{what}; {written}'
 
     def _new_diagnosis(self) -> LiveDiagnosis:
-        settings = self.live.settings
-        return LiveDiagnosis(0 if self._by_hand or not settings.diagnosis_period else settings.diagnosis_samples)
+        return LiveDiagnosis(self.live.settings.diagnosis_samples if self._diagnosis_period else 0)
 
     def _reset(self) -> tuple[bool, str]:
         lost = self.place.unsaved(self.live)
@@ -221,23 +224,23 @@ class CalibrationWorker(threading.Thread):
         return True, (f'started anew, {lost} {self.gathered} that were in no file are forgotten; ' if lost else 'started anew; ') + \
             'the last calibration stays published until there is another one'
 
-    def change_settings(self, settings: Any) -> tuple[bool, str]:
+    def change_settings(self, settings: LiveSettings) -> tuple[bool, str]:
         """Solve, keep and tell as often as other LiveSettings say."""
-        was_off, self.live.settings = not self.live.settings.diagnosis_period, settings
+        was_off, self.live.settings = not self._diagnosis_period, settings
         self._pacer = SolvePacer(settings.solve_share)
-        self._diagnosis.change(0.0 if self._by_hand else settings.diagnosis_period)
+        self._diagnosis.change(self._diagnosis_period)
         if was_off:   # nothing was kept for it so far
             self._windows = self._new_diagnosis()
         return True, ''
 
-    def change_windows(self, windows: Any) -> tuple[bool, str]:
+    def change_windows(self, windows: WindowSettings) -> tuple[bool, str]:
         """Find windows by other WindowSettings from now on."""
         self.live.change_windows(windows)
         return True, ''
 
-    def change_by_hand(self, by_hand: Any) -> tuple[bool, str]:
+    def change_by_hand(self, by_hand: LiveByHandSettings) -> tuple[bool, str]:
         """Take other LiveByHandSettings; another gravity changes the solution at once."""
-        self.live.change(by_hand)
+        self.live.change_by_hand(by_hand)
         self._new_windows = self.live.n_windows > 0
         return True, ''
 
@@ -273,12 +276,12 @@ class CalibrationWorker(threading.Thread):
                      'calibrate the recording offline']
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
         groups = self.live.groups() if stale else self.state.groups
-        hand, diagnosis = (self.live.status(self.hints), None) if self._by_hand else (None, self._diagnosis_state())
+        diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
         self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
-                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values, hand, diagnosis,
+                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values, self.live.status(self.hints), diagnosis,
                                  str(self.place.calibration))
 
-    def _diagnosis_state(self):
+    def _diagnosis_state(self) -> DiagnosisState:
         state = self._diagnosis.state
         return replace(state, values={**state.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
 

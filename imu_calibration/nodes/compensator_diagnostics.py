@@ -2,6 +2,7 @@
 
 from math import sqrt
 from time import monotonic
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from imu_calibration.calibration import trust
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, WAITING
+from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.segmentation.stamping import COUNTED
 
@@ -32,24 +34,25 @@ KNOWN = {'no temperature yet': 'the calibration has thermal effects and no tempe
 class CompensatorDiagnostics:
     """Collects the state of the node; what is wrong is logged when it begins and when it is over."""
 
-    def __init__(self, node):
+    def __init__(self, node: Any):
         self._node, self._counts = node, {}
         self._received, self._last_change, self._told_source, self._told_stamps = 0, monotonic(), '', None
-        self._temperature, self._temperature_at, self._nan_temperatures = None, monotonic(), 0
+        self._temperature: float | None = None
+        self._temperature_at, self._nan_temperatures = monotonic(), 0
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
-    def publish_now(self):
+    def publish_now(self) -> None:
         """Publish the present state at once."""
         self._publisher.publish_now()
 
-    def note_temperature(self, temperature_c):
+    def note_temperature(self, temperature_c: float) -> None:
         """Take a temperature that came, which may be NaN."""
         if np.isfinite(temperature_c):
             self._temperature, self._temperature_at = temperature_c, monotonic()
         else:
             self._nan_temperatures += 1
 
-    def collect(self):
+    def collect(self) -> list:
         """Return the list of DiagnosticStatus."""
         node = self._node
         node.look_for_correction()
@@ -57,12 +60,13 @@ class CompensatorDiagnostics:
         serious, notes = self._lines(compensation)
         notes += self._stream(compensation) + [line for each in node.inputs for line in each.faults()]
         node.complaints.now('compensation', notes, serious)
-        calibration = None if node.adopted is None else node.adopted.calibration
-        notes += [] if calibration is None else node.adopted.caveats
+        adopted: Adopted | None = node.adopted
+        notes += [] if adopted is None else adopted.caveats
         level = ERROR if serious else WARN if notes else OK
-        message = '; '.join(serious + notes) or f'corrected with calibration {node.adopted.version} ({trust.standing(calibration)})'
-        frame_id = '' if calibration is None else calibration.frame_id
-        return [*self._health(compensation, frame_id), make_status(level, 'compensation', message, self._values(), frame_id)]
+        good = '' if adopted is None else f'corrected with calibration {adopted.version} ({trust.standing(adopted.calibration)})'
+        frame_id = '' if adopted is None else adopted.calibration.frame_id
+        return [*self._health(compensation, frame_id),
+                make_status(level, 'compensation', '; '.join(serious + notes) or good, values=self._values(), hardware_id=frame_id)]
 
     def _health(self, compensation, frame_id):
         """Return a status that says whether the calibration still holds, and tell when it no longer does."""
@@ -74,7 +78,8 @@ class CompensatorDiagnostics:
         level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
         grave = HEALTH_LEVELS[state.word] == ERROR
         self._node.complaints.now('health', [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm], [state.message] * grave)
-        return [make_status(level, 'health', '; '.join([state.message, *warm]), {'outcome': state.word, **state.values}, frame_id)]
+        return [make_status(level, 'health', '; '.join([state.message, *warm]), values={'outcome': state.word, **state.values},
+                            hardware_id=frame_id)]
 
     def _stream(self, compensation):
         """Return what is wrong with the stream of messages, and log where it comes from when it begins."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import rclpy
 from rclpy.node import Node
+from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -26,6 +27,7 @@ from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.static_frames import StaticFrames
@@ -42,11 +44,13 @@ class CompensatorNode(Node):
     the other one, which prepares a new compensation; the first takes it over between two messages.
     """
 
-    def __init__(self, **options: Any):
+    def __init__(self, **options: Any) -> None:
         super().__init__('compensator_node', **options)
         self.settings = declare_parameters(self, CompensatorSettings)
         self.adopted: Adopted | None = None
-        self._current = self._wanted = self._told = None
+        self._current: LiveCompensation | None = None
+        self._wanted: LiveCompensation | None = None
+        self._told: Adopted | None = None
         self.problem, self.corrected_already, self._heard, self.awaited = '', '', '', ''
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
@@ -55,17 +59,17 @@ class CompensatorNode(Node):
         self._publisher = self.create_publisher(Imu, 'imu/data_corrected', output_qos())
         self._mark = self.create_publisher(String, self._publisher.topic_name + MARK, latched_qos())
         group = relay_loop.OutsideExecutor() if self.by_wait_set else None
-        self.imu = MatchedInput(self, Imu, 'imu/data_raw', self._on_imu, group=group)
+        self.imu = MatchedInput(self, Imu, 'imu/data_raw', callback=self._on_imu, group=group)
         self._refuse_own_output()
-        self.documents = MatchedInput(self, String, 'imu/calibration', self._guarded(self._on_document), raw=False, latched=True)
+        self.documents = MatchedInput(self, String, 'imu/calibration', callback=self._guarded(self._on_document), raw=False, latched=True)
         self.temperature: MatchedInput | None = None
         self.inputs = [self.imu, self.documents]
         watch_inputs(self, self.inputs)
         self.diagnostics = CompensatorDiagnostics(self)
         self.create_service(Trigger, '~/reload', self._on_reload)
         self._start()
-        watch_parameters(self, {'settings': self.settings}, self._change, HINTS['compensator_node'])
-        self._timer = None
+        watch_parameters(self, {'settings': self.settings}, self._change, hints=HINTS['compensator_node'])
+        self._timer: Timer | None = None
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
@@ -76,14 +80,14 @@ class CompensatorNode(Node):
                                    "waiting for parameter 'calibration_file'")
 
     @property
-    def compensation(self):
+    def compensation(self) -> LiveCompensation | None:
         """The LiveCompensation in use, or about to be, or None."""
         return self._wanted
 
     def spin(self) -> None:
         """Work until the context ends."""
         if self.by_wait_set:
-            relay_loop.relay(self, self.imu, self._publisher, self.convert)
+            relay_loop.relay(self, self.imu, self._publisher, convert=self.convert)
         else:
             rclpy.spin(self)
 
@@ -134,18 +138,19 @@ class CompensatorNode(Node):
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
-        self._put_in_force(adopt(text, source, settings, self._frames, before=self.adopted))
-        if self.adopted.says_more_than(self._told):
-            self._told = self.adopted
-            self.get_logger().info(self.adopted.line())
-            for line in self.adopted.caveats:
-                self.get_logger().warning(f'calibration {self.adopted.version}: {line}')
+        adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
+        self._put_in_force(adopted)
+        if adopted.says_more_than(self._told):
+            self._told = adopted
+            self.get_logger().info(adopted.line())
+            for line in adopted.caveats:
+                self.get_logger().warning(f'calibration {adopted.version}: {line}')
 
     def _put_in_force(self, adopted: Adopted) -> None:
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
         self.awaited = ''
         if self.temperature is None and (adopted.compensation.needs_temperature or adopted.calibration.conditions.get('temperature_range_c')):
-            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', self._guarded(self._on_temperature), depth=10, raw=False)
+            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10, raw=False)
             self.inputs.append(self.temperature)
         self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
         self.diagnostics.publish_now()
@@ -190,7 +195,7 @@ class CompensatorNode(Node):
             why = self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
             why = "parameter 'calibration_file' is empty; set it to the file to return to"
-        response.success, response.message = not why, why or self.adopted.line()
+        response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
         return response
 
     def _change(self, name: str, settings: CompensatorSettings) -> None:
@@ -236,7 +241,7 @@ class CompensatorNode(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
-    return run_node(CompensatorNode, arguments, CompensatorNode.spin, hints=HINTS['compensator_node'])
+    return run_node(CompensatorNode, arguments, spin=CompensatorNode.spin, hints=HINTS['compensator_node'])
 
 
 if __name__ == '__main__':

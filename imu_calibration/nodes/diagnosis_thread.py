@@ -2,9 +2,10 @@
 
 import threading
 import time
+from collections.abc import Callable
 
 from imu_calibration.calibration.pacing import SolvePacer
-from imu_calibration.diagnosis.live import FAILED, OFF, DiagnosisState
+from imu_calibration.diagnosis.live import FAILED, OFF, DiagnosisQuestion, DiagnosisState
 
 SHARE = 0.2
 """Share of the time that diagnosing takes at most."""
@@ -24,33 +25,34 @@ class DiagnosisThread:
 
     """
 
-    def __init__(self, period):
-        self.period, self._pacer, self._thread, self._ending = period, SolvePacer(SHARE), None, False
+    def __init__(self, period: float):
+        self.period, self._pacer, self._ending = period, SolvePacer(SHARE), False
+        self._thread: threading.Thread | None = None
         self._next, self._wanted = time.monotonic() + period, False
         self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
 
-    def change(self, period):
+    def change(self, period: float) -> None:
         """Ask as often as another period says; 0: no more."""
         if bool(period) != bool(self.period):
             self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.period, self._next = period, time.monotonic() + period
 
     @property
-    def is_running(self):
+    def is_running(self) -> bool:
         """Whether a question is being answered."""
         return self._thread is not None and self._thread.is_alive()
 
-    def want(self):
+    def want(self) -> None:
         """Ask as soon as possible, whatever the period."""
         self._wanted = bool(self.period)
 
-    def forget(self):
+    def forget(self) -> None:
         """Take back what was said: the session starts anew."""
         self.state, self._wanted = DiagnosisState() if self.period else self.state, False
         self._session += 1
 
-    def ask_when_due(self, make_question, is_news):
+    def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
         """Start answering `make_question()` (or None) when that is wanted, or when the period is over and there is news."""
         now = time.monotonic()
         due = self._wanted or (bool(self.period) and is_news and now >= self._next and self._pacer.due(now))
@@ -80,10 +82,10 @@ class DiagnosisThread:
         if self._ending or session != self._session:
             raise _Ended
 
-    def end(self, timeout=10.0):
+    def end(self, timeout: float = 10.0) -> None:
         """Let the answer be, and wait for the thread."""
         self._ending = True
-        if self.is_running:
+        if self._thread is not None:
             self._thread.join(timeout)
 
 

@@ -5,9 +5,13 @@ Levels by convention: OK works as it should, a start included; WARN works and so
 for those who listen, when nothing comes any more.
 """
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.node import Node
 
 from imu_calibration.errors import shortened
 
@@ -16,7 +20,7 @@ PERIOD = 1.0
 """Seconds between two messages; diagnostic aggregators call a status stale after five."""
 
 
-def make_status(level, name, message, values=None, hardware_id=''):
+def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any] | None = None, hardware_id: str = '') -> DiagnosticStatus:
     """
     Return one DiagnosticStatus.
 
@@ -45,12 +49,12 @@ class DiagnosticsPublisher:
     The timer runs on the steady clock, so that diagnostics go on while simulated time stands still.
     """
 
-    def __init__(self, node, collect):
+    def __init__(self, node: Node, collect: Callable[[], list]):
         self._node, self._collect = node, collect
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._timer = node.create_timer(PERIOD, self.publish_now, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def publish_now(self):
+    def publish_now(self) -> None:
         """Publish the present state; when it cannot be told, that is told."""
         try:
             statuses = self._collect()

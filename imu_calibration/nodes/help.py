@@ -4,6 +4,7 @@ import inspect
 import sys
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from imu_calibration.nodes.parameter_files import meaning, settings_of, value_text
@@ -15,9 +16,9 @@ WIDTH = 118
 def help_text(node_class: Callable[[], Any]) -> str:
     """Return the help of a node, from the docstring of its module and the settings that it declares."""
     module = sys.modules[node_class.__module__]
-    name = inspect.getsourcefile(module).rpartition('/')[2].removesuffix('.py')
+    name = Path(inspect.getfile(module)).stem
     lines = [f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]', '',
-             inspect.getdoc(module), '', 'parameters:']
+             inspect.getdoc(module) or '', '', 'parameters:']
     for group in settings_of(name):
         for item in describe(group):
             lines.append(f'  {item.name}: {value_text(item.default)}')

@@ -56,7 +56,7 @@ class MatchedInput:
 
     """
 
-    def __init__(self, node: Node, message_type: type, topic: str, callback: Callable[..., None], *, depth: int = DEPTH,
+    def __init__(self, node: Node, message_type: type, topic: str, *, callback: Callable[..., None], depth: int = DEPTH,
                  group: CallbackGroup | None = None, single: bool = True, raw: bool = True, latched: bool = False):
         self.node, self.message_type, self.topic, self.single = node, message_type, topic, single
         self._callback, self._depth, self._group, self._raw, self._latched = callback, depth, group, raw, latched
@@ -146,9 +146,9 @@ class BatchInput(MatchedInput):
 
     """
 
-    def __init__(self, node: Node, message_type: type, topic: str, add: Callable[[bytes, int], None], **options: Any):
+    def __init__(self, node: Node, message_type: type, topic: str, *, add: Callable[[bytes, int], None], **options: Any):
         self._add = add
-        super().__init__(node, message_type, topic, self._arrived, **options)
+        super().__init__(node, message_type, topic, callback=self._arrived, **options)
 
     def _arrived(self, message: bytes, information: dict) -> None:
         self._add(message, sent_ns(information))

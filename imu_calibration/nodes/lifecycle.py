@@ -19,7 +19,7 @@ HEARD = 0.1
 """Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
 
 
-def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, spin: Callable[[Any], None] | None = None,
+def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, *, spin: Callable[[Any], None] | None = None,
              hints: dict[str, str] | None = None) -> int:
     """
     Run one node until the process is asked to end, and return the exit code.

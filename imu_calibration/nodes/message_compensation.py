@@ -2,8 +2,11 @@
 
 import numpy as np
 
+from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.covariance import is_known
+from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.sample_compensation import SampleCompensation
+from imu_calibration.compensation.stop_watch import StopWatch
 from imu_calibration.compensation.stream import late_ns
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.stamps import MessageError
@@ -34,22 +37,24 @@ class LiveCompensation(SampleCompensation):
 
     """
 
-    def __init__(self, calibration, transfer=None, check_frame=True, with_parameters=True, correct_stamps=False, *, watch=None):
+    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, *, check_frame: bool = True,
+                 with_parameters: bool = True, correct_stamps: bool = False,
+                 watch: StopWatch | None = None):
         super().__init__(calibration, transfer, with_parameters)
         self.watch = watch
         self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
-        self._message = ImuStream(transfer and transfer.frame_id, late_ns(calibration, correct_stamps))
+        self._message = ImuStream(None if transfer is None else transfer.frame_id, late_ns(calibration, correct_stamps))
         self._taken, self._rate_cov, self._force_cov = -1, b'', b''
         self._no_rate = self._no_force = self._absent = self._odd = False
         self._orientation_in, self._orientation_out, self._no_orientation = None, b'', False
         self._can_saturate = any(np.isfinite(self.levels))
 
-    def follow(self, before):
+    def follow(self, before: 'LiveCompensation') -> None:  # type: ignore[override]
         """Go on where another compensation stops."""
         super().follow(before)
         self.received = before.received
 
-    def __call__(self, data, sent_ns=0):
+    def __call__(self, data: bytes, sent_ns: int = 0) -> bytes | None:
         """
         Return the corrected message as bytes, or None when there is nothing to publish; `counts` says why.
 

@@ -32,7 +32,7 @@ def settings_of(node: str) -> list[type]:
     tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
     calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
     module = importlib.import_module(f'imu_calibration.nodes.{node}')
-    return [getattr(module, call.args[1].id) for call in sorted(calls, key=lambda call: call.lineno)]
+    return [getattr(module, ast.unparse(call.args[1])) for call in sorted(calls, key=lambda call: call.lineno)]
 
 
 def rendered(node: str) -> str:

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
 
@@ -57,8 +57,8 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
     return descriptor
 
 
-def watch_parameters(node: Node, groups: Mapping[str, Any], take: Callable[[str, Any], None],
-                     hints: Mapping[str, str] | None = None) -> None:
+def watch_parameters(node: Node, groups: dict[str, Any], take: Callable[[str, Any], None], *,
+                     hints: dict[str, str] | None = None) -> None:
     """
     Let the settings that are declared `live` be changed while the node runs; the others say why they cannot.
 
@@ -115,7 +115,7 @@ def unknown_parameters(node: Node) -> list[str]:
         if name in RETIRED:
             lines.append(f"parameter '{name}' is not needed any more: {RETIRED[name]}")
             continue
-        known = [item.name for item in node.get_parameters_by_prefix('').values()]
+        known = list(node.get_parameters_by_prefix(''))
         near = get_close_matches(name, known, 1)
         lines.append(f"parameter '{name}' is unknown and ignored" + (f"; did you mean '{near[0]}'?" if near else
                                                                      f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))

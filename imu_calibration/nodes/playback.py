@@ -3,10 +3,12 @@
 import queue
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
@@ -63,7 +65,8 @@ class Playback(threading.Thread):
 
     """
 
-    def __init__(self, node, publishers, batches, pace, clock_start_ns=0, awaited=(), on_end=lambda error: None):
+    def __init__(self, node: Node, publishers: Sequence, batches: Iterator[Batch], *, pace: Pace, clock_start_ns: int = 0,
+                 awaited: Sequence = (), on_end: Callable[[BaseException | None], None] = lambda error: None):
         super().__init__(name='playback', daemon=True)
         self._publishers, self._batches, self._pace, self._awaited, self._on_end = publishers, batches, pace, awaited, on_end
         self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
@@ -72,13 +75,13 @@ class Playback(threading.Thread):
         self._ending = threading.Event()
         self.n_published = 0
 
-    def end(self):
+    def end(self) -> None:
         """Stop as soon as possible."""
         self._ending.set()
         if self.is_alive():
             self.join(5.0)
 
-    def run(self):
+    def run(self) -> None:
         """Publish everything."""
         error = None
         try:

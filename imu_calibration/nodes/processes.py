@@ -5,21 +5,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 END_TIMEOUT = 30.0
 """Seconds a node may take to end."""
 
 
-def local_environment(domain_id):
+def local_environment(domain_id: int) -> dict[str, str]:
     """Return an environment in which DDS stays on this host and in a domain of its own."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
     return {**os.environ, 'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'PYTHONPATH': path,
             'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 
 
-def node_command(name, parameters=None, remappings=None, namespace='', node_name=None, parameter_file=None):
+def node_command(name: str, parameters: Mapping | None = None, *, remappings: Mapping | None = None, namespace: str = '',
+                 node_name: str | None = None, parameter_file: Any = None) -> list[str]:
     """
     Return the command that runs a node of this package.
 
@@ -57,17 +60,17 @@ def _text(value):
 class NodeProcesses:
     """Processes of one DDS domain; as a context manager it leaves none behind."""
 
-    def __init__(self, domain_id):
+    def __init__(self, domain_id: int):
         self.environment, self.running = local_environment(domain_id), []
 
-    def start(self, name, parameters=None, output=None, **options):
+    def start(self, name: str, parameters: Mapping | None = None, output: Any = None, **options: Any) -> subprocess.Popen:
         """Start a node (see `node_command`) and return its Popen; `output` is a file for what it prints."""
         process = subprocess.Popen(node_command(name, parameters, **options), env=self.environment, stdout=output, stderr=output,
                                    stdin=subprocess.DEVNULL)
         self.running.append(process)
         return process
 
-    def end(self, process, number=signal.SIGINT, timeout=END_TIMEOUT):
+    def end(self, process: subprocess.Popen, number: int = signal.SIGINT, timeout: float = END_TIMEOUT) -> int:
         """Send a signal and return the exit code; kill what does not end in time."""
         if process.poll() is None:
             process.send_signal(number)

@@ -7,10 +7,16 @@ node run in a second thread with the public executor.
 
 import sys
 import threading
+from collections.abc import Callable
+from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from imu_calibration.nodes.inputs import MatchedInput
 
 try:
     from rclpy.impl.implementation_singleton import rclpy_implementation as _inner
@@ -29,19 +35,19 @@ SWITCH_INTERVAL = 5e-4
 class OutsideExecutor(CallbackGroup):
     """Callbacks that the executor never takes: their subscription is read by `relay`."""
 
-    def can_execute(self, entity):
+    def can_execute(self, entity: Any) -> bool:
         """Return False: never by the executor."""
         return False
 
-    def beginning_execution(self, entity):
+    def beginning_execution(self, entity: Any) -> bool:
         """Return False: never by the executor."""
         return False
 
-    def ending_execution(self, entity):
+    def ending_execution(self, entity: Any) -> None:
         """Do nothing."""
 
 
-def available():
+def available() -> bool:
     """Return whether this rclpy has the inner parts that `relay` leans on."""
     wait_set = getattr(_inner, 'WaitSet', None)
     needed = {wait_set: ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
@@ -49,7 +55,7 @@ def available():
     return all(part is not None and all(hasattr(part, name) for name in names) for part, names in needed.items())
 
 
-def relay(node, source, publisher, convert):
+def relay(node: Node, source: MatchedInput, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]) -> None:
     """
     Publish what `convert` makes of each message until the context ends.
 

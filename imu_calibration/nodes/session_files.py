@@ -4,9 +4,9 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from imu_calibration import files
+from imu_calibration.calibration.session import LiveSession
 from imu_calibration.errors import ImuCalibrationError, shortened
 
 DEFAULT = 'calibration.yaml'
@@ -66,7 +66,7 @@ class SessionFiles:
         """
         return files.put_aside(self.accumulator)
 
-    def unsaved(self, live: Any) -> int:
+    def unsaved(self, live: LiveSession) -> int:
         """Return how many windows or poses of a session are in no file yet."""
         return max(live.n_windows - self.n_saved, 0)
 
@@ -74,13 +74,13 @@ class SessionFiles:
         """Take note that so many windows or poses are safe now."""
         self.saved_at, self.n_saved = time.monotonic(), n_windows
 
-    def save(self, live: Any, text: str | None) -> tuple[bool, str]:
+    def save(self, live: LiveSession, text: str | None) -> tuple[bool, str]:
         """
         Save both files; return whether both are safe now, and what became of each.
 
         Parameters
         ----------
-        live : LiveCalibration or LiveByHand
+        live : LiveSession
         text : str or None
             The calibration; None: there is none, the accumulator is saved alone.
 
@@ -99,7 +99,7 @@ class SessionFiles:
         lines = [f'written: {" and ".join(done)}'] * bool(done) + [f'not written: {line}' for line in failed]
         return not failed, '; '.join(lines)
 
-    def autosave(self, live: Any, period: float) -> bool:
+    def autosave(self, live: LiveSession, period: float) -> bool:
         """Save the accumulator when that is due; return whether it was. Raises an InputError when it cannot be written."""
         if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
             return False
@@ -108,7 +108,7 @@ class SessionFiles:
         self.note_saved(n_windows)
         return True
 
-    def keep(self, live: Any, noun: str) -> str:
+    def keep(self, live: LiveSession, noun: str) -> str:
         """Keep what is in no file at the end of a session where a place was given; return what became of it, '' when nothing was left."""
         unsaved = self.unsaved(live)
         if not unsaved:

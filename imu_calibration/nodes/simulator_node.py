@@ -93,7 +93,7 @@ NO_PROFILE = ('', 'none')
 class SimulatorNode(Node):
     """Publishes what a LiveSimulation makes."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
         self._controller = declare_parameters(self, ControllerSettings)
@@ -111,7 +111,8 @@ class SimulatorNode(Node):
         publishers = [self.create_publisher(kind, topic, output_qos(DEPTH)) for kind, topic in kinds]
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
         pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
-        self._playback = Playback(self, publishers, self._batches(), pace, start_ns, publishers[:1], self._ended)
+        self._playback = Playback(self, publishers, self._batches(), pace=pace, clock_start_ns=start_ns, awaited=publishers[:1],
+                                  on_end=self._ended)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._trajectories.put, 10)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.failed = self._is_over = False
@@ -119,7 +120,7 @@ class SimulatorNode(Node):
         moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
         self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, {settings.time_factor:g} times as fast as real time')
 
-    def close(self):
+    def close(self) -> str:
         """Stop publishing; return what became of it."""
         self._playback.end()
         return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
@@ -193,7 +194,7 @@ class SimulatorNode(Node):
     def _statuses(self):
         refused = self._driven['why refused']
         text = f'the last trajectory that was refused: {refused}' if refused else 'follows what comes on joint_trajectory'
-        return [make_status(WARN if refused else OK, 'table', text, dict(self._driven))]
+        return [make_status(WARN if refused else OK, 'table', text, values=dict(self._driven))]
 
     def _ended(self, error):
         self._is_over, self.failed = True, error is not None and rclpy.ok()
@@ -204,7 +205,7 @@ class SimulatorNode(Node):
         rclpy.try_shutdown()
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
     return run_node(SimulatorNode, arguments, hints=HINTS['simulator_node'])
 

@@ -106,7 +106,7 @@ class StreamWatch:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
-    def note_stamping(self, line: StampLine) -> None:
+    def note_stamping(self, line: StampLine | None) -> None:
         """Take how the stamps of the IMU are (a StampLine), or None."""
         self._stamping = line
 

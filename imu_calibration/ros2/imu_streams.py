@@ -75,7 +75,7 @@ class _Stream:
     def __init__(self, node, topic):
         self.node, self.topic, self.heads, self.gatherer = node, topic, ImuHeads(), LiveGatherer()
         self.by_wall_clock = not node.count_publishers('/clock')   # else stamps belong to the time that is played
-        self.input = BatchInput(node, Imu, topic, self._add)
+        self.input = BatchInput(node, Imu, topic, add=self._add)
 
     def _add(self, data, sent_ns):
         self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)

@@ -97,7 +97,7 @@ class Station:
 
         from imu_calibration.nodes.inputs import BatchInput
         gatherer = LiveGatherer()
-        self.subscriptions.append(BatchInput(self.node, Imu, topic, gatherer.add_imu, depth=20_000))
+        self.subscriptions.append(BatchInput(self.node, Imu, topic, add=gatherer.add_imu, depth=20_000))
         return gatherer
 
     def watch_documents(self, topic='imu/calibration'):
