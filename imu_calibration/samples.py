@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class _Columns:
@@ -101,3 +102,8 @@ class NominalScaling:
         """Return the samples in SI."""
         return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
                        rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
+
+
+def runs_of(flags: ArrayLike) -> np.ndarray:
+    """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], np.asarray(flags, bool), [False]]))).reshape(-1, 2)

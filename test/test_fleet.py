@@ -69,7 +69,8 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     assert 'unit_c.mcap' in units['unit_c']['error']
     assert '\n' not in units['unit_c']['error']
     assert not (output / 'unit_c').exists()
-    assert 'unit_c' in (output / 'summary.html').read_text()
+    page = (output / 'summary.html').read_text()
+    assert 'unit_c' in page and ' units are good</p>' in page and '--accent' in page   # the style of all reports
     assert capsys.readouterr().err == ''
 
 

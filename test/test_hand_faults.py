@@ -16,7 +16,7 @@ from imu_calibration.by_hand.turns import at_range_end, rising
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.segmentation.static_detector import find_still
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
@@ -83,8 +83,7 @@ def test_turns_with_clipped_samples_are_left_out(rate_hz):
     spoiled = clipped(imu, limit)
     at = np.abs(spoiled.rate_s).max(axis=1) == limit
     assert at_range_end(spoiled.rate_s).tolist() == at.tolist()
-    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]))))[::2]
-    assert rate_hz > 20 or runs.max() < 3
+    assert rate_hz > 20 or np.diff(runs_of(at)).max() < 3
     found = calibrated(spoiled)
     assert found.statistics['turns_dropped'].get('clipped', 0) > 0
     assert rate_error(found, truth) < 3 * rate_error(calibrated(imu), truth) + 1e-4

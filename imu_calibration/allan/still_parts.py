@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from imu_calibration.preflight.chunks import Chunks
 from imu_calibration.preflight.rest import still_chunks
+from imu_calibration.samples import runs_of
 
 OUTLIER = 8.0
 """Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median."""
@@ -80,7 +81,7 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     shrunk = _shrunk(still, margin)
     parts, short = [], 0.0
-    for first, last in _runs(shrunk, np.diff(chunks.time) > BRIDGE):
+    for first, last in _unbroken_runs(shrunk, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
         if part.seconds >= LEAST:
             parts.append(part)
@@ -151,10 +152,10 @@ def _shrunk(still, margin):
     return moving[np.minimum(index + margin + 1, len(still))] == moving[np.maximum(index - margin, 0)]
 
 
-def _runs(mask, broken):
+def _unbroken_runs(mask, broken):
     """Return (first, last + 1) of the runs of True, cut where `broken` says that two neighbours are apart."""
     edges = []
-    for first, last in np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2):
+    for first, last in runs_of(mask):
         cuts = first + 1 + np.flatnonzero(broken[first:last - 1])
         edges += list(zip([first, *cuts], [*cuts, last]))
     return edges

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.by_hand.equations import Poses, TurnData
 from imu_calibration.by_hand.options import ByHandSettings, KnownTurn
-from imu_calibration.samples import ImuSamples
+from imu_calibration.samples import ImuSamples, runs_of
 
 TOP = 20
 """Readings below the largest that tell how closely readings lie there."""
@@ -74,7 +74,7 @@ def _at_end(values, fresh):
     if len(below) < TOP:
         return np.zeros(len(values), bool)
     chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
-    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], at[fresh], [False]]))))[::2]
+    runs = np.diff(runs_of(at[fresh]))
     # the top of one smooth turn may fill a coarse step for some samples
     number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
     return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)

@@ -10,6 +10,7 @@ from pathlib import Path
 from imu_calibration import files
 from imu_calibration.calibration.fleet import FleetStep, Spread, UnitResult, fleet_exit_code, summarise
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.verdict import BAD, GOOD, WEAK
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
@@ -127,4 +128,8 @@ def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder:
 
 def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:
     """Return the summary as one page."""
-    return render('fleet.html', results=results, columns=COLUMNS, rows=[shown(spread) for spread in spreads])
+    verdicts = [result.verdict for result in results]
+    word = GOOD if set(verdicts) == {GOOD} else WEAK if set(verdicts) <= {GOOD, WEAK} else BAD
+    headline = f'{verdicts.count(GOOD)} of {len(results)} units are good'
+    return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=COLUMNS,
+                  rows=[shown(spread) for spread in spreads])

@@ -9,6 +9,9 @@ import numpy as np
 from imu_calibration.documents import from_text, to_text
 from imu_calibration.errors import InputError, shortened
 
+XYZ = 'XYZ'
+"""Axes in the names of parameters."""
+
 
 def commented(lines: list[str], mark: str = '# ') -> str:
     """Return lines as comments."""
@@ -106,6 +109,11 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     if not found:
         raise InputError(f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file')
     return found
+
+
+def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
+    """Return the parameters of the three axes, whose letter stands for ``*`` in the name, shape (3,)."""
+    return np.array([found.get(name.replace('*', axis), missing) for axis in XYZ])
 
 
 def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks
 from imu_calibration.preflight.rest import find_rest
+from imu_calibration.samples import runs_of
 
 SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
 LONG = 4
@@ -32,8 +33,8 @@ class FrozenPart:
 
 def long_runs(flags: np.ndarray) -> np.ndarray:
     """Return (start, stop) of the runs of at least `LONG` true flags, shape (n, 2)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))).reshape(-1, 2)
-    return edges[edges[:, 1] - edges[:, 0] >= LONG]
+    runs = runs_of(flags)
+    return runs[np.ptp(runs, axis=1) >= LONG]
 
 
 def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarray]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks
+from imu_calibration.samples import runs_of
 
 LEAST_CHUNKS = 4
 STILL = 0.02
@@ -100,6 +101,6 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
 
 
 def _stretches(still):
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
-    long = edges[edges[:, 1] - edges[:, 0] >= 2]
-    return long if len(long) else edges
+    runs = runs_of(still)
+    long = runs[np.ptp(runs, axis=1) >= 2]
+    return long if len(long) else runs

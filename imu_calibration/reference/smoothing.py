@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from imu_calibration.reference.quintic_spline import ORDER, penalty_bands
+from imu_calibration.samples import runs_of
 
 # Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100 of Nyquist's.
 _COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
@@ -80,8 +81,7 @@ class PenalisedSpline:
     def _least_decade(self):
         """Return the smallest penalty (decade) for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6."""
         empty = self.bands[0] < 1e-9 * self.density
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], empty, [False]]).astype(np.int8)))
-        hole = np.max(edges[1::2] - edges[::2], initial=0) + ORDER
+        hole = np.max(np.diff(runs_of(empty)), initial=0) + ORDER
         return max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
 
     def _end_weights(self, penalty):

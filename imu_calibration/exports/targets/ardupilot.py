@@ -10,9 +10,8 @@ from imu_calibration.exports.affine import AffineImu
 from imu_calibration.exports.gauges import forward_right_down
 from imu_calibration.exports.holdings import OFFSETS, SCALES, THERMAL_OFFSETS, of
 from imu_calibration.exports.target import Page, Read, Readings, Target
-from imu_calibration.exports.text import commented, read_parameters, refuse_curved
+from imu_calibration.exports.text import XYZ, commented, plain, read_parameters, refuse_curved, vector_of
 
-AXES = 'XYZ'
 OFFSET = {'accelerometer': 'INS_ACCOFFS', 'gyroscope': 'INS_GYROFFS'}
 SCALE = 'INS_ACCSCAL'
 CALTEMP = {'accelerometer': 'INS_ACC1_CALTEMP', 'gyroscope': 'INS_GYR1_CALTEMP'}
@@ -26,25 +25,21 @@ LARGEST_OFFSET, SCALES_ALLOWED = 3.5, (0.8, 1.2)
 
 def numbers(imu: AffineImu) -> dict:
     """Return parameters; offsets count at the temperature CALTEMP, polynomials without constant are about 35 C."""
-    found = {f'{OFFSET[s]}_{a}': value for s in SENSORS for a, value in zip(AXES, imu.bias[s])}
-    found |= {f'{SCALE}_{a}': 1.0 / value for a, value in zip(AXES, np.diag(imu.matrix['accelerometer']))}
+    found = {f'{OFFSET[s]}_{a}': value for s in SENSORS for a, value in zip(XYZ, imu.bias[s])}
+    found |= {f'{SCALE}_{a}': 1.0 / value for a, value in zip(XYZ, np.diag(imu.matrix['accelerometer']))}
     if any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
         low, high = imu.temperature_range_c or DEFAULT_RANGE
         found |= {f'{TCAL}_ENABLE': 1, f'{TCAL}_TMIN': low, f'{TCAL}_TMAX': high}
         for sensor in SENSORS:
             found[CALTEMP[sensor]] = imu.temperature_ref_c
             found |= {f'{TCAL}_{ORDER[sensor]}{power}_{a}': float(value) / PER_PARAMETER if power == 1 else 0.0
-                      for power in (1, 2, 3) for a, value in zip(AXES, imu.thermal[sensor])}
+                      for power in (1, 2, 3) for a, value in zip(XYZ, imu.thermal[sensor])}
     return found
-
-
-def _vector(found, name, missing=0.0):
-    return np.array([found.get(f'{name}_{a}', missing) for a in AXES])
 
 
 def _polynomial(found, sensor, temperature_c):
     warmth = temperature_c[:, None] - REFERENCE_C
-    return sum(_vector(found, f'{TCAL}_{ORDER[sensor]}{power}') * PER_PARAMETER * warmth**power for power in (1, 2, 3))
+    return sum(vector_of(found, f'{TCAL}_{ORDER[sensor]}{power}_*') * PER_PARAMETER * warmth**power for power in (1, 2, 3))
 
 
 def _thermal(found, sensor, temperature_c):
@@ -57,9 +52,9 @@ def _thermal(found, sensor, temperature_c):
 
 def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL``; gyroscopes have no scale."""
-    force = readings.force - _thermal(found, 'accelerometer', readings.temperature_c) - _vector(found, OFFSET['accelerometer'])
-    rate = readings.rate - _thermal(found, 'gyroscope', readings.temperature_c) - _vector(found, OFFSET['gyroscope'])
-    return force * _vector(found, SCALE, 1.0), rate
+    force = readings.force - _thermal(found, 'accelerometer', readings.temperature_c) - vector_of(found, OFFSET['accelerometer'] + '_*')
+    rate = readings.rate - _thermal(found, 'gyroscope', readings.temperature_c) - vector_of(found, OFFSET['gyroscope'] + '_*')
+    return force * vector_of(found, SCALE + '_*', 1.0), rate
 
 
 def imu(found: dict) -> AffineImu:
@@ -67,19 +62,18 @@ def imu(found: dict) -> AffineImu:
     on = found.get(f'{TCAL}_ENABLE') == 1
     limits = (found.get(f'{TCAL}_TMIN', DEFAULT_RANGE[0]), found.get(f'{TCAL}_TMAX', DEFAULT_RANGE[1])) if on else None
     ref = float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits)) if limits else 25.0
-    thermal = {s: _vector(found, f'{TCAL}_{ORDER[s]}1') * PER_PARAMETER * on for s in SENSORS}
-    bias = {s: _vector(found, OFFSET[s]) for s in SENSORS}
+    thermal = {s: vector_of(found, f'{TCAL}_{ORDER[s]}1_*') * PER_PARAMETER * on for s in SENSORS}
+    bias = {s: vector_of(found, OFFSET[s] + '_*') for s in SENSORS}
     if limits:   # both sensors may have been calibrated at temperatures of their own; the document has one
         there = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
         bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - there)
-    matrix = {'accelerometer': np.diag(1.0 / _vector(found, SCALE, 1.0)), 'gyroscope': np.eye(3)}
+    matrix = {'accelerometer': np.diag(1.0 / vector_of(found, SCALE + '_*', 1.0)), 'gyroscope': np.eye(3)}
     return AffineImu(bias=bias, matrix=matrix, thermal=thermal, temperature_ref_c=ref, temperature_range_c=limits)
 
 
 def write(page: Page) -> str:
     """Return a parameter file, ``NAME,VALUE``."""
-    values = {name: value if isinstance(value, int) else float(value) for name, value in page.numbers.items()}
-    return commented(page.comments) + ''.join(f'{name},{value!r}\n' for name, value in values.items())
+    return commented(page.comments) + ''.join(f'{name},{value!r}\n' for name, value in plain(page.numbers).items())
 
 
 def read(content: bytes, _path: str | Path) -> Read:
@@ -100,7 +94,7 @@ def read(content: bytes, _path: str | Path) -> Read:
 def ignored(found: dict) -> list[str]:
     """Return what lies outside the ranges that ArduPilot takes."""
     lines = []
-    offset, scale = _vector(found, OFFSET['accelerometer']), _vector(found, SCALE, 1.0)
+    offset, scale = vector_of(found, OFFSET['accelerometer'] + '_*'), vector_of(found, SCALE + '_*', 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
         lines.append(f'ArduPilot takes INS_ACCOFFS up to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused')
     if np.any((scale < SCALES_ALLOWED[0]) | (scale > SCALES_ALLOWED[1])):

@@ -10,9 +10,8 @@ from imu_calibration.exports.affine import AffineImu
 from imu_calibration.exports.gauges import forward_right_down
 from imu_calibration.exports.holdings import OFFSETS, SCALES, THERMAL_OFFSETS, of
 from imu_calibration.exports.target import Page, Read, Readings, Target
-from imu_calibration.exports.text import commented, read_parameters, refuse_curved
+from imu_calibration.exports.text import XYZ, commented, plain, read_parameters, refuse_curved, vector_of
 
-AXES = 'XYZ'
 CAL = {'accelerometer': 'CAL_ACC0', 'gyroscope': 'CAL_GYRO0'}
 TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
 DEFAULT_RANGE = (0.0, 100.0)
@@ -27,8 +26,8 @@ def numbers(imu: AffineImu) -> dict:
     """Return parameters; the coefficient of power p of axis a is called ``X{p}_{a}``."""
     found: dict[str, float] = {}
     for sensor in SENSORS:
-        found |= {f'{CAL[sensor]}_{a}OFF': value for a, value in zip(AXES, imu.bias[sensor])}
-    found |= {f'{CAL["accelerometer"]}_{a}SCALE': 1.0 / value for a, value in zip(AXES, np.diag(imu.matrix['accelerometer']))}
+        found |= {f'{CAL[sensor]}_{a}OFF': value for a, value in zip(XYZ, imu.bias[sensor])}
+    found |= {f'{CAL["accelerometer"]}_{a}SCALE': 1.0 / value for a, value in zip(XYZ, np.diag(imu.matrix['accelerometer']))}
     low, high = imu.temperature_range_c or DEFAULT_RANGE
     for sensor in SENSORS:
         if np.any(imu.thermal[sensor]):
@@ -48,15 +47,11 @@ def _thermal(found, sensor, temperature_c):
     return sum(warmth[:, None]**power * [found.get(f'{short}_X{power}_{axis}', 0.0) for axis in range(3)] for power in range(4))
 
 
-def _vector(found, prefix, ending, missing):
-    return np.array([found.get(f'{prefix}_{a}{ending}', missing) for a in AXES])
-
-
 def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(raw - thermal - offset) * scale``; gyroscopes have no scale."""
     made = {}
     for sensor, raw in zip(SENSORS, (readings.force, readings.rate)):
-        offset, scale = _vector(found, CAL[sensor], 'OFF', 0.0), _vector(found, CAL[sensor], 'SCALE', 1.0)
+        offset, scale = vector_of(found, f'{CAL[sensor]}_*OFF'), vector_of(found, f'{CAL[sensor]}_*SCALE', 1.0)
         made[sensor] = (raw - _thermal(found, sensor, readings.temperature_c) - offset) * scale
     return made['accelerometer'], made['gyroscope']
 
@@ -67,23 +62,19 @@ def imu(found: dict) -> AffineImu:
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
         on = bool(found.get(f'{TC[sensor]}_ENABLE'))
-        bias[sensor] = _vector(found, CAL[sensor], 'OFF', 0.0)
+        bias[sensor] = vector_of(found, f'{CAL[sensor]}_*OFF')
         thermal[sensor] = np.array([found.get(f'{short}_X1_{axis}', 0.0) if on else 0.0 for axis in range(3)])
         if on:
             bias[sensor] = bias[sensor] + [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
             ref, limits = found[f'{short}_TREF'], (found[f'{short}_TMIN'], found[f'{short}_TMAX'])
-    matrix = {'accelerometer': np.diag(1.0 / _vector(found, CAL['accelerometer'], 'SCALE', 1.0)), 'gyroscope': np.eye(3)}
+    matrix = {'accelerometer': np.diag(1.0 / vector_of(found, f'{CAL["accelerometer"]}_*SCALE', 1.0)), 'gyroscope': np.eye(3)}
     return AffineImu(bias=bias, matrix=matrix, thermal=thermal, temperature_ref_c=ref, temperature_range_c=limits)
 
 
 def write(page: Page) -> str:
     """Return a parameter file: vehicle, component, name, value, type."""
-    lines = [f'1\t1\t{name}\t{value!r}\t{INTEGER if isinstance(value, int) else REAL}' for name, value in _plain(page.numbers)]
+    lines = [f'1\t1\t{name}\t{value!r}\t{INTEGER if isinstance(value, int) else REAL}' for name, value in plain(page.numbers).items()]
     return commented([*page.comments, '', 'Vehicle-Id Component-Id Name Value Type']) + '\n'.join(lines) + '\n'
-
-
-def _plain(found):
-    return [(name, value if isinstance(value, int) else float(value)) for name, value in found.items()]
 
 
 def read(content: bytes, _path: str | Path) -> Read:
@@ -102,7 +93,7 @@ def ignored(found: dict) -> list[str]:
     """Return what PX4 takes for unchanged."""
     lines = []
     for sensor, ending, nominal in (('accelerometer', 'OFF', 0.0), ('accelerometer', 'SCALE', 1.0), ('gyroscope', 'OFF', 0.0)):
-        change = float(np.linalg.norm(_vector(found, CAL[sensor], ending, nominal) - nominal))
+        change = float(np.linalg.norm(vector_of(found, f'{CAL[sensor]}_*{ending}', nominal) - nominal))
         if 0 < change <= UNNOTICED:
             lines.append(f'PX4 takes {CAL[sensor]}_*{ending} for unchanged when the three together move by {UNNOTICED:g} or less (older '
                          f'versions 0.001), here they move by {change:.2g} from {nominal:g}: see that your version takes them')
