@@ -48,15 +48,15 @@ def expected(quick):
     return offline(quick)
 
 
-def blocks(imu, joints, seed=0, mean_seconds=0.2):
+def blocks(*streams, seed=0, mean_seconds=0.2):
     """Cut a session into uneven blocks as they would come from topics."""
     rng = np.random.default_rng(seed)
-    first, last = imu.stamp_ns[0] - 1, max(imu.stamp_ns[-1], joints.stamp_ns[-1]) + 1
+    first, last = streams[0].stamp_ns[0] - 1, max(samples.stamp_ns[-1] for samples in streams) + 1
     edges = np.sort(rng.integers(first, last, int((last - first) * 1e-9 / mean_seconds)))
     edges = np.concatenate([[first], edges, [last]])
-    cuts = [np.searchsorted(s.stamp_ns, edges) for s in (imu, joints)]
+    cuts = [np.searchsorted(s.stamp_ns, edges) for s in streams]
     for k in range(len(edges) - 1):
-        parts = [s.select(slice(c[k], c[k + 1])) for s, c in zip((imu, joints), cuts)]
+        parts = [s.select(slice(c[k], c[k + 1])) for s, c in zip(streams, cuts)]
         yield SampleBlock(*parts)
 
 
@@ -65,9 +65,9 @@ def offline(*sessions, options=CalibrationOptions()):
     return calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options)
 
 
-def run(live, imu, joints, seed=0):
+def run(live, *streams, seed=0):
     """Push a session and return the completed windows."""
-    return [window for block in blocks(imu, joints, seed) for window in live.push(block)]
+    return [window for block in blocks(*streams, seed=seed) for window in live.push(block)]
 
 
 def assert_same(a, b, share=SD):
@@ -139,6 +139,36 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     result, expected = second.solve(pending=True), offline(*halves)
     assert_same(result.calibration, expected.calibration)
     assert result.calibration.conditions == expected.calibration.conditions
+
+
+WARMTH = np.array([0.004, -0.006, 0.0025])
+"""What a kelvin adds to the readings of the accelerometers, m/s^2."""
+
+
+def at_temperature(samples, temperature_c):
+    """A part of a session, warmed up by 3 K about a temperature, with the readings of accelerometers that drift with it from 20 C on."""
+    imu, joints = samples
+    warm = temperature_c + np.linspace(-1.5, 1.5, len(imu))
+    return replace(imu, force_s=imu.force_s + (warm - 20.0)[:, None] * WARMTH), joints, TemperatureSamples(imu.stamp_ns, warm)
+
+
+def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):
+    """Each part alone says little of the drift; the two together say it, about the temperature of the first."""
+    parts = [at_temperature([cut(s, *part) for s in quick], temperature_c) for part, temperature_c in (((0.0, 0.5), 20.0), ((0.5, 1.0), 50.0))]
+    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect+accel_thermal_bias')
+    first = LiveCalibration(TABLE, options)
+    run(first, *parts[0])
+    second = LiveCalibration(TABLE, options, saved=first.saved(pending=True))
+    assert second.model.temperature_ref_c == first.model.temperature_ref_c == pytest.approx(18.5, abs=0.6)
+    run(second, *parts[1])
+    found, expected = second.solve(pending=True).calibration, offline(*parts, options=options).calibration
+    assert_same(found, expected)
+    plain = offline(quick).calibration   # before it was warmed
+    for effect, truth in (('accel_thermal_bias', WARMTH),
+                          ('bias', plain.value('accelerometer', 'bias') + (second.model.temperature_ref_c - 20.0) * WARMTH)):
+        error = found.value('accelerometer', effect) - truth
+        assert np.all(np.abs(error) < 4 * found.sd[found.model.slices['accelerometer', effect]]), effect
+    assert found.sd[found.model.slices['accelerometer', 'accel_thermal_bias']].max() < 1e-4
 
 
 def test_a_state_comes_back_to_the_last_bit(quick):

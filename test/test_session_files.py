@@ -2,6 +2,8 @@
 
 import errno
 import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +15,39 @@ from imu_calibration.nodes.session_files import SessionFiles
 def live(n_windows=7, saved=b'motion'):
     """Stands for a session."""
     return SimpleNamespace(n_windows=n_windows, saved=lambda pending: saved)
+
+
+FULL_DISK = '''
+import sys
+from types import SimpleNamespace
+from imu_calibration.nodes.session_files import SessionFiles
+
+def live(n_windows, size):
+    return SimpleNamespace(n_windows=n_windows, saved=lambda pending: b'%d' % n_windows * size)
+
+place = SessionFiles(sys.argv[1] + '/calibration.yaml')
+print(*place.save(live(3, 40_000), 'the first'), sep='; ')
+print(*place.save(live(4, 120_000), 'the second'), sep='; ')
+print(place.unsaved(live(5, 0)), place.calibration.read_text(), set(place.accumulator.read_text()), len(list(place.accumulator.parent.iterdir())))
+'''
+ON_A_SMALL_DISK = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c', 'mount -t tmpfs -o size=128k tmpfs "$1" || exit 77; exec "$2" -c "$3" "$1"', 'sh']
+"""Mounts a disk of 128 kB that nobody else sees and that ends with the process."""
+
+
+def test_on_a_disk_that_is_really_full_what_was_there_stays_whole(tmp_path):
+    try:
+        done = subprocess.run([*ON_A_SMALL_DISK, str(tmp_path), sys.executable, FULL_DISK], capture_output=True, text=True, timeout=60)
+    except FileNotFoundError:
+        pytest.skip('no unshare here, with which a small disk could be mounted')
+    if done.returncode in (1, 77) and 'Traceback' not in done.stderr:
+        pytest.skip(f'no small disk may be mounted here: {done.stderr.strip()}')
+    assert done.returncode == 0, done.stderr
+    first, second, left = done.stdout.splitlines()
+    calibration, accumulator = tmp_path / 'calibration.yaml', tmp_path / 'calibration.accumulator.npz'
+    assert first == f'True; written: {calibration} and {accumulator}'
+    assert second.startswith(f'False; written: {calibration}; not written: {accumulator} must be writable: No space left on device')
+    assert second.endswith('the earlier one there stays whole')
+    assert left == "2 the second {'3'} 2"
 
 
 @pytest.mark.parametrize('full_for', ('calibration.yaml', 'calibration.accumulator.npz'))
