@@ -91,9 +91,5 @@ def gauss_markov(time: float) -> NoiseProcess:
     return NoiseProcess('gauss_markov', 'sigma', '', kernel, f'The bias wanders and forgets within {time:g} s.', time=time)
 
 
-SLOPES = {'quantisation': -1.0, 'white_noise': -0.5, 'bias_instability': 0.0, 'random_walk': 0.5, 'ramp': 1.0}
-"""Slopes of the deviations on the log-log plot."""
-READ_AT = {'quantisation': 3.0**0.5, 'white_noise': 1.0, 'random_walk': 3.0, 'ramp': 2.0**0.5}
-"""Averaging time, s, at which each line reads its coefficient."""
 FLATNESS = (2 * np.log(2) / np.pi)**0.5
 """Deviation of flicker noise over B: 0.664."""

@@ -103,8 +103,6 @@ class Target:
     """Whether its noise includes random walks, which only a noise document has."""
     suffix: str = '.yaml'
     """Ending of its files."""
-    comment: str = '# '
-    """Beginning of a line of comment; '' where the format has none."""
     write: Callable[[Page], str | bytes] | None = None
     """The file; None: its files are read only."""
     read: Callable[[bytes, Any], Read] | None = None

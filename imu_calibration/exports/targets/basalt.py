@@ -76,5 +76,5 @@ TARGETS = (Target(
             'accelerometer: b and the lower triangle of S, gyroscope: b and the whole S, by columns',
     source='VladyslavUsenko/basalt-headers, calibration/calib_bias.hpp and calibration.hpp',
     holds=OFFSETS + MATRICES, estimates=THERMAL_OFFSETS, placement=accelerometer_lower, numbers=numbers, corrected=corrected, noise=noise,
-    noise_is='continuous, per axis', suffix='.json', comment='', write=write, read=read, imu=imu, axes='accelerometer_lower_triangular',
+    noise_is='continuous, per axis', suffix='.json', write=write, read=read, imu=imu, axes='accelerometer_lower_triangular',
     hint="put these entries into the 'value0' of your calibration.json; the camera entries there must refer to the frame named above"),)

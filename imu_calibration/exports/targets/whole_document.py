@@ -55,7 +55,7 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
 
 def _target(name, title, writer, reader, suffix):
     return Target(name=name, title=title, formula='measured = bias + matrix @ (true + lever-arm terms) + further effects; values in SI',
-                  source='imu_calibration, calibration.yaml', whole=True, write=writer, read=reader, suffix=suffix, comment='')
+                  source='imu_calibration, calibration.yaml', whole=True, write=writer, read=reader, suffix=suffix)
 
 
 TARGETS = (_target('json', 'the whole document as JSON', write_json, read_json_document, '.json'),
