@@ -81,11 +81,11 @@ class Collector:
             found.spread.add(window)
         return reduced
 
-    def _columns(self, window):
+    def _columns(self, _window):
         """Return the function that gives the columns of a window."""
         return columns
 
-    def _store(self, window, reduced: WindowStatistics):
+    def _store(self, window, _reduced: WindowStatistics):
         kept = self.gathered.kept
         if window.kind != 'static' and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES:
             kept.append(window)

@@ -190,7 +190,7 @@ class CompensatorNode(Node):
         elif self.settings.calibration_file:
             self._try("parameter 'calibration_file'", self._load_file, self.settings)
 
-    def _on_reload(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reload(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.settings.calibration_file:
             why = self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
@@ -198,7 +198,7 @@ class CompensatorNode(Node):
         response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
         return response
 
-    def _change(self, name: str, settings: CompensatorSettings) -> None:
+    def _change(self, _name: str, settings: CompensatorSettings) -> None:
         """Take changed parameters; raises an ImuCalibrationError and stays as it was."""
         old, insists = self.settings, settings.anyway and not self.settings.anyway
         if settings.calibration_file and (settings.calibration_file != old.calibration_file or (insists and not settings.takes_topic)):

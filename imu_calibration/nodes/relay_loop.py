@@ -35,15 +35,15 @@ SWITCH_INTERVAL = 5e-4
 class OutsideExecutor(CallbackGroup):
     """Callbacks that the executor never takes: their subscription is read by `relay`."""
 
-    def can_execute(self, entity: Any) -> bool:
+    def can_execute(self, _entity: Any) -> bool:
         """Return False: never by the executor."""
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
+    def beginning_execution(self, _entity: Any) -> bool:
         """Return False: never by the executor."""
         return False
 
-    def ending_execution(self, entity: Any) -> None:
+    def ending_execution(self, _entity: Any) -> None:
         """Do nothing."""
 
 

@@ -124,10 +124,10 @@ def _axes(sensor, moments, table):
         return
     what, whose = WORDS[sensor]
     yield CheckFinding('handedness', REFUSE,
-                       f'{what} must be {whose}, {_exchange(match, seen, whose)}: {_cause(match, matrix, seen, table)}')
+                       f'{what} must be {whose}, {_exchange(match, seen)}: {_cause(match, matrix, seen, table)}')
 
 
-def _exchange(match, seen, whose):
+def _exchange(match, seen):
     known = [f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}" for i, j, sign in match.exchanges(seen)]
     return ', '.join(known) if known and match.agreement > CLEAR else 'no exchange of axes makes them so'
 

@@ -41,7 +41,7 @@ class CountedClock:
         self._origin_ns: int | None = None
         self._next = 0.0
         self._before = np.zeros((2, 0))
-        self._block: tuple[np.ndarray, np.ndarray] | None = None
+        self._block: np.ndarray | None = None
         self._points: list[tuple[float, float]] = []
 
     def push(self, stamp_ns: np.ndarray) -> None:
@@ -75,9 +75,9 @@ class CountedClock:
             late = stamp - self._period * number
             self._points.append((float(number.mean()), float((late.min() if self._arrivals else late.mean()) + self._period * number.mean())))
         if self._block is not None:
-            self._tell(*self._block)
+            self._tell(self._block)
             self._follow()
-        self._block = number, stamp
+        self._block = number
 
     def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
         """Return the numbers of the first `count` samples: one more each, and as many more as were lost behind a long step."""
@@ -91,7 +91,7 @@ class CountedClock:
                 number[k:] += np.round(jump / self._period) if jump > self._margin else 0.0
         return number[:count]
 
-    def _tell(self, number: np.ndarray, stamp: np.ndarray) -> None:
+    def _tell(self, number: np.ndarray) -> None:
         """Tell the times of a block, from the points of its neighbours and its own."""
         points = np.array(self._points)
         ends = (points[0] - (BLOCK, BLOCK * self._period), points[-1] + (BLOCK, BLOCK * self._period))
@@ -111,5 +111,5 @@ class CountedClock:
     def _finish(self) -> None:
         """Tell what is left, and forget."""
         if self._block is not None:
-            self._tell(*self._block)
+            self._tell(self._block)
         self._begin()

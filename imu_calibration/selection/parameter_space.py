@@ -16,10 +16,10 @@ from imu_calibration.selection.reduced_recording import ReducedRecording
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
     """
-    A reduced recording in the parameters that are asked about: those of the extended model, then the amplitudes of the banks of time
-    constants, per sensor.
+    A reduced recording in the parameters that are asked about.
 
-    Rows are ``[design | residual]`` of one axis; all their columns act on that axis.
+    Those of the extended model come first, then the amplitudes of the banks of time constants, per sensor. Rows are
+    ``[design | residual]`` of one axis; all their columns act on that axis.
     """
 
     recording: ReducedRecording
