@@ -56,13 +56,15 @@ From the ground up; each package imports only what stands above it. The words ar
 `selection`       which effects the evidence of a recording asks for, proven on windows that are held out
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
+`planning`        which motion next: the gain of motions per second, and the least time that any plan takes
 `by_hand`         calibration without a table; the arm between two IMUs
-`report`          pages that people look at
 `exports`         a calibration in the words of other programs, and back; what each of them loses
 `diagnosis`       what the model gets wrong, and why
+`report`          pages that people look at
 `files`           files written whole or not at all; `resources` finds those that are installed
 `use_cases`       from files to files: what the command line and notebooks call
 `cli`, `nodes`    the command line and the ROS 2 nodes; `msg_adapters` beside this package knows messages and bags
+`ros2`            the verbs under ``ros2 imu``, and the checks of ``ros2 doctor``
 ================  ======================================================================================================
 """
 

@@ -2,6 +2,7 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -129,6 +130,13 @@ def test_each_package_imports_only_what_stands_below_it(path):
 def test_every_package_has_its_place_in_the_order():
     found = {path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0] for path in modules('imu_calibration')} - {'__init__'}
     assert found == {name for names in ORDER for name in names}
+
+
+def test_the_page_of_contents_goes_from_the_ground_up():
+    height = {name: row for row, names in enumerate(ORDER) for name in names}
+    text = ast.get_docstring(ast.parse(FRONT_DOOR.read_text()))
+    listed = [name for line in text.partition('Contents')[2].splitlines() for name in re.findall(r'^`(\w+)`', line)]
+    assert len(listed) > 15 and listed == sorted(listed, key=height.get)
 
 
 def test_every_package_says_what_comes_in_what_goes_out_and_what_to_read_first():
