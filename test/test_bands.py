@@ -99,3 +99,10 @@ def test_variance_along_the_columns_is_that_of_noise_and_shows_what_is_no_noise(
 
     assert 9 * 0.05 < along(noise) < 9 * 4
     assert along(noise + 0.2 * design[:, 1]) > 50
+
+
+def test_the_slow_misfit_of_few_pieces_is_taken_larger():
+    """By two standard deviations of a variance from so many: parts are told apart where that is sure, and weighed by what is sure."""
+    few, many = (band_misfit(np.full(3, 3.0 * (9 * dof) + dof), 10 * dof, np.full(3, float(dof)), dof_slow=dof) for dof in (8, 800))
+    assert not few.apart.any() and many.apart.all()
+    np.testing.assert_allclose(many.slow, 1 + 2 * np.sqrt(2 / 800))

@@ -9,7 +9,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.selection import investigation
-from imu_calibration.selection.saturation import may_be_clipped
+from imu_calibration.selection.saturation import find_saturation, may_be_clipped, without_clipped
 from imu_calibration.use_cases.diagnose import diagnose
 
 from worlds.misfit_worlds import make_pair
@@ -39,6 +39,31 @@ def test_a_limit_is_seen_in_fine_and_in_coarse_outputs(step):
     swing = 12.0 * np.sin(np.arange(48_000) * 0.02)[:, None] * np.array([0.1, 0.2, 1.0])
     force = np.clip(np.round(swing / step) * step, -100 * STEP, 100 * STEP)
     assert may_be_clipped(windows_of(force), 'accelerometer')
+
+
+@pytest.mark.parametrize('where', ['where the force is large', 'at rest'])
+def test_a_limit_is_where_the_motion_passes_it(where):
+    """An output that sticks at its largest value while nothing happens is no limit, though the model expects more elsewhere."""
+    expected = 12.0 * np.sin(np.arange(8000) * 0.02)[:, None] * np.array([0.0, 0.0, 1.0])
+    force = expected + np.random.default_rng(1).normal(0, 0.01, expected.shape)
+    if where == 'at rest':
+        force *= 0.8
+        force[np.abs(expected[:, 2]) < 0.1, 2] = 10.0
+    else:
+        force = np.clip(force, -10.0, 10.0)
+    windows = windows_of(force)
+    predicted = [(part, np.zeros_like(part)) for part in np.split(expected, 10)]
+    found = find_saturation(windows, predicted, np.full(3, 0.01), sensor='accelerometer')
+    assert found is None if where == 'at rest' else found.level == 10.0
+
+
+def test_samples_at_a_limit_and_those_predicted_near_it_are_left_out():
+    """The first twenty of a hundred are at the limit, the next twenty might be, and no more go."""
+    expected, force = np.zeros((100, 3)), np.zeros((100, 3))
+    force[:20, 2], expected[20:40, 2], force[20:40, 2] = 10.0, 9.97, 9.9
+    kept = without_clipped(windows_of(force, 1), [(expected, np.zeros((100, 3)))], {'accelerometer': 10.0},
+                           noise_sd={'accelerometer': np.full(3, 0.01), 'gyroscope': np.full(3, 0.01)})
+    assert [list(window.stamp_ns // 10**7) for window in kept] == [list(range(40, 100))]
 
 
 @pytest.mark.real_data

@@ -1,0 +1,158 @@
+"""Lines that stand between the tool and a false claim, each with a fault and the tests that must notice it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault."""
+
+    name: str
+    """What is broken, in a few words."""
+    file: str
+    """Where, from the root of the repository."""
+    line: str
+    """Part of the text that is there once."""
+    fault: str
+    """What stands there instead."""
+    tests: tuple[str, ...]
+    """Test files, or single tests, that must notice; the quickest first."""
+
+
+def _of(package, *mutants):
+    """Return the mutants of (name, file, line, fault, tests) in a package."""
+    return tuple(Mutant(name, f'{package}/{file}', line, fault, tuple(f'test/{test}' for test in tests.split()))
+                 for name, file, line, fault, tests in mutants)
+
+
+NOISE = _of(
+    'imu_calibration/estimation',
+    ('scatter from window to window dropped from weights', 'noise_model.py', 'return self.low_variance * np.stack(', 'return 1e-3 * self.low_variance * np.stack(',
+     'test_noise_model.py'),
+    ('noise at low frequency taken for white', 'noise_model.py', 'return self.white_variance * self.inflation', 'return self.white_variance * 1.0',
+     'test_noise_model.py'),
+    ('knocked rests enter the noise', 'noise_model.py', "(variances[:, axis] <= 2 * median) & (variances[:, axis] >= 0.5 * median)",
+     'variances[:, axis] > 0', 'test_noise_model.py'),
+    ('variance from few data taken for certain', 'noise_model.py', 'DOF_FACTOR_MOST = 3.0', 'DOF_FACTOR_MOST = 1.0', 'test_noise_model.py'),
+    ('slow misfit not weighed apart', 'band_misfit.py', 'apart = of_fast > APART * cautious', 'apart = of_fast > np.inf * cautious', 'test_bands.py'),
+    ('caution about the slow misfit dropped', 'band_misfit.py', 'SURE = 2.0', 'SURE = 0.0', 'test_bands.py'),
+    ('correlated misfit along the columns not seen', 'band_misfit.py', 'STRONG = 1e-6', 'STRONG = 2.0', 'test_noise_model.py test_bands.py'),
+)
+COVARIANCE = _of(
+    'imu_calibration/estimation',
+    ('prior of held parameters left out of the covariance', 'scaled_solve.py', 'total = influence @ np.diag(prior_sd[held]**2) @ influence.T',
+     'total = 0 * influence @ np.diag(prior_sd[held]**2) @ influence.T', 'test_linear.py test_estimation.py'),
+    ('nothing is ever held', 'solver.py', 'HELD_SHARE = 0.5', 'HELD_SHARE = 5.0', 'test_estimation.py test_observability.py'),
+    ('misfit does not widen standard deviations', 'model_error.py', 'factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])',
+     'factor[waves.places[group]] = 1.0', 'test_model_error.py'),
+    ('drifts do not widen standard deviations', 'model_error.py', 'more[waves.places[group]] = waves.drift(group)[1]',
+     'more[waves.places[group]] = 0.0', 'test_model_error.py'),
+    ('standard deviations widen by chance', 'model_error.py', 'CHANCE = 0.01', 'CHANCE = 0.9', 'test_model_error.py'),
+    ('values that only misfit gives are believed', 'unbelievable.py', '(size > _limit(effect)) & ', '(size < 0) & ', 'test_believing.py'),
+    ('a wrong full scale is taken for misfit', 'unbelievable.py', ' & (size < sd[part] * max(feigned[sensor] for sensor in sensors))', '',
+     'test_believing.py'),
+    ('unasked values do not shrink', 'shrinkage.py', 'values -= min(1.0, ', 'values -= min(0.0, ', 'test_believing.py'),
+    ('unasked values vanish', 'shrinkage.py', 'min(1.0, known.sum() / max(chi2, 1e-300))', '1.0', 'test_believing.py'),
+)
+SEARCH = _of(
+    'imu_calibration/selection',
+    ('offsets of windows left out of the evidence', 'normal_matrices.py', ' + own.offset_sd**2', '', 'test_search.py'),
+    ('gain judged on the windows that chose it', 'gain.py', 'for rows in (~attempt.locked, attempt.locked))', 'for rows in (attempt.locked, ~attempt.locked))',
+     'test_search.py'),
+    ('locked windows take part in the fit', 'evidence.py', 'fold = np.full(len(kind), -1)', 'fold, locked = np.full(len(kind), -1), np.zeros_like(locked)',
+     'test_search.py'),
+    ('cross-validation that leaks', 'evidence.py', 'quadratic(part, used, self.fit(used, number)[0])', 'quadratic(part, used, self.fit(used)[0])',
+     'test_search.py'),
+    ('interval of 50 % called 95 %', 'gain.py', '(0.025, 0.975)', '(0.25, 0.75)', 'test_search.py'),
+    ('correction for the number of effects dropped', 'search.py', 'self.evidence.p_value(smaller, larger) * len(self.questions)',
+     'self.evidence.p_value(smaller, larger)', 'test_search.py'),
+    ('significance of 1 % becomes 50 %', 'search.py', 'FAMILY_WISE = 0.01', 'FAMILY_WISE = 0.5', 'test_search.py'),
+    ('gain on held-out windows not asked for', 'search.py', ' and self.net > 0 and self.gain > LEAST_GAIN', '', 'test_search.py'),
+    ('a negative time constant is allowed', 'search.py', 'if question.effect.nonnegative and value[0] < 0:', 'if False:', 'test_search.py'),
+    ('steps of the encoder pass for errors of the table', 'search.py', '< 0.5 * self.encoder_step)', '< 0.0 * self.encoder_step)', 'test_search.py'),
+    ('absurd sizes are explanations', 'search.py', '(1.0 if question.effect.known_size else ABSURD)', '1e9', 'test_search.py'),
+    ('earlier choices never reconsidered', 'search.py', 'chosen = self.reconsidered(chosen + [best.question])', 'chosen = chosen + [best.question]',
+     'test_search.py'),
+    ('share of the unexplained that a finding must remove', 'explained_share.py', 'LEAST_SHARE = 0.7', 'LEAST_SHARE = 0.1', 'test_search.py'),
+    ('the same for what is smooth in time', 'explained_share.py', 'LEAST_SHARE_SMOOTH = 0.9', 'LEAST_SHARE_SMOOTH = 0.1', 'test_search.py'),
+    ('a cause of the table need not show in both sensors', 'explained_share.py', 'return min(value / (value', 'return max(value / (value', 'test_search.py'),
+    ('biases do not move by nature', 'bias_process_search.py', 'NATURAL = 0.5', 'NATURAL = 0.0', 'test_search.py'),
+    ('a smooth effect need not beat the wander of the bias', 'noise_beside_effects.py', 'SMOOTH_PENALTY = 7.0', 'SMOOTH_PENALTY = -50.0',
+     'test_search.py'),
+    ('halves that disagree are not asked', 'investigation.py', 'if not attempt.agrees_in_halves(named, question)]', 'if False]', 'test_search.py'),
+    ('halves disagree by chance', 'attempt.py', 'DISAGREE = 1e-4', 'DISAGREE = 0.5', 'test_search.py'),
+    ('a finding need not lower the residual in its own unit', 'investigation.py', 'short = [paid <= _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]',
+     'short = [False for each in kept]', 'test_search.py'),
+    ('no veto of windows that took no part', 'investigation.py', 'if min(helps) >= 0.0:', 'if True:', 'test_search.py'),
+    ('limits need not agree with the motion', 'saturation.py', 'AGREEMENT = 0.25', 'AGREEMENT = 0.0', 'test_saturation.py'),
+    ('coarse outputs pass for clipped ones', 'saturation.py', 'return bool(at > 3 * repeats[-5:].max(initial=1))', 'return True', 'test_saturation.py'),
+    ('clipped samples stay', 'saturation.py', 'good &= ~(near | at).any(axis=1)', 'good &= ~(near & ~near | at & ~at).any(axis=1)', 'test_saturation.py'),
+)
+DIAGNOSIS = _of(
+    'imu_calibration/diagnosis',
+    ('threshold of what is unexplained', 'unexplained.py', 'SIGNIFICANT = 5.0', 'SIGNIFICANT = 50.0', 'test_search.py'),
+    ('any correlation is told', 'unexplained.py', 'if p_value < ALPHA and share > max(best[1], 0.15):', 'if share > best[1]:', 'test_search.py'),
+    ('mates that do not show in the sensor', 'diagnose.py', 'MATE = 0.5', 'MATE = -9.0', 'test_search.py'),
+)
+HAND = _of(
+    'imu_calibration',
+    ('gravity enters the gyroscope by chance', 'by_hand/g_sensitivity.py', 'P_VALUE = 1e-3', 'P_VALUE = 0.9', 'test_hand_faults.py test_by_hand.py'),
+    ('time is not asked beside gravity', 'by_hand/g_sensitivity.py', '[np.ones(count), time, time**2][:3 if count >= 12 else 2]', '[np.ones(count)]',
+     'test_hand_faults.py'),
+    ('drifts do not widen sds by hand', 'by_hand/bias_movement.py', 'grown[index[:3], index[:3]] += (movement.size / 2)**2', 'grown[index[:3], index[:3]] += 0',
+     'test_hand_faults.py'),
+    ('what does not belong to the others stays', 'by_hand/outliers.py', 'if p * max(len(own), 1) < P_VALUE]', 'if p < 0]', 'test_hand_faults.py'),
+    ('missed turns stay', 'by_hand/outliers.py', 'CONTRADICTED = 0.35', 'CONTRADICTED = 9.0', 'test_hand_faults.py'),
+    ('slow turns are poses', 'segmentation/static_detector.py', 'keep[1:-1] &= np.all(', 'keep[1:-1] |= np.all(', 'test_hand_faults.py test_still_search.py'),
+    ('spikes stay', 'segmentation/spike_filter.py', 'LARGE = 8.0', 'LARGE = 8e9', 'test_spike_filter.py'),
+    ('fast motion passes for spikes', 'segmentation/spike_filter.py', 'np.maximum(1.4 * limit, ROUGH * rough)', '1.4 * limit', 'test_spike_filter.py'),
+)
+TRUST = _of(
+    'imu_calibration',
+    ('bad verdicts are used', 'calibration/trust.py', 'if calibration.verdict == BAD else []', 'if False else []', 'test_trust.py'),
+    ('disproven calibrations are used', 'calibration/trust.py', '*disproved(calibration.proof)]', ']', 'test_trust.py'),
+    ('the compensator takes what speaks against itself', 'nodes/adoption.py', 'if not settings.anyway:', 'if False:', 'test_adoption.py'),
+    ('a calibration for another sensor is taken', 'nodes/adoption.py', 'calibration.frame_id != known:', 'False:', 'test_adoption.py'),
+    ('whatever a document does ends the node', 'nodes/adoption.py', 'except Exception as error:   # whatever', 'except ZeroDivisionError as error:   # whatever',
+     'test_adoption.py'),
+    ('help that is not shown counts as help', 'calibration/proof_words.py', " and found['ci95'][1] < 1.0)", ')', 'test_proof.py test_trust.py'),
+    ('harm in some motion is passed over', 'calibration/proof_words.py', "part['after'] > HARM * part['before']", "part['after'] > 99 * part['before']",
+     'test_proof.py test_trust.py'),
+    ('proof on windows that were fitted', 'calibration/held_out.py', 'for k, part in enumerate(parts) if k != fold)', 'for k, part in enumerate(parts))',
+     'test_proof.py'),
+    ('misfit is not a reason', 'calibration/verdict.py', 'MISFIT = 10.0', 'MISFIT = 1e9', 'test_verdict.py'),
+    ('weak called determined', 'calibration/status.py', 'DETERMINED if s <= t else WEAK', 'DETERMINED if s <= 9 * t else WEAK', 'test_observability.py test_verdict.py'),
+    ('held called determined', 'calibration/status.py', 'HELD if h else DETERMINED', 'DETERMINED if h else DETERMINED', 'test_observability.py test_verdict.py'),
+    ('weak values applied whatever they cost', 'compensation/compensate.py', 'applied_values(', '(lambda known: known.values)(', 'test_believing.py'),
+)
+FILES = _of(
+    'imu_calibration',
+    ('files written where they stand', 'files.py', "beside = path.parent / f'.{os.getpid()}.{zlib.crc32(path.name.encode(errors=\"replace\")):08x}'", 'beside = path',
+     'test_disk_faults.py test_cli_bad_input.py'),
+    ('no limit to nesting', 'documents.py', 'DEEPEST = 20', 'DEEPEST = 10**9', 'test_documents.py test_document_faults.py'),
+    ('aliases allowed', 'documents.py', "if kind == 'AliasEvent':", 'if False:', 'test_documents.py test_document_faults.py'),
+    ('another model is resumed', 'calibration/accumulator_state.py', 'if not same or known.point.keys()', 'if known.point.keys()', 'test_session_files.py test_live_calibration.py'),
+    ('another temperature is resumed', 'calibration/accumulator_state.py', ' and known.temperature_ref_c == model.temperature_ref_c', '',
+     'test_live_calibration.py test_session_files.py'),
+)
+SIGNS = _of(
+    'imu_calibration',
+    ('centripetal term with the other sign', 'reference/reference_motion.py', 'return skew(alpha_s) + cross @ cross', 'return skew(alpha_s) - cross @ cross',
+     'test_turntable.py'),
+    ('tangential term with the other sign', 'reference/reference_motion.py', 'return skew(alpha_s) + cross @ cross', 'return -skew(alpha_s) + cross @ cross',
+     'test_turntable.py'),
+    ('parameters left out of the published covariance', 'compensation/covariance.py', 'self.parameters[k:k + 3, k:k + 3] if with_parameters else total',
+     'total * 0 if with_parameters else total', 'test_compensation_covariance.py'),
+    ('delay of the derivative left out of the published covariance', 'compensation/covariance.py', '(self.earlier * rate_cov + error_cov)',
+     '(self.earlier * rate_cov)', 'test_compensation_covariance.py test_rate_slope.py'),
+    ('bias added instead of taken away', 'compensation/kernel.py', '[added(row, {(): -constant})', '[added(row, {(): constant})', 'test_compensation_kernel.py'),
+)
+LIVE = _of(
+    'imu_calibration',
+    ('an open window counts twice', 'calibration/live.py', 'gathered, store, self.open_windows = self._collector.snapshot(pending)',
+     'gathered, store, self.open_windows = self._collector.snapshot(True)', 'test_live_calibration.py'),
+    ('an earlier run is forgotten', 'calibration/live.py', 'return merge([copied(self.earlier), gathered])', 'return gathered', 'test_live_calibration.py'),
+    ('solving again adds the earlier run again', 'calibration/live.py', 'merge([copied(self.earlier), gathered])', 'merge([self.earlier, gathered])',
+     'test_live_calibration.py'),
+)
+MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *DIAGNOSIS, *HAND, *TRUST, *FILES, *SIGNS, *LIVE)

@@ -1,0 +1,97 @@
+"""Break each declared line, one at a time, in a copy of the code, and report the faults that no test noticed."""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / 'test'))
+
+from mutants.declared import MUTANTS  # noqa: E402
+
+TIMEOUT = 300.0
+"""s; a test that a fault keeps from ending has noticed it."""
+NOTICED, SURVIVED, BROKEN = 'noticed', 'SURVIVED', 'BROKEN'
+
+
+def copied(folder):
+    """Copy what git knows of, so that nothing here is ever broken."""
+    names = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split('\0')
+    for name in filter(None, names):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+def tested(folder, tests):
+    """Return pytest's exit code and the last line that it printed."""
+    env = os.environ | {'PYTHONPATH': os.pathsep.join([str(folder), os.environ.get('PYTHONPATH', '')]), 'PYTHONDONTWRITEBYTECODE': '1'}
+    command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *tests]
+    try:
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired:
+        return 1, f'did not end within {TIMEOUT:.0f} s'
+    return done.returncode, next((line for line in reversed(done.stdout.splitlines()) if line.startswith(('FAILED', 'ERROR'))), '')
+
+
+def tried(folder, mutant):
+    """Return (what became of a mutant, the test that noticed)."""
+    path = folder / mutant.file
+    text = path.read_text()
+    if text.count(mutant.line) != 1:
+        return BROKEN, f'{mutant.file} has its line {text.count(mutant.line)} times'
+    path.write_text(text.replace(mutant.line, mutant.fault))
+    try:
+        for test in mutant.tests:
+            code, line = tested(folder, [test])
+            if code == 1:
+                return NOTICED, line
+            if code:
+                return BROKEN, line or f'pytest ended with {code} on {test}'
+        return SURVIVED, ''
+    finally:
+        path.write_text(text)
+
+
+def main():
+    """Try all mutants, or those whose name or file holds a word that is given; exit code 1 when one survives."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('words', nargs='*', help='only mutants with one of these in their name or file')
+    parser.add_argument('--workers', type=int, default=2)
+    asked = parser.parse_args()
+    chosen = [m for m in MUTANTS if not asked.words or any(word in m.name or word in m.file for word in asked.words)]
+    start, counts = time.monotonic(), dict.fromkeys((NOTICED, SURVIVED, BROKEN), 0)
+    with tempfile.TemporaryDirectory() as place:
+        folders = Queue()
+        for number in range(asked.workers):
+            folders.put(copied(Path(place) / str(number)))
+        needed = sorted({test for mutant in chosen for test in mutant.tests})
+        code, line = tested(folders.queue[0], needed)
+        if code:
+            sys.exit(f'the tests must pass before anything is broken: {line or code}')
+
+        def one(mutant):
+            folder = folders.get()
+            try:
+                return mutant, *tried(folder, mutant)
+            finally:
+                folders.put(folder)
+
+        with ThreadPoolExecutor(asked.workers) as pool:
+            for mutant, outcome, line in pool.map(one, chosen):
+                counts[outcome] += 1
+                print(f'{outcome:9}{mutant.name}: {line.partition(" - ")[0]}', flush=True)
+    print(f'{len(chosen)} faults, {counts[NOTICED]} noticed, {counts[SURVIVED]} survived, {counts[BROKEN]} not tried; {time.monotonic() - start:.0f} s')
+    sys.exit(bool(counts[SURVIVED] + counts[BROKEN]))
+
+
+if __name__ == '__main__':
+    main()

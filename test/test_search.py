@@ -1,0 +1,234 @@
+"""The guards of the search, each in a case in which it alone stands between the tool and a false claim."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imu_calibration.diagnosis import unexplained as rests
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.selection import gain, investigation
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.noise_beside_effects import _needed_smooth, natural_processes
+from imu_calibration.selection.normal_matrices import white_means
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import LEAST_GAIN, Search
+
+KINDS = np.array(['static'] * 20 + ['spin'] * 12)
+
+
+def asked(sensor, name, *parameters):
+    """The question about an effect of the catalogue."""
+    return Question(CATALOGUE.find(sensor, name), parameters, len(parameters), name)
+
+
+QUADRATIC, CUBIC, PRODUCT = (asked('accelerometer', name, k) for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_cross_product')))
+TILT, OFFSET, DRIFT = asked('reference', 'table_tilt', 0, 1), asked('reference', 'time_offset', 3), asked('accelerometer', 'accel_bias_drift', 4, 5, 6)
+
+
+class Known(Evidence):
+    """Evidence that is given: losses of choices, an estimate, a p-value."""
+
+    def __init__(self, loss=dict, values=None, p=1e-12):
+        super().__init__(np.ones(9), np.zeros(9))
+        self.loss_of, self.values, self.p = loss, values, p
+
+    def normal(self, number=None):
+        raise NotImplementedError
+
+    def loss(self, used):
+        return self.loss_of(frozenset(used))
+
+    heldout = loss
+
+    def p_value(self, smaller, larger):
+        return self.p
+
+    def fit(self, used, number=None):
+        values = np.full(len(used), 1e-9) if self.values is None else np.asarray(self.values)
+        return values, 1e-18 * np.eye(len(values))
+
+
+def scored(fall=100.0, p=1e-12, questions=30):
+    """Return the Score of an effect that makes the held-out loss fall by so much."""
+    evidence = Known(lambda used: -fall * (0 in used), p=p)
+    return Search(evidence, (), [QUADRATIC] * questions).score([], QUADRATIC)
+
+
+def test_among_many_effects_one_is_significant_by_chance():
+    """One in a thousand is much for one question and nothing for thirty."""
+    assert scored(p=1e-3, questions=1).significant
+    assert not scored(p=1e-3, questions=30).significant
+    assert scored(p=1e-3, questions=30).p_value == pytest.approx(0.03)
+
+
+def test_a_finding_predicts_what_it_was_not_fitted_to():
+    assert scored(2 * (LEAST_GAIN + 1)).significant
+    assert not scored(2 * (LEAST_GAIN - 1)).significant
+    assert not scored(-10.0).significant
+
+
+@pytest.mark.parametrize(('question', 'value', 'step', 'possible'), (
+    (asked('gyroscope', 'gyro_bandwidth', 0), [2e-3], 0.0, True),
+    (asked('gyroscope', 'gyro_bandwidth', 0), [-2e-3], 0.0, False),
+    (TILT, [4e-6, 3e-6], 1e-5, False), (TILT, [6e-6, 3e-6], 1e-5, True), (TILT, [4e-6, 3e-6], 0.0, True),
+    (asked('reference', 'encoder_harmonic', 0), [4e-6], 1e-5, False),
+    (QUADRATIC, [100 * QUADRATIC.effect.largest], 0.0, False), (QUADRATIC, [10 * QUADRATIC.effect.largest], 0.0, True)))
+def test_no_lag_is_negative_no_angle_within_an_encoder_step_no_size_absurd(question, value, step, possible):
+    assert Search(Known(values=value), (), [question], encoder_step=step).allowed([question], question) == possible
+
+
+def test_an_earlier_choice_gives_way_to_what_explains_better_together():
+    """The first effect is the best alone; with the second beside it a third does more, and the first is needed no longer."""
+    losses = {frozenset(): 400.0, frozenset({0}): 100.0, frozenset({1}): 200.0, frozenset({2}): 190.0, frozenset({0, 1}): 80.0,
+              frozenset({0, 2}): 90.0, frozenset({1, 2}): 4.0, frozenset({0, 1, 2}): 3.0}
+    found = Search(Known(losses.get), (), [QUADRATIC, CUBIC, PRODUCT]).run()
+    assert {question.label for question in found} == {CUBIC.label, PRODUCT.label}
+
+
+def test_windows_that_are_locked_are_in_no_fold():
+    locked = locked_windows(KINDS)
+    fold = folds_of(KINDS, locked)
+    assert 0.2 < locked.mean() < 0.3 and np.all(fold[locked] == -1) and np.all(fold[~locked] >= 0)
+    for kind in np.unique(KINDS):
+        assert locked[kind == KINDS].any() and len(set(fold[(kind == KINDS) & ~locked])) >= 5
+
+
+def test_noise_gains_nothing_where_it_was_not_fitted():
+    """Columns of noise fit the windows that they see, and predict others worse than one column does: on average of forty draws."""
+    gained = []
+    for seed in range(40):
+        evidence = WindowEvidence.__new__(WindowEvidence)
+        Evidence.__init__(evidence, np.full(4, 1e3), np.zeros(4))
+        evidence._parts = [rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))]
+        evidence.total = sum(evidence._parts)
+        gained.append((evidence.loss([0]) - evidence.loss(range(4)), evidence.heldout([0]) - evidence.heldout(range(4))))
+    fitted, held_out = np.mean(gained, axis=0)
+    assert fitted > 2.0 and held_out < -2.0
+
+
+def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
+    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), time=np.arange(4.0), sessions=[np.arange(4)])
+    space = SimpleNamespace(recording=recording, mean={'gyroscope': [np.ones((4, 2))] * 3})
+    for offset, weight in ((0.0, 10.0), (3.0, 1 / np.sqrt(9.01))):
+        white = white_means(space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope')
+        np.testing.assert_allclose(white, weight, rtol=1e-9)
+
+
+class Squares:
+    """Sums of squares of 40 windows, every fourth locked: in the others the samples fall most, in the locked ones the means."""
+
+    locked = np.arange(40) % 4 == 2
+
+    def __call__(self, _attempt, choice, _sensor):
+        samples, means = np.full((2, 40), 100.0)
+        if choice:
+            samples, means = np.where(self.locked, 90.0, 40.0), np.where(self.locked, 10.0, 80.0)
+        return samples, means, np.full(40, 100.0), np.full(40, 100.0)
+
+
+def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeypatch):
+    monkeypatch.setattr(gain, '_squares', Squares())
+    found = gain.heldout_gain(SimpleNamespace(locked=Squares.locked), [], [QUADRATIC], sensors=['accelerometer'])
+    assert (found.measure, found.windows) == ('samples', 10)
+    assert found.heldout_rms_after**2 == pytest.approx(0.9)
+
+
+def test_an_interval_of_95_percent_holds_95_percent():
+    """Of the reductions that windows drawn anew give."""
+    rng = np.random.default_rng(8)
+    before, number = rng.chisquare(20, 60), np.full(60, 20.0)
+    after = before * rng.uniform(0.3, 0.7, 60)
+    low, high = gain.reduction_interval([(before, number), (after, number)])
+    draw = rng.integers(0, 60, (4000, 60))
+    reductions = 1 - np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
+    assert 0.93 < np.mean((reductions > low) & (reductions < high)) < 0.97
+
+
+@pytest.mark.parametrize(('question', 'share', 'kept'), ((QUADRATIC, 0.6, False), (QUADRATIC, 0.75, True), (DRIFT, 0.85, False), (DRIFT, 0.95, True)))
+def test_what_leaves_most_unexplained_is_not_named(question, share, kept):
+    assert pruned([question], lambda chosen, each: share) == ([question] if kept else [])
+
+
+def test_a_cause_of_the_table_shows_in_both_sensors():
+    """It takes all there is off the accelerometer, and leaves twice as much on the gyroscope as it takes."""
+    explained = Explained.__new__(Explained)
+    explained.n_means, explained.n_within = 100.0, 1000.0
+    explained.excess = lambda chosen: {'accelerometer': (0.0, 0.0), 'gyroscope': (2000.0, 0.0)} if chosen else {
+        'accelerometer': (1000.0, 0.0), 'gyroscope': (3000.0, 0.0)}
+    assert explained.share([OFFSET], OFFSET) == pytest.approx(1 / 3)
+
+
+def test_every_bias_moves_by_half_the_white_noise_of_a_second():
+    (process,) = natural_processes(NoiseModel(np.full(3, 0.04), np.ones(3)), 0.01)
+    assert process.sd == pytest.approx(0.5 * np.sqrt(0.04 * 0.01)) and process.time == 100.0
+
+
+def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
+    """Three parameters that win three units of likelihood are chance."""
+    for won, needed in ((3.0, []), (60.0, [7, 8, 9])):
+        search = SimpleNamespace(best=lambda used, restricted, won=won: (None, 100.0 - won * (len(used) > 2)))
+        assert _needed_smooth(search, [0, 1], [[7, 8, 9]]) == needed
+
+
+@pytest.mark.parametrize(('apart', 'agree'), ((2.0, True), (6.0, False)))
+def test_halves_agree_within_chance(apart, agree):
+    """An effect of two standard deviations of the whole, halves that differ by so many of theirs."""
+    attempt = Attempt.__new__(Attempt)
+    attempt.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
+    attempt._halves = [np.array([[1.0, value], [value, value**2]]) for value in (apart / np.sqrt(2), -apart / np.sqrt(2))]
+    attempt.search = SimpleNamespace(used=lambda chosen: (0,))
+    attempt.evidence = SimpleNamespace(fit=lambda used: (np.array([2.0]), np.eye(1) / 2))
+    assert attempt.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
+
+
+def with_attempt(monkeypatch, gains, paid=None, agree=lambda question: True):
+    """Return an attempt of which the locked windows, the residual in the sensor's unit and the halves say this."""
+    monkeypatch.setattr(investigation, '_sure_reduction', lambda attempt, kept, each: (paid or {}).get(each, 0.5))
+    monkeypatch.setattr(investigation, '_needed_reduction', lambda *given: 0.0)
+    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True), agrees_in_halves=lambda named, question: agree(question),
+                           locked_gain=lambda kept, question: gains[question])
+
+
+def test_windows_that_took_no_part_have_a_veto(monkeypatch):
+    attempt = with_attempt(monkeypatch, {QUADRATIC: 5.0, CUBIC: -1.0})
+    assert investigation._that_help(attempt, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+
+
+def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
+    attempt = with_attempt(monkeypatch, {QUADRATIC: 5.0, CUBIC: 5.0}, {CUBIC: -0.01})
+    assert investigation._that_help(attempt, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+
+
+def test_what_the_halves_disagree_on_is_denied(monkeypatch):
+    attempt = with_attempt(monkeypatch, {QUADRATIC: 5.0, CUBIC: 5.0}, agree=lambda question: question is not CUBIC)
+    assert investigation._agreed(attempt, None, [QUADRATIC, CUBIC]) == ([QUADRATIC], [CUBIC])
+
+
+def rest_of(sigma, residual):
+    """Return the Unexplained of a residual whose windows exceed noise by so many standard deviations."""
+    count = len(residual)
+    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), time=np.arange(float(count)),
+                                describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
+                                          'specific force': np.full(count, 9.8)})
+    space = SimpleNamespace(mean={'accelerometer': [column[:, None] for column in residual.T]}, recording=recording, places=lambda sensor, axis: np.array([0]))
+    explained = SimpleNamespace(floor=SimpleNamespace(noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))}), n_means=3.0 * count, n_within=0.0,
+                                chosen=np.ones(count, bool))
+    return rests._rest(SimpleNamespace(space=space, recording=recording), explained, 'accelerometer', (sigma * np.sqrt(6.0 * count), 0.0), np.ones(1))
+
+
+def test_a_rest_of_some_standard_deviations_is_unexplained():
+    residual = 2 * np.random.default_rng(5).normal(size=(40, 3))
+    assert rest_of(10.0, residual).significant
+    assert not rest_of(4.0, residual).significant
+
+
+def test_noise_goes_with_nothing():
+    """Twenty curves, none of which the residual follows."""
+    rng = np.random.default_rng(6)
+    curves = [(f'curve {k}', rng.normal(size=(60, 2)), np.ones(60, bool)) for k in range(20)]
+    assert rests.correlate(iter(curves), rng.normal(size=(60, 3))) == (None, 0.0)
+    assert rests.correlate(iter(curves), rng.normal(size=(60, 3)) + 1.5 * curves[3][1][:, :1])[0] == 'curve 3'
