@@ -32,7 +32,7 @@ STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 2 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
+.PHONY: help setup demo live-demo test test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
@@ -82,6 +82,10 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
 test-oldest:
 	$(MAKE) test VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
+
+# Each declared line of the guards broken, one at a time (test/mutants/declared.py): which faults does no test notice? Half an hour.
+mutants: $(STAMP)
+	@$(PY) test/mutants/run.py
 
 # Everything on the real recordings (IMU_CALIBRATION_DATA, default ../shared/data), beside other packages; writes docs/validation.md.
 validate: $(STAMP)-validate

@@ -112,6 +112,21 @@ def print_budget():
           f'largest error {np.max(np.abs(solution.coefficients - truth)):.1e} V/g, tilt {60 * np.rad2deg(solution.tilt_rad[0]):.6f} arcmin')
 
 
+def print_section_5():
+    tests, noise_sd, truth = 2000, 1e-3, avrutov.nominal_accelerometers('linear')
+    heading(f'Section V as printed: X = B U (eq. 13), {tests} tests of sample 1 with 1 mV of output noise; sd in mV and mV/g')
+    operator, design = avrutov_budget.estimation_operator(readings()), avrutov.design_matrix(readings())
+    outputs = design @ truth + noise_sd * np.random.default_rng(3).normal(size=(tests, len(design), 3))
+    errors = operator @ outputs - truth
+    rows = {'1/(m-1), printed': avrutov_budget.m_test_sd(errors), '1/m': avrutov_budget.m_test_sd(errors, as_printed=False),
+            "sigma sqrt(diag BB')": np.repeat(noise_sd * np.linalg.norm(operator, axis=1)[:, None], 3, axis=1)}
+    for title, sd in rows.items():
+        print(f'{title:22s}' + ''.join(f'   {name}{"".join(f"{1e3 * one:8.4f}" for one in row)}' for name, row in zip(avrutov.COLUMNS['linear'], sd)))
+    few = avrutov_budget.m_test_sd(errors[:5]) / avrutov_budget.m_test_sd(errors[:5], as_printed=False)
+    print(f'B is {operator.shape[0]} x {operator.shape[1]}, not n x 4; with five tests 1/(m-1) is {100 * (few.mean() - 1):.0f} % too large, for the truth is '
+          'known and no mean was estimated')
+
+
 def print_findings():
     heading('What does not hold')
     for k, finding in enumerate(findings(), start=1):
@@ -175,6 +190,7 @@ def main():
     print_refusals()
     print_gyro_series()
     print_budget()
+    print_section_5()
     print_findings()
 
 

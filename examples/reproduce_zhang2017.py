@@ -41,15 +41,19 @@ def print_table_1():
 
 
 def simulated_readings(rng, rate_deg_s):
-    """Return window means (measured, compensated, reference) with x up and down, from Table 1 and Table 3, 0.1 mg of noise."""
-    calibration = six_position_calibration(rng)
+    """
+    Return window means (measured, compensated, reference) with x up and down, from Table 1 and Table 3, 0.1 mg of noise.
+
+    They are compensated with what the paper's method estimates from other readings: six positions, and arms by eq. 24.
+    """
+    calibration, arms = six_position_calibration(rng), mean_of_rates(rng, 0.1 * MG)
     runs = [spin((sign, 0, 0), rate_deg_s, 1.0) for sign in (1, -1)]
     force, arm_matrix, _ = stack_runs(runs)
     size = np.einsum('ij,njk,ik->ni', SENSOR.cosines, arm_matrix, ARMS)
     outputs = TABLE.bias + SENSOR.scale * (force @ SENSOR.cosines.T + size + 0.1 * MG * rng.normal(size=(2, 3))) / G
     before = (outputs - TABLE.bias) / TABLE.scale * G
-    known_arms = np.linalg.solve(SENSOR.cosines, size.T).T
-    return before, calibration.invert(outputs) * G - known_arms, force
+    estimated = np.einsum('ij,njk,ik->ni', SENSOR.cosines, arm_matrix, arms)
+    return before, calibration.invert(outputs) * G - np.linalg.solve(SENSOR.cosines, estimated.T).T, force
 
 
 def six_position_calibration(rng):
@@ -75,6 +79,13 @@ def closed_form_means(rng, rate, noise_sd, axes=None):
     return tuple(np.column_stack([predict(part, one) for one in TRUTH]) + noise_sd * rng.normal(size=(3, 3)) for part in runs)
 
 
+def mean_of_rates(rng, noise_sd, weighted=False):
+    """Return the arms by eq. 24 averaged over 100, 150 and 200 deg/s: plainly as in the paper, or by their inverse variances."""
+    rates = np.deg2rad(RATES_DEG_S)
+    arms = [zhang.closed_form(*closed_form_means(rng, rate, noise_sd), rate, directions=SENSOR.cosines) for rate in rates]
+    return zhang.average_rates(np.array(arms), rates, weighted)
+
+
 def print_table_3(rng):
     heading('Table 3, lever arms in mm (reference point to sensor; printed with the opposite sign)')
     rate, rows = np.deg2rad(200), {}
@@ -83,6 +94,9 @@ def print_table_3(rng):
     rows['eq. 24 as printed'] = zhang.closed_form(*closed_form_means(rng, rate, 0.0), rate, directions=SENSOR.cosines, as_printed=True)
     rows['eq. 24, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG), rate, directions=SENSOR.cosines)
     rows['   its sd'] = zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines)
+    rows['mean of 3 rates, 0.75 mg'] = mean_of_rates(rng, 0.75 * MG)
+    rows['   sd of 400 such means'] = np.std([mean_of_rates(rng, 0.75 * MG) for _ in range(400)], axis=0)
+    rows['   weighted by rate^4'] = np.std([mean_of_rates(rng, 0.75 * MG, weighted=True) for _ in range(400)], axis=0)
     axes = skewed_axes(60)
     rows['eq. 24, skew 60, 0.75 mg'] = zhang.closed_form(*closed_form_means(rng, rate, 0.75 * MG, axes), rate, directions=SENSOR.cosines,
                                                          spin_axes=axes)

@@ -286,3 +286,15 @@ def test_separate_sets_take_means_of_positions_and_runs():
 def test_unknown_model_is_refused():
     with pytest.raises(InputError, match='linear, products'):
         avrutov.design_matrix(np.eye(3), 'cubic')
+
+
+def test_section_5_as_printed():
+    """Eq. 13 is the fit, the m tests scatter as sigma sqrt(diag BB'), and dividing by m - 1 with the truth known is too large."""
+    inputs, truth = avrutov.gravity_readings(avrutov.turn('ZYX', [ANGLES] * 3), 'z'), avrutov.nominal_accelerometers('linear')
+    operator, design = avrutov_budget.estimation_operator(inputs), avrutov.design_matrix(inputs)
+    np.testing.assert_allclose(operator @ (design @ truth), truth, atol=1e-12)
+    assert operator.shape == (4, len(inputs))
+    errors = operator @ (1e-3 * np.random.default_rng(5).normal(size=(3000, len(inputs), 3)))
+    wanted = 1e-3 * np.linalg.norm(operator, axis=1)[:, None]
+    assert np.max(np.abs(avrutov_budget.m_test_sd(errors, as_printed=False) / wanted - 1)) < 0.05
+    np.testing.assert_allclose(avrutov_budget.m_test_sd(errors[:5])**2, 1.25 * avrutov_budget.m_test_sd(errors[:5], as_printed=False)**2)

@@ -57,6 +57,17 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35
 
 
+def test_what_is_published_has_the_share_of_the_parameters():
+    """It is there, and grows with their variance: by a hundred from 1e-4 to 1e-3."""
+    shares = []
+    for sd in (1e-4, 1e-3):
+        sensitivity = Uncertainty(random_calibration(1, sd=sd), None, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT)
+        whole, noise_only = (sensitivity.covariances(FORCE_COV, RATE_COV, flag) for flag in (True, False))
+        shares.append([np.trace(a - b) for a, b in zip(whole, noise_only)])
+    assert np.all(np.array(shares) > 0)
+    np.testing.assert_allclose(np.divide(*shares[::-1]), 100.0, rtol=1e-6)
+
+
 def test_an_ideal_sensor_passes_its_noise_on_unchanged():
     calibration = random_calibration(0, (), (), sd=0.0, matrix_spread=0.0)
     force_cov, rate_cov = Uncertainty(calibration).at().covariances(FORCE_COV, RATE_COV)

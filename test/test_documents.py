@@ -129,3 +129,12 @@ def test_implausible_values_are_named():
     values[1] = 50.0
     lines = implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24))
     assert len(lines) == 1 and 'accelerometer bias' in lines[0]
+
+
+@pytest.mark.parametrize(('text', 'words'), (
+    ('a: ' + '[' * 25 + ']' * 25, 'more than 20 levels'), ('a: &x [1]\nb: *x', 'YAML aliases'), ('a: ' + 'x' * 6000, 'more than 5000 characters in a row'),
+    ('a: [' + '1,' * 70_000 + ']', 'more than 60000 parts'), ('a: 1\n' + '# ' + 'x' * 2_000_000, 'more than 2000000 characters')))
+def test_what_would_take_long_to_read_is_refused_by_its_name(text, words):
+    """One guard at a time: whatever else the text is, it is small and plain."""
+    with pytest.raises(InputError, match=words):
+        documents.from_text(text)

@@ -126,6 +126,16 @@ def test_a_warm_up_is_not_sold_as_g_sensitivity():
         assert not any('g_sensitivity' in name for name in found.param_names)
 
 
+def test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order():
+    """Tipped over step by step: gravity's direction and the bias both go with time."""
+    imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
+    poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
+    share = np.linspace(0, 1, len(poses.force))
+    tipped = GRAVITY * np.column_stack([np.sin(1.5 * share), 0.1 * np.sin(9 * share), np.cos(1.5 * share)])
+    drift = 1e-2 * np.column_stack([share**2, share, -share]) + np.random.default_rng(4).normal(0, 1e-4, (len(share), 3))
+    assert not shown(g_sensitivity_evidence(replace(poses, force=tipped, rate=drift, time=100 * share)))
+
+
 def test_g_sensitivity_is_seen_beside_a_warm_up():
     truth = random_truth(np.random.default_rng(9), 3e-4)
     imu, ranges, _ = hold_and_turn(9, n_poses=20, rate_hz=50.0, still=2.0, truth=truth)

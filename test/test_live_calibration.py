@@ -98,6 +98,16 @@ def test_solving_on_the_way_changes_nothing(quick, expected):
     assert_same(live.solve(pending=True).calibration, expected.calibration)
 
 
+def test_windows_that_are_open_count_only_when_asked_for(quick):
+    """In the middle of a stretch: with them there are more samples, without them the windows that were completed."""
+    live = LiveCalibration(TABLE)
+    completed = [window for part in list(blocks(*quick))[:700] for window in live.push(part)]
+    used = sum(len(window) for window in completed if window.kind != 'unused')
+    without, with_open = (sum(live.solve(pending=flag).calibration.statistics['samples_used'].values()) for flag in (False, True))
+    assert without == used < with_open
+    assert sum(live.solve().calibration.statistics['samples_used'].values()) == used
+
+
 @pytest.fixture(scope='module')
 def tilted():
     """A session on a table that stands far from level."""
@@ -139,6 +149,7 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     result, expected = second.solve(pending=True), offline(*halves)
     assert_same(result.calibration, expected.calibration)
     assert result.calibration.conditions == expected.calibration.conditions
+    assert_same(second.solve(pending=True).calibration, expected.calibration)   # solving does not add the earlier run again
 
 
 WARMTH = np.array([0.004, -0.006, 0.0025])
@@ -187,6 +198,8 @@ def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
     data = accumulator_state.to_bytes(live.gathered(), live.model)
     with pytest.raises(DocumentError, match='accel_size_effect.*start without resume'):
         accumulator_state.from_bytes(data, replace(live.model, accelerometer=('bias', 'matrix')))
+    with pytest.raises(DocumentError, match=r'at 25 C, asked for is .* at 50 C; start without resume'):
+        accumulator_state.from_bytes(data, replace(live.model, temperature_ref_c=50.0))
     for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/2', b'accumulator/9')):
         with pytest.raises(DocumentError, match='resume'):
             accumulator_state.from_bytes(broken, live.model)

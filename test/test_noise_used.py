@@ -161,11 +161,11 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
         output = tmp_path / file.stem
         assert main(['compensate', str(BAG), '--calibration', str(truth), '--anyway', '--noise', str(file), '--output', str(output)]) == 0
         of_bags.append(parse_imu(raw_messages(output, '/imu/data_corrected')[-1][1]).doubles[FIELDS['force_cov']][0])
-        live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True)).compensation
+        live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), None).compensation
         of_nodes.append(live.covariances(np.zeros((3, 3)), np.zeros((3, 3)))[0][0, 0])
     assert of_bags[1] / of_bags[0] == pytest.approx(4.0, rel=0.05) and of_nodes[1] / of_nodes[0] == pytest.approx(4.0, rel=0.02)
     with pytest.raises(InputError, match='missing.yaml'):
-        adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True))
+        adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True), None)
 
 
 def test_the_noise_becomes_metres():

@@ -63,6 +63,29 @@ def reference_error(inputs: np.ndarray, input_changes: np.ndarray, coefficients:
     return calibrate(inputs, true_outputs, model).values - coefficients
 
 
+def estimation_operator(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
+    """Return B with ``X = B @ U``, eq. 13: ``inv(G'G) G'``, by orthogonal factors, shape (n_params, n)."""
+    return calibrate(inputs, np.zeros((len(inputs), 3)), model).unit_covariance @ design_matrix(inputs, model).T
+
+
+def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
+    """
+    Return the root-mean-square error over m tests, as at the end of section V: ``sqrt(sum(error^2) / (m - 1))``, shape (...).
+
+    The errors are against known truth, so that nothing was estimated from them and m is right (`as_printed` False); m - 1 belongs to
+    differences from their own mean.
+
+    Parameters
+    ----------
+    errors : array, shape (m, ...)
+        Estimate minus truth in each test.
+    as_printed : bool
+
+    """
+    errors = np.asarray(errors, float)
+    return np.sqrt((errors**2).sum(axis=0) / (len(errors) - as_printed))
+
+
 def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'linear', *, noise_sd: float = 0.0,
                  common: dict[str, np.ndarray] | None = None, scattered: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """
@@ -85,9 +108,8 @@ def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'lin
         Sd per cause, to first order, and 'total'.
 
     """
-    solution = calibrate(inputs, design_matrix(inputs, model) @ coefficients, model)
-    inverse = solution.unit_covariance @ design_matrix(inputs, model).T
-    budget = {'output noise': np.repeat(noise_sd * solution.unit_sd[:, None], 3, axis=1)}
+    inverse = estimation_operator(inputs, model)
+    budget = {'output noise': np.repeat(noise_sd * np.linalg.norm(inverse, axis=1)[:, None], 3, axis=1)}
     slope = _design_slope(inputs, model)
 
     def output_change(changes):

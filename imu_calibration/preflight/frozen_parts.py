@@ -85,13 +85,18 @@ def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
     still_ns : array, shape (n, 2)
         First and last stamp of each stretch in which no joint position changes.
     rate_at_rest : array, shape (3,)
-        What the gyroscope reads at rest, rad/s.
+        What the gyroscope reads at rest, rad/s; what it reads mostly while the joints stand still, where that explains more (spins about the
+        vertical are as steady as rests).
 
     """
-    turning = np.linalg.norm(chunks.mean[:, 3:] - rate_at_rest, axis=1) > TURNS
     inside = np.zeros(len(chunks), bool)
     for start, stop in (still_ns - chunks.first_ns) * 1e-9:
         inside |= (chunks.time - chunks.duration / 2 >= start) & (chunks.time + chunks.duration / 2 <= stop)
+    if not inside.any():
+        return []
+    rates = chunks.mean[:, 3:]
+    turning = min((np.linalg.norm(rates - rate, axis=1) > TURNS for rate in (rate_at_rest, np.median(rates[inside], axis=0))),
+                  key=lambda flags: np.count_nonzero(flags & inside))
     return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(turning & inside)]
 
 

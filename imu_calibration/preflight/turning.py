@@ -17,7 +17,7 @@ LEAST_EXPLAINED = 0.5
 WIDTH = 4.0
 """Errors of neighbouring chunks go together: standard deviations are this much larger than for independent ones."""
 SURE = 0.15
-"""A column counts when its standard deviation is below this share of its length."""
+"""A direction counts when the standard deviation of what it does is below this share of its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +25,26 @@ class Turning:
     """What relates measured rates to the turn of measured gravity."""
 
     matrix: np.ndarray
-    """``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero in columns that were not seen, shape (3, 3)."""
+    """``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero across the directions that were not seen, shape (3, 3)."""
     seen: np.ndarray
-    """Which columns were, shape (3,)."""
+    """Projector on the directions of the measured rate that were: a turn about (1, 1, 1) alone shows one direction and no axis, shape (3, 3)."""
     explained: float
     """Share of gravity's turns that it explains."""
 
     @property
+    def axes(self) -> np.ndarray:
+        """Which of the gyroscope's axes were mostly seen, shape (3,)."""
+        return np.diag(self.seen) > 0.5
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether the rates took all directions."""
+        return round(np.trace(self.seen)) == 3
+
+    @property
     def factor(self) -> float:
         """True rate over measured rate: 1, or pi / 180 for deg/s."""
-        return float(np.median(np.linalg.norm(self.matrix[:, self.seen], axis=0)))
+        return float(np.median(np.linalg.svd(self.matrix, compute_uv=False)[:round(np.trace(self.seen))]))
 
 
 def relate_turns(chunks: Chunks) -> Turning | None:
@@ -47,33 +57,36 @@ def relate_turns(chunks: Chunks) -> Turning | None:
     if pairs is None:
         return None
     direction, change, turn_time, rate = pairs
-    spread = np.sqrt(np.mean(rate**2, axis=0))
+    spread, directions = np.linalg.eigh(rate.T @ rate / len(rate))
+    spread = np.sqrt(np.maximum(spread, 0.0))
     if np.linalg.norm(change, axis=1).sum() < LEAST_TURN or not spread.max() > 0:
         return None
-    seen = spread > 1e-3 * spread.max()
-    while seen.any():
-        matrix, sure, explained = _fit(direction, change, turn_time, np.where(seen, rate / np.where(seen, spread, 1.0), 0.0))
+    kept = spread > 1e-3 * spread.max()
+    while kept.any():
+        seen, scale = directions[:, kept], spread[kept]
+        matrix, sure, explained = _fit(direction, change, turn_time, rate @ seen / scale)
         if explained < LEAST_EXPLAINED:
             return None
-        if sure[seen].all():
-            return Turning(np.where(seen, matrix / np.where(seen, spread, 1.0), 0.0), seen, explained)
-        # What turns least may only be the leakage of another axis, and then spoils both.
-        seen = seen & (spread > spread[seen].min())
+        if sure.all():
+            return Turning(matrix / scale @ seen.T, seen @ seen.T, explained)
+        # What turns least may only be the leakage of another direction, and then spoils both.
+        kept = kept & (spread > spread[kept].min())
     return None
 
 
 def _fit(direction, change, turn_time, rate):
-    """Return (matrix, which columns are sure, share explained) by least squares."""
+    """Return (matrix (3, m), which of the m rates are sure, share explained) by least squares."""
     lever = skew(direction) * turn_time[:, None, None]
     inputs = np.column_stack([rate, np.ones(len(rate))])
-    design = (lever[:, :, :, None] * inputs[:, None, None, :]).reshape(-1, 12)
+    width = inputs.shape[1]
+    design = (lever[:, :, :, None] * inputs[:, None, None, :]).reshape(-1, 3 * width)
     target = change.ravel()
     normal = design.T @ design
-    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(12))
+    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
     solution = inverse @ (design.T @ target)
     rest = float(((target - design @ solution)**2).sum())
-    sd = WIDTH * np.sqrt(np.diag(inverse) * rest / max(len(target) - 12, 1)).reshape(3, 4)[:, :3]
-    matrix = solution.reshape(3, 4)[:, :3]
+    sd = WIDTH * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[:, :-1]
+    matrix = solution.reshape(3, width)[:, :-1]
     return matrix, np.linalg.norm(sd, axis=0) < SURE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
 
 

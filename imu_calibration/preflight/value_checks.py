@@ -76,7 +76,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         elif not 0.5 < ratio < 2.0:
             yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
         else:
-            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates about {_axes(turning.seen)} say')
+            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates{_about(turning.axes)} say')
     elif largest > FASTEST:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
@@ -112,14 +112,13 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     turning = evidence.turning
     if turning is None:
         return
-    seen = np.diag(turning.seen.astype(float))
-    match = match_axes(turning.matrix, seen)
+    match = match_axes(turning.matrix, turning.seen)
     if not match.wrong:
-        if turning.seen.all():
+        if turning.everywhere:
             yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
         return
     what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j,
-                     sign in match.exchanges(seen))
+                     sign in match.exchanges(turning.seen))
     if not what or match.agreement < CLEAR:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
@@ -241,3 +240,7 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def _axes(flags):
     return ', '.join(np.array(list('xyz'))[np.asarray(flags, bool)])
+
+
+def _about(flags):
+    return f' about {_axes(flags)}' if np.any(flags) else ''

@@ -31,14 +31,14 @@ def copied(folder):
     return folder
 
 
-def tested(folder, tests):
+def tested(folder, tests, *options, timeout=TIMEOUT):
     """Return pytest's exit code and the last line that it printed."""
     env = os.environ | {'PYTHONPATH': os.pathsep.join([str(folder), os.environ.get('PYTHONPATH', '')]), 'PYTHONDONTWRITEBYTECODE': '1'}
-    command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *tests]
+    command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *options, *tests]
     try:
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
-        return 1, f'did not end within {TIMEOUT:.0f} s'
+        return 1, f'did not end within {timeout:.0f} s'
     return done.returncode, next((line for line in reversed(done.stdout.splitlines()) if line.startswith(('FAILED', 'ERROR'))), '')
 
 
@@ -74,7 +74,7 @@ def main():
         for number in range(asked.workers):
             folders.put(copied(Path(place) / str(number)))
         needed = sorted({test for mutant in chosen for test in mutant.tests})
-        code, line = tested(folders.queue[0], needed)
+        code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile', timeout=10 * TIMEOUT)
         if code:
             sys.exit(f'the tests must pass before anything is broken: {line or code}')
 

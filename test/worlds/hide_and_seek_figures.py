@@ -68,7 +68,7 @@ def _table(rows, parts):
         lines.append(f'| traps that give a finding | none | {_count(bool(row["found"]) for row in parts["traps"])} |')
     ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
     if ratios:
-        lines.append(f'| held-out rms over that of an oracle, median | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |')
+        lines.append(f'| held-out rms over that of a fit with the right effect alone, median (1 where nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |')
     seconds = [row['seconds'] for row in rows if 'seconds' in row]
     lines.append(f'| processor time per diagnosis, five minutes at 100 Hz | 5 s | median {np.median(seconds):.1f} s, 95 % below '
                  f'{np.quantile(seconds, 0.95):.1f} s, largest {np.max(seconds):.1f} s |')
@@ -78,7 +78,7 @@ def _table(rows, parts):
 def _sentence(rows, parts):
     effects, outside = parts.get('effects', []), parts.get('outside', [])
     none = parts.get('none', [])
-    return (f'Measured on {date.today().isoformat()} over {len(rows)} sessions that were not used during development: the hidden effect is named first, or in the '
+    return (f'Measured on {date.today().isoformat()} over {len(rows)} simulated sessions, each cause at five times its smallest detectable size: the hidden effect is named first, or in the '
             f'class of the first finding, in {_count(map(first_is_right, effects))}; nothing hidden gave a finding in {_count(bool(row["found"]) for row in none)}; a cause '
             f'that no catalogue holds was reported as unexplained in {_count(row["unexplained"] for row in outside)} and given a name in '
             f'{_count(bool(row["found"]) for row in outside)}; two effects at once were both found in {_count(map(both_found, parts.get("pairs", [])))}.')

@@ -178,7 +178,7 @@ def _power(rows, path):
         some = [row for row in rows if row['hidden'][0] == effect]
         factors = sorted({row['factor'] for row in some})
         power = [np.mean([first_is_right(row) for row in some if row['factor'] == factor]) for factor in factors]
-        axes.plot(factors, power, 'o-', label=effect)
+        axes.plot(factors, power, 'o-', label=f'{effect} ({len(some) // len(factors)} sessions a point)')
         print(f'  {effect:24s} ' + ', '.join(f'{factor:g}: {value:.2f}' for factor, value in zip(factors, power)))
     axes.axhline(0.5, color='grey', lw=0.8)
     axes.set_xlabel('size / smallest detectable size')
