@@ -21,6 +21,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
 
@@ -74,6 +75,8 @@ class HandCalibration:
     """The poses as they were weighed: those left out with means that count for nothing, a bias that moves at its mean."""
     used_turns: list
     """`TurnData` that were not left out."""
+    model_error: ModelError
+    """What the covariance grew by, beyond noise and scatter, in the order of `model`."""
 
     @property
     def sd(self) -> np.ndarray:
@@ -215,7 +218,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
                            tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
                            np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
-                           found.factor.T @ found.factor, used, turns)
+                           found.factor.T @ found.factor, used, turns, found.model_error)
 
 
 def _settled(model, found):

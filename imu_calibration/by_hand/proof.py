@@ -20,6 +20,8 @@ ATTITUDES_LEAST = 10
 """So many attitudes must stay when a part is left out: nine parameters of the accelerometer take one equation each."""
 TURNS_LEAST = 6
 """So many turns must stay, and be left out altogether."""
+PER_TURN = 'rad per turn'
+"""Unit of the angle by which gravity is carried past where it is found."""
 
 
 def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> dict:
@@ -52,7 +54,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
             angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
     proof = {'accelerometer': _entry(norms, 'm/s^2')}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
-        proof['gyroscope'] = _entry(angles, 'rad per turn')
+        proof['gyroscope'] = _entry(angles, PER_TURN)
     return proof
 
 

@@ -7,6 +7,8 @@ import scipy.linalg
 
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, HandModel, unpack
+from imu_calibration.by_hand.model_error import hand_model_error
+from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.scaled_solve import covariance_with_held
 from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
 
@@ -32,6 +34,8 @@ class HandSolution:
     """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (n, n)."""
     steps: int
     """Gauss-Newton steps taken."""
+    model_error: ModelError
+    """What the covariance grew by, beyond noise and scatter."""
 
 
 def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float, fallback: np.ndarray) -> HandSolution:
@@ -63,8 +67,9 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     start = np.maximum(scatter.variance, 0.01 * fallback)
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
-    cov = covariance_with_held(factor, ~held, held, prior_sd=priors) + _of_gravity(state.values, gravity_sd / model.gravity)
-    return HandSolution(state, cov, held, scatter, factor, steps + more)
+    error = hand_model_error(model, state, poses, turns=turns, scatter=scatter, free=~held)
+    cov = error.added(covariance_with_held(factor, ~held, held, prior_sd=priors)) + _of_gravity(state.values, gravity_sd / model.gravity)
+    return HandSolution(state, cov, held, scatter, factor, steps + more, error)
 
 
 def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:

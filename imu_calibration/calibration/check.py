@@ -21,6 +21,8 @@ class CheckResult:
     """Sensor -> error before and after, interval, on how much, by what the IMU does (see `proof.prove`); {}: it cannot be told."""
     findings: tuple = ()
     """What a look at the recording found."""
+    why: str = 'fewer than three windows of rest or motion were found; record for longer'
+    """Why it cannot be told, where it cannot."""
 
     @property
     def helps(self) -> bool:
@@ -31,7 +33,7 @@ class CheckResult:
     def lines(self) -> list[str]:
         """The answer in sentences, the gravest first."""
         if not self.proof:
-            return ['whether it helps cannot be told: fewer than three windows of rest or motion were found; record for longer']
+            return [f'whether it helps cannot be told: {self.why}']
         return disproved(self.proof) or proven(self.proof)
 
 

@@ -26,7 +26,7 @@ def disproved(proof: Mapping) -> list[str]:
                          f'{found["before"]:.3g} without ({_ratio(found)}): that it helps is not shown{_cause(found)}')
         elif worse := harmed(found):
             name, part = max(worse.items(), key=lambda item: item[1]['after'] / max(item[1]['before'], 1e-300))
-            lines.append(f'on data that took no part ({name}) the {sensor} error is {part["after"]:.3g} {found["unit"]} with it and '
+            lines.append(f'on data that took no part ({name}) the {sensor} error is {part["after"]:.3g} {part.get("unit", found["unit"])} with it and '
                          f'{part["before"]:.3g} without ({_ratio(part)}): it makes this motion worse{_cause(found)}')
     return lines
 
@@ -58,7 +58,8 @@ def _cause(found):
     if abs(late) > LATE and share > DELAY_SHARE:
         return f'; the likely cause is that the readings come {abs(late) * 1e3:.0f} ms too {"late" if late > 0 else "early"}, which the model leaves out'
     regimes = found.get('regimes') or {}
-    if 'rest' in harmed(found) or regimes.get('rest', {'after': 0.0})['after'] > AT_REST * found['after'] > 0.0:
+    rest = regimes.get('rest', {'after': 0.0})
+    if 'rest' in harmed(found) or rest['after'] > AT_REST * found['after'] > 0.0 and rest.get('unit', found['unit']) == found['unit']:
         return '; most likely the bias has moved'
     if regimes and set(harmed(found)) == {'angular acceleration'}:
         return '; the likely cause goes with angular acceleration: a lever arm, a lag that changes, a mount that gives way'

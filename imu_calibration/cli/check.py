@@ -32,7 +32,8 @@ def run(options: Namespace) -> int:
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
             low, high = part['ci95']
-            table.add_row(sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}', entry['unit'],
+            table.add_row(sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}',
+                          part.get('unit', entry['unit']),
                           f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}')
     out.print(table)
     for line in str(found).splitlines():

@@ -6,6 +6,7 @@ weighted with slow cosines of the blocks' numbers are, times the covariance, wha
 noise alone says how large they may be. Where they are larger than chance allows, the covariance grows.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,21 +65,41 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
         Parameters that were estimated.
 
     """
-    factor, more = np.ones(len(values)), np.zeros(len(values))
-    if len(system.accumulator.blocks) >= LEAST_BLOCKS and free.any():
-        waves = _Waves(*block_scores(system, values, noises), system.prior.root, free)
-        for sensor in {effect.sensor for effect in system.model.effects}:
-            groups = [waves.group(system.model.slices[e.key]) for e in system.model.effects if e.sensor == sensor]
-            groups = [group for group in groups if len(group)]
-            if groups and fisher([waves.drift(group)[0] for group in groups]) < CHANCE:
-                for group in groups:
-                    more[waves.places[group]] = waves.drift(group)[1]
-            if groups and fisher([waves.scatter(group)[0] for group in groups]) < CHANCE:
-                for group in groups:
-                    factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
-                if sensor == 'accelerometer':   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
-                    more[system.model.part(sensor, Role.OFFSET)] += noises[sensor].offset_sd**2
-    return ModelError(factor, more)
+    if len(system.accumulator.blocks) < LEAST_BLOCKS or not free.any():
+        return ModelError(np.ones(len(values)), np.zeros(len(values)))
+    waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
+    sensors = {effect.sensor for effect in system.model.effects}
+    found, misfits = errors_of_waves(waves, len(values), groups={sensor: [system.model.slices[e.key] for e in system.model.effects if e.sensor == sensor]
+                                                                for sensor in sensors})
+    if 'accelerometer' in misfits:   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
+        found.added_variance[system.model.part('accelerometer', Role.OFFSET)] += noises['accelerometer'].offset_sd**2
+    return found
+
+
+def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[slice]]) -> tuple[ModelError, set[str]]:
+    """
+    Return (ModelError, sensors that misfit) from what parts of a recording ask for.
+
+    Parameters
+    ----------
+    waves : Waves
+    size : int
+        Number of parameters.
+    groups : mapping
+        Sensor -> the parameters of each of its effects.
+
+    """
+    factor, more, misfits = np.ones(size), np.zeros(size), set()
+    for sensor, parts in groups.items():
+        shown = [group for group in map(waves.group, parts) if len(group)]
+        if shown and fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
+            for group in shown:
+                more[waves.places[group]] = waves.drift(group)[1]
+        if shown and fisher([waves.scatter(group)[0] for group in shown]) < CHANCE:
+            misfits.add(sensor)
+            for group in shown:
+                factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
+    return ModelError(factor, more), misfits
 
 
 def fisher(p_values: list[float]) -> float:
@@ -105,30 +126,51 @@ def block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
     return information, gradient
 
 
-class _Waves:
-    """The parts' gradients as cosines over the recording, with the covariance that noise gives them."""
+def slow_cosines(count: int) -> np.ndarray:
+    """Return the weights of `count` parts in each cosine, the slowest first, shape (k, count)."""
+    number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
+    return np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
 
-    def __init__(self, information, gradient, prior_root, free):
-        self.places = np.flatnonzero(free)
-        information, gradient = information[:, free][:, :, free], gradient[:, free]
-        covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
-        count = len(information)
-        number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
-        weights = np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
-        self.moved = weights @ gradient @ covariance
-        mixed = np.einsum('kc,cij->kij', weights, information)
-        squared = np.einsum('kc,cij->kij', weights**2, information)
-        self.expected = covariance @ (squared - mixed @ covariance @ mixed) @ covariance
-        self.walk = 1 / (np.pi * number)**2
+
+def _waves_of_blocks(information, gradient, prior_root, free):
+    """Return the Waves of independent parts with their own information and gradient."""
+    information, gradient = information[:, free][:, :, free], gradient[:, free]
+    covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
+    weights = slow_cosines(len(information))
+    mixed = np.einsum('kc,cij->kij', weights, information)
+    squared = np.einsum('kc,cij->kij', weights**2, information)
+    expected = covariance @ (squared - mixed @ covariance @ mixed) @ covariance
+    return Waves(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance)
+
+
+class Waves:
+    """
+    What cosines over a recording ask of the parameters, with the covariance that noise gives it.
+
+    Parameters
+    ----------
+    places : array of int, shape (m,)
+        Parameters that were estimated.
+    moved : array, shape (k, m)
+        What each cosine asks for beyond the whole.
+    expected : array, shape (k, m, m)
+        Its covariance by noise alone.
+    covariance : array, shape (m, m)
+        Of the estimate, by noise alone.
+
+    """
+
+    def __init__(self, places: np.ndarray, moved: np.ndarray, expected: np.ndarray, *, covariance: np.ndarray):
+        self.places, self.moved, self.expected = places, moved, expected
+        self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1))**2
         """Variance of each cosine of a random walk that has unit variance after the whole recording."""
-        diagonal = np.einsum('kii->ki', self.expected)
-        self._seen = np.all(diagonal > SEEN * np.diag(covariance), axis=0)
+        self._seen = np.all(np.einsum('kii->ki', expected) > SEEN * np.diag(covariance), axis=0)
 
-    def group(self, part):
+    def group(self, part: slice) -> np.ndarray:
         """Return the places among the free parameters of those of one effect that the recording shows."""
         return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & self._seen)
 
-    def drift(self, group):
+    def drift(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """
         Return (chance of so slow a change by noise, variance to add for it, shape (n,)) of parameters that each walk at random.
 
@@ -148,7 +190,7 @@ class _Waves:
         dof = mean**2 / spread
         return float(chi2.sf(score / mean * dof, dof)), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
 
-    def scatter(self, group):
+    def scatter(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (chance of so much scatter by noise, factor on the variance of each parameter) of a group."""
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size

@@ -5,9 +5,9 @@ from os import PathLike
 from typing import Unpack
 
 from imu_calibration import files
+from imu_calibration.by_hand.check import check_by_hand, gravity_of
 from imu_calibration.calibration.check import CheckResult, check_on_table
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
@@ -56,9 +56,10 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         A bag, or samples in memory, of the IMU that was calibrated.
     calibration : Calibration or path-like
     table : path-like, Table or Arm, optional
-        The reference of this recording; it need not be the one of the calibration.
+        The reference of this recording; it need not be the one of the calibration. Without it gravity is: the IMU held still in some
+        attitudes, and the turns between them.
     choices
-        See `Choices`; those of topics and windows count.
+        See `Choices`; those of topics and windows count, and the local gravity.
 
     Raises
     ------
@@ -70,13 +71,22 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
     calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     options, topics = calibration_options(choices), topics_of(choices)
     if table is None:
-        raise InputError('a calibration must be checked against a reference, none came; give the description of the table', key='table')
+        result = check_by_hand(source_of(recording, topics, want_joints=False), calibration, options)
+        return Checked(result, (*_gravity(options, calibration), *_notes(recording, calibration)))
     if not isinstance(recording, SampleBlock):
         open_bag(recording, topics, want_joints=True).close()
     table = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, table.joint_names)
     result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
     return Checked(result, _notes(recording, calibration))
+
+
+def _gravity(options, calibration):
+    """Return a note on the gravity that was taken, when none was given."""
+    if options.gravity:
+        return ()
+    taken = gravity_of(calibration, options)
+    return (f'gravity was taken to be {taken:.6g} m/s^2, as where it was calibrated; give the local one where it differs',)
 
 
 def _notes(recording, calibration):

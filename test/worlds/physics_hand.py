@@ -10,9 +10,12 @@ from imu_calibration.samples import ImuSamples
 
 from worlds.hand_sessions import GRAVITY, NOMINAL, SENSITIVITY, random_truth, turn_samples
 
+SETTLES = 0.5
+"""Time constant of a grip that gives way, s."""
+
 
 def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.002, drift_sd=2e-4,
-                  creep=0.0, tremor=0.0, attitudes=None, truth=None, largest=2.6):
+                  creep=0.0, settling=0.0, tremor=0.0, attitudes=None, truth=None, largest=2.6):
     """
     Return (imu, ranges at rest, truth): poses held in a hand that creeps, and turns between them.
 
@@ -22,6 +25,8 @@ def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, f
         Scatter of the accelerometer's (m/s^2) and of the gyroscope's (rad/s) bias from pose to pose.
     creep : float
         Rms rate per axis at which the attitude creeps while it is held, rad/s.
+    settling : float
+        Rms angle per axis by which a grip that flexes gives way after each turn, rad, with a time constant of half a second.
     tremor : float
         Rms specific force of the hand's tremor at some 8 Hz, m/s^2.
     attitudes : sequence of Rotation, optional
@@ -36,10 +41,12 @@ def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, f
     parts, ranges, total = [], [], 0
     for pose in range(n_poses):
         rate = rng.normal(0, creep, 3)
-        held = attitude * Rotation.from_rotvec(np.outer(period * np.arange(count), rate))
+        gives, within = rng.normal(0, settling, 3) if settling else np.zeros(3), period * np.arange(count)
+        held = attitude * Rotation.from_rotvec(np.outer(within, rate) + np.outer(-np.expm1(-within / SETTLES), gives))
+        rates = rate + np.outer(np.exp(-within / SETTLES) / SETTLES, gives)   # of small angles
         offsets = rng.normal(0, pose_sd, 3), rng.normal(0, drift_sd, 3)
         shake = tremor * np.sin(2 * np.pi * 8 * period * np.arange(count) + rng.uniform(0, 6))
-        parts.append((held.inv().apply([0, 0, GRAVITY]) + np.outer(shake, rng.normal(0, 1, 3)) + offsets[0], np.tile(rate, (count, 1)), offsets[1]))
+        parts.append((held.inv().apply([0, 0, GRAVITY]) + np.outer(shake, rng.normal(0, 1, 3)) + offsets[0], rates, offsets[1]))
         ranges.append(slice(total, total + count))
         total, attitude = total + count, held[-1]
         if pose == n_poses - 1:

@@ -1,0 +1,95 @@
+"""Is a calibration still good? Its proof on a recording without a table: gravity at rest, rates at rest, and turns between poses."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from imu_calibration.by_hand.calibrate import HandData, gather_by_hand
+from imu_calibration.by_hand.preintegration import integrate_turn
+from imu_calibration.by_hand.proof import PER_TURN, TURNS_LEAST
+from imu_calibration.by_hand.workflow import read_by_hand
+from imu_calibration.calibration.check import CheckResult
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.proof import UNITS, compared
+from imu_calibration.compensation.arrays import compensate_readings
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.errors import NotObservableError
+from imu_calibration.preflight.checks import Preflight
+from imu_calibration.preflight.joint_checks import check_force
+from imu_calibration.samples import ImuSamples, TemperatureSamples
+
+
+def check_by_hand(source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()) -> CheckResult:
+    """
+    Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
+
+    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle by which it carries gravity
+    past the pose that a turn ends in, and its mean reading at rest. Before: readings as they come; after: as compensation corrects them. Directions of
+    gravity are those of the corrected accelerometer for both.
+
+    Parameters
+    ----------
+    source : callable
+        Returns an iterator of SampleBlock.
+    calibration : Calibration
+        From a table or by hand.
+    options : CalibrationOptions
+        The local gravity, where it is not that of the calibration, and the conversion of volts or counts.
+
+    Raises
+    ------
+    InputError
+        When the recording cannot be used.
+
+    """
+    preflight = Preflight(options.gravity)
+    recording = read_by_hand(source(), options.nominal, [preflight])
+    try:
+        data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
+    except NotObservableError as error:
+        return CheckResult({}, preflight.findings, str(error))
+    check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
+    warm = None if recording.temperature_c is None else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
+    corrected = compensate_readings(calibration, recording.imu, temperature_c=warm)
+    return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), preflight.findings)
+
+
+def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
+    """Return the gravity that readings at rest are compared with, m/s^2: what was given, else that of the calibration."""
+    return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
+
+
+def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float) -> dict:
+    """Return the proof of corrected samples `after` beside those as they came: sensor -> entry of a document (see `calibration.proof`)."""
+    poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
+    ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
+    (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
+    rested = float(np.sum(poses.stop - poses.start) * poses.period)
+    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNITS['accelerometer'], seconds=rested)
+    rest = _entry(raw_rate, rate, unit=UNITS['gyroscope'], seconds=rested)
+    proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
+    if len(turns) >= TURNS_LEAST:
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        missed = (np.array([[_missed(turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)] for turn in turns])
+                  for imu in (before, after))
+        angles = _entry(*missed, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
+        proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
+    return proof
+
+
+def _means(imu, ranges):
+    return tuple(np.array([np.nanmean(values[part], axis=0) for part in ranges]) for values in (imu.force_s, imu.rate_s))
+
+
+def _entry(before, after, *, unit, seconds):
+    """Return an entry of a proof, of errors of shape (n, components)."""
+    found = compared(*((errors**2).sum(axis=1) for errors in (before, after)), np.ones(len(before)), components=before.shape[1])
+    return found | {'unit': unit, 'windows': len(before), 'seconds': seconds}
+
+
+def _missed(turn, rates, up):
+    """Return the angle between gravity after a turn and where these rates carry it from before, rad."""
+    known = np.isfinite(rates).all(axis=1)   # the first readings may lack an angular acceleration
+    carried = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji @ up[turn.first]
+    return np.arctan2(np.linalg.norm(np.cross(carried, up[turn.last])), carried @ up[turn.last])

@@ -1,0 +1,32 @@
+"""By hand too, standard deviations allow for parameters that move while it is recorded, and for nothing where nothing moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.model import GYRO_MATRIX
+from imu_calibration.by_hand.options import HandOptions
+
+from worlds.hand_coverage import GROUPS, errors
+from worlds.hand_sessions import GRAVITY, PARAM_NAMES
+from worlds.physics_hand import hold_and_turn
+
+MATRIX = PARAM_NAMES[GYRO_MATRIX]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
+    """Its scale walks by two per cent through the recording; what one session says of the next errs by about that, and not by the noise of turns."""
+    imu, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
+    walk = np.linspace(0, 0.02, len(imu))[:, None]
+    walking, steady = (calibrate_by_hand(replace(imu, rate_s=rate), HandOptions(GRAVITY), ranges) for rate in (imu.rate_s * (1 + walk), imu.rate_s))
+    assert not steady.model_error.added_variance[GYRO_MATRIX].any() and steady.model_error.factor[GYRO_MATRIX].max() == 1.0
+    assert np.sqrt(walking.model_error.added_variance[GYRO_MATRIX].max()) > 2e-3
+    assert max(walking.sd_of(name) for name in MATRIX) > 10 * max(steady.sd_of(name) for name in MATRIX)
+
+
+def test_clean_sessions_become_no_wider():
+    grown = np.concatenate([errors('clean', seed, n_poses=16)[group][2] for seed in range(4) for group in GROUPS])
+    assert np.quantile(grown, 0.95) < 1.3 and np.median(grown) == pytest.approx(1.0)

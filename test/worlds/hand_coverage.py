@@ -1,0 +1,63 @@
+"""Do standard deviations by hand hold where the hand and the sensor do what no model holds? ``python -m worlds.hand_coverage`` in test/."""
+
+from argparse import ArgumentParser
+
+import numpy as np
+
+from imu_calibration.by_hand.by_evidence import solve_by_evidence
+from imu_calibration.by_hand.calibrate import gather_by_hand
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.effects.base import SENSORS
+
+from worlds.hand_sessions import GRAVITY, PARAM_NAMES
+from worlds.physics_hand import hold_and_turn, warmed_up
+
+WORLDS = {'clean': {}, 'warm-up': {}, 'creep': {'creep': 0.0026}, 'poses that do not repeat': {'pose_sd': 0.02, 'drift_sd': 2e-3},
+          'flexing grip': {'settling': 0.009}}
+"""What `hold_and_turn` is told: 0.15 deg/s of creep, 2 mg and 0.11 deg/s from pose to pose, half a degree of giving way."""
+GROUPS = {'accelerometer.bias': slice(0, 3), 'accelerometer.matrix': slice(3, 9), 'gyroscope.bias': slice(9, 12), 'gyroscope.matrix': slice(12, 21)}
+
+
+def session(world, seed, n_poses=24):
+    """Return (data, truth, change of the biases from the start to the mean over the recording) of one session of a world, found as a user's would be."""
+    imu, _, truth = hold_and_turn(seed, n_poses=n_poses, rate_hz=50.0, **WORLDS[world])
+    moved = {sensor: np.zeros(3) for sensor in SENSORS}
+    if world == 'warm-up':
+        before, (imu, _) = imu, warmed_up(imu, seed, force=0.05, rate=0.01, time_constant=60.0)
+        moved = dict(zip(SENSORS, ((imu.force_s - before.force_s).mean(axis=0), (imu.rate_s - before.rate_s).mean(axis=0)), strict=True))
+    return gather_by_hand(imu), truth, moved
+
+
+def errors(world, seed, **options):
+    """Return group -> (errors, reported sds, factor of the sds on those that noise and scatter alone give)."""
+    data, truth, moved = session(world, seed, **options)
+    hand, truth = solve_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
+    for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
+        if not any(effect.sensor == sensor and effect.time_constant for effect in hand.model.extras):   # a bias beside a drift is that of the start, else a mean
+            truth[part] += moved[sensor]
+    places = [hand.param_names.index(name) for name in PARAM_NAMES[:21]]
+    own = [hand.model.param_names.index(name) for name in PARAM_NAMES[:21]]
+    noise_alone = hand.sd[places]**2 - hand.model_error.added_variance[own]
+    grown = hand.model_error.factor[own] * hand.sd[places] / np.sqrt(np.maximum(noise_alone, 1e-30))
+    off, sd = hand.values[places] - truth[:21], hand.sd[places]
+    return {group: (off[part], sd[part], grown[part]) for group, part in GROUPS.items()}
+
+
+def main():
+    parser = ArgumentParser()
+    parser.add_argument('--first', type=int, default=1)
+    parser.add_argument('--seeds', type=int, default=8)
+    parser.add_argument('--worlds', nargs='*', default=list(WORLDS))
+    options = parser.parse_args()
+    for world in options.worlds:
+        runs = [errors(world, seed) for seed in range(options.first, options.first + options.seeds)]
+        for group in GROUPS:
+            off, sd, grown = (np.concatenate([run[group][k] for run in runs]) for k in range(3))
+            alone = off / (sd / grown)
+            print(f'{world:26s} {group:22s} noise alone {np.sqrt(np.mean(alone**2)):5.2f} {100 * np.mean(np.abs(alone) < 1.96):4.0f} %   '
+                  f'reported {np.sqrt(np.mean((off / sd)**2)):5.2f} {100 * np.mean(np.abs(off / sd) < 1.96):4.0f} %   '
+                  f'wider by {np.median(grown):.2f} (95 %: {np.quantile(grown, 0.95):.2f})', flush=True)
+
+
+if __name__ == '__main__':
+    main()
