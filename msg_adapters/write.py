@@ -1,12 +1,13 @@
 """Sessions from arrays into new recordings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from msg_adapters.bag import DEFAULT_TOPICS
 from msg_adapters.bag_writer import BagWriter
@@ -14,6 +15,7 @@ from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import UNKNOWN, encode_imu, encode_joints, encode_temperature, rows
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE, encode_trajectory
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 BATCH = 65536
@@ -62,6 +64,23 @@ def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSampl
         received = [np.maximum.accumulate(samples.stamp_ns) for _, _, samples, _ in streams]
         for parts in _merged(received):
             _write_batch(bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts)
+
+
+def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *, topic: str = 'joint_trajectory',
+                       storage: str = 'sqlite3') -> None:
+    """
+    Write joint trajectories into a new bag, each at the time (ns) at which it shall begin: played back, it drives the joints.
+
+    Raises
+    ------
+    InputError
+        When `path` exists already or cannot be written.
+
+    """
+    with BagWriter(path, storage) as bag:
+        number = bag.add_topic(topic, standard_definition(JOINT_TRAJECTORY_TYPE))
+        messages = [memoryview(encode_trajectory(points)) for _, points in parts]
+        bag.write(np.full(len(parts), number), np.array([stamp for stamp, _ in parts], np.int64), messages)
 
 
 def _merged(received):

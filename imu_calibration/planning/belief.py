@@ -117,9 +117,11 @@ def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise
     return total
 
 
-def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel]) -> np.ndarray:
+def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0) -> np.ndarray:
     """
     Return an information matrix that bounds from above what a window adds in any plan, shape (n, n).
+
+    For the given share of the covariance of the bias processes; the rest is left to `common_variance`.
 
     The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an Ornstein-Uhlenbeck process seen at the middles
     of the windows, whose inverse is tridiagonal. Its rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller
@@ -129,8 +131,18 @@ def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel]) -> np.nd
     total = np.zeros_like(window.within[SENSORS[0]])
     for sensor in SENSORS:
         model = noise[sensor]
-        floor = sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
+        floor = share * sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
         variance = model.low_variance / window.samples + model.offset_sd**2 + floor
         rows = window.means[sensor]
         total += window.within[sensor] + rows.T @ (rows / variance[:, None])
     return total
+
+
+def common_variance(noise: NoiseModel, seconds: float) -> float:
+    """
+    Return c such that the bias processes seen at any instants within so many seconds have a covariance of at least ``c 1 1'``.
+
+    ``1' G^-1 1`` is the information about a constant beside the process, at most ``(T + 2 time) / (2 time sd^2)``, which is that of seeing
+    it all the time; of several processes the inverses add up.
+    """
+    return sum(process.sd**2 * 2 * process.time / (seconds + 2 * process.time) for process in noise.bias_processes)

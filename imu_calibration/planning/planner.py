@@ -25,12 +25,14 @@ from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.motions import MotionKind, PlannedMotion
+from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.search import LEAST_GAIN, Offers, exchanged, greedy
 from imu_calibration.planning.situation import Situation
 from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.simulation.motion_builder import Segment
 
 DONE = 'every parameter is within its tolerance'
 STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
@@ -77,6 +79,22 @@ class Plan:
     def seconds(self) -> float:
         """Total time, s."""
         return float(self.ends[-1]) if len(self.ends) else 0.0
+
+    @property
+    def segments(self) -> tuple[tuple[Segment, ...], ...]:
+        """Segments of each motion, the way to it included, each going on where the last one ended."""
+        position, found = np.asarray(self.start), []
+        for motion in self.motions:
+            found.append(motion.from_position(position))
+            position = np.asarray(found[-1][-1].end) if found[-1] else position
+        return tuple(found)
+
+    @property
+    def points(self) -> TrajectoryPoints:
+        """The whole plan as one trajectory."""
+        everything = tuple(segment for one in self.segments for segment in one)
+        names = tuple(self.model.joint_names)
+        return trajectory(names, everything) if everything else TrajectoryPoints.stop(names)
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -139,7 +157,7 @@ class Planner:
         first = () if self.known is not None else (situation.first_rest(place),)
         sequence = greedy(situation, place, known=self.known, first=first, progress=progress)
         sequence = exchanged(situation, sequence, place, known=self.known, fixed=len(first))
-        bound = situation.relaxation(self.known).seconds if with_bound else float('nan')
+        bound = situation.lower_bound(self.known) if with_bound else float('nan')
         return self._plan_of(sequence, start, place, bound)
 
     def _plan_of(self, sequence, start, place, bound):

@@ -7,8 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.planning.belief import Belief, additive_bound, exact_information
+from imu_calibration.planning.belief import Belief, additive_bound, common_variance, exact_information
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.motions import MotionKind, PlannedMotion
 from imu_calibration.planning.relaxation import Relaxation, relax
@@ -18,6 +19,10 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 FIRST_REST = 4.0
 """Seconds of the first rest at least: what the noise of the IMU is read from."""
+COMMON_SHARES = (0.5, 0.9)
+"""Shares of the biases' covariance that are tried as common to a session in the lower bound."""
+ROUNDS_OF_LENGTH = 3
+"""Lengths of session that are tried for each of them."""
 
 
 class Situation:
@@ -104,16 +109,75 @@ class Situation:
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE and motion.seconds >= FIRST_REST]
         return min(rests, key=lambda k: (self.way_seconds[place, self.repertoire.place_of[k]], self.seconds[k]))
 
-    def relaxation(self, known: np.ndarray | None = None) -> Relaxation:
-        """Return the lower bound on the time of every plan made of these motions and the moves between their places."""
+    def lower_bound(self, known: np.ndarray | None = None) -> float:
+        """
+        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s.
+
+        With nothing known of the biases, a share of their wander is common to a whole session no longer than T, which keeps their
+        parameters from being known better however much is measured: every plan takes at least ``min(T, value(T))``, the value that of the
+        relaxation for sessions of T. The best T is looked for; without any T the share is zero.
+        """
+        best = self.relaxation(known).seconds
+        if known is not None or best == 0:
+            return best
+        floor = self._bias_floor()
+        for share in COMMON_SHARES if floor > 0.3 * best else ():
+            seconds = max(best, floor)
+            for _ in range(ROUNDS_OF_LENGTH):
+                value = self.relaxation(known, common=(share, seconds)).seconds
+                best = max(best, min(seconds, value))
+                if value < 1.05 * seconds:
+                    break
+                seconds = float(np.sqrt(seconds * min(value, 9.0 * seconds)))
+        return max(best, floor)
+
+    def _bias_floor(self) -> float:
+        """Return how long the biases alone must be watched, whatever else is known, s."""
+        model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
+        for sensor in SENSORS:
+            for parameter in range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names))):
+                prior = coordinates.prior_sd[parameter]**2
+                wanted = coordinates.tolerances[parameter]**2
+                room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
+                lengths = np.geomspace(0.1, 1e6, 600)
+                enough = [common_variance(self.noise[sensor], seconds) <= room for seconds in lengths]
+                floor = max(floor, float(lengths[np.argmax(enough) - 1]) if not enough[0] else 0.0)
+        return floor
+
+    def relaxation(self, known: np.ndarray | None = None, *, common: tuple[float, float] | None = None) -> Relaxation:
+        """Return the relaxed plan; `common`: (share of the biases' covariance, seconds of the longest session that counts)."""
+        share, seconds = common or (0.0, 0.0)
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
         everything = [*(self.windows[number] for number in own), *(self.way_windows[key] for key in edges)]
         empty = np.zeros_like(self.coordinates.prior_information)
-        most = np.array([sum((additive_bound(window, self.noise) for window in windows), empty) for windows in everything])
+        most = np.array([sum((additive_bound(window, self.noise, share=1.0 - share) for window in windows), empty)
+                         for windows in everything])
         cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
         prior = self.coordinates.prior_information + (0.0 if known is None else known)
-        return relax(most, cost, prior, asked=self.coordinates.asked)
+        asked = self.coordinates.asked
+        if share:
+            prior, asked = self._with_common(prior, asked, share, seconds)
+        return relax(most, cost, prior, asked=asked)
+
+    def _with_common(self, prior, asked, share, seconds):
+        """
+        Return (prior information, rows asked for) where a bias and the offset common to the session are one coordinate b.
+
+        With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' - P))^-1 + (P / P')^2 var(b)``.
+        """
+        prior, asked, model = prior.copy(), asked.copy(), self.coordinates.model
+        for sensor in SENSORS:
+            for parameter in range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names))):
+                place = int(np.argmax(np.abs(self.coordinates.basis[parameter])))
+                before = 1.0 / prior[place, place]
+                offset = share * common_variance(self.noise[sensor], seconds) / self.coordinates.units[parameter]**2
+                after = before + offset
+                room = (1.0 - before * offset / after) * (after / before)**2
+                prior[place, place] = 1.0 / after
+                # Where there is no room at all a small number stands for it: the value is then longer than any session that counts.
+                asked[np.abs(asked[:, place]) > 0.5] /= np.sqrt(max(room, 1e-4))
+        return prior, asked
 
     def timed(self, sequence: Sequence[int], start: int) -> tuple[list[PlannedWindow], np.ndarray, float]:
         """Return (windows, their middles, total time) of motions one after the other from a place, with the ways between them."""

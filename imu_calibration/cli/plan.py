@@ -1,0 +1,78 @@
+"""``imu_calibration plan``: the motions that bring every parameter within its tolerance."""
+
+from argparse import ArgumentParser, Namespace
+from textwrap import fill
+
+from imu_calibration import files
+from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
+from imu_calibration.errors import InputError
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.use_cases.plan import plan, summary
+from imu_calibration.use_cases.progress import progress_bar
+from msg_adapters.storages import identifiers
+
+NAME = 'plan'
+HELP = 'Plan the motions that bring every parameter within its tolerance: plan.yaml, a joint trajectory and report.html.'
+CHOICES = ('tolerances', 'noise', 'accelerometer_model', 'gyroscope_model', 'reference_model', 'catalogue', 'gravity')
+SHOWN = 12
+"""Motions that are printed; plan.yaml has all."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('--output', metavar='DIR', required=True,
+                        help='folder for plan.yaml, trajectory.yaml, the bag trajectory and report.html')
+    add_stand_arguments(parser, 'with limits: range, speed, acceleration')
+    parser.add_argument('--motion', choices=('any', 'yaw-only'), default='any',
+                        help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
+    parser.add_argument('--calibration', metavar='FILE', help='what is known already')
+    parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
+    parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
+    parser.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
+    parser.add_argument('--imu-rate', type=float, default=100.0, help='Hz, default 100')
+    parser.add_argument('--gravity', type=float, help='local gravity for a robot description, m/s^2')
+    group = parser.add_argument_group('model')
+    group.add_argument('--accelerometer-model', metavar='MODEL', help='a named model or effect names joined by +; default size_effect')
+    group.add_argument('--gyroscope-model', metavar='MODEL', help='the same for the gyroscope; default bias+matrix')
+    group.add_argument('--reference-model', metavar='MODEL', help="effects of table and clock joined by +, or 'none'; default table_tilt")
+    add_effects_argument(group)
+    parser.add_argument('--storage', choices=identifiers(), default='sqlite3', help='of the bag with the trajectories, default sqlite3')
+    parser.add_argument('--no-bound', action='store_true', help='leave out the lower bound on the time, which takes longest')
+    parser.add_argument('--no-report', action='store_true', help='no report.html')
+
+
+def run(options: Namespace) -> int:
+    """Plan into a folder that can be written, print what it promises, return the exit code."""
+    stand = _stand(options)
+    with files.output_folder(options.output) as folder, progress_bar('planning', 100, 'percent') as advance:
+        told = 0.0
+
+        def progress(share):
+            nonlocal told
+            advance(max(100 * share - told, 0.0))
+            told = max(told, 100 * share)
+        made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate, progress=progress,
+                    with_bound=not options.no_bound, **{name: getattr(options, name) for name in CHOICES})
+        made.save(folder, report=not options.no_report, storage=options.storage)
+    _show(made.plan, folder)
+    return made.exit_code
+
+
+def _stand(options):
+    from imu_calibration.planning.yaw_only import yaw_table
+    if options.motion == 'yaw-only':
+        return yaw_table(options.gravity)
+    stand = stand_of(options)
+    if stand is None:
+        raise InputError('what moves the IMU must be described, nothing was; give a table or a robot description', key='table')
+    return stand
+
+
+def _show(made, folder):
+    for end, motion in list(zip(made.ends, made.motions, strict=True))[:SHOWN]:
+        print(fill(f'until {end:6.1f} s  {motion.words}', 96, subsequent_indent=' ' * 16))
+    if len(made.motions) > SHOWN:
+        print(f'... and {len(made.motions) - SHOWN} more, in plan.yaml')
+    for line in summary(made):
+        print(fill(line, 96, subsequent_indent='    '))
+    print(f'written: plan.yaml and the trajectory in {folder}')

@@ -1,0 +1,137 @@
+"""From a table or an arm and what is wanted of its IMU to the motions that it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imu_calibration import documents, files
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.errors import InputError
+from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
+from imu_calibration.planning.noise import noise_of_figures, noise_of_grade
+from imu_calibration.planning.planner import Plan, make_planner
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.use_cases.choices import calibration_options
+from imu_calibration.use_cases.drawing import Drawing
+from imu_calibration.use_cases.stand import Stand, table_of
+
+START_NS = 1_000_000_000
+"""First stamp of the bag with the trajectories: any, but the same every time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A plan: prints what it promises, draws itself, saves plan.yaml, the trajectory and report.html."""
+
+    plan: Plan
+    """Motions, predicted standard deviations, time and its lower bound."""
+    table: Table
+    """What moves."""
+    provenance: dict[str, Any]
+    """Options that it was made with."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every parameter comes within its tolerance, else 3."""
+        return 3 if self.plan.missing else 0
+
+    @property
+    def seconds(self) -> float:
+        """Total time, s."""
+        return self.plan.seconds
+
+    @property
+    def lower_bound_seconds(self) -> float:
+        """Time that no plan of these motions undercuts, s."""
+        return self.plan.lower_bound_seconds
+
+    @cached_property
+    def report(self) -> str:
+        """The report as one HTML page."""
+        from imu_calibration.report.plan_page import plan_report
+        return plan_report(self.plan, self.provenance)
+
+    def plot(self) -> Drawing:
+        """Return the standard deviations against time, in tolerances, as a figure for a notebook."""
+        from imu_calibration.report.plan_figures import draw_progress
+        return Drawing(draw_progress(self.plan))
+
+    def save(self, folder: str | PathLike, *, report: bool = True, bag: bool = True, storage: str = 'sqlite3') -> None:
+        """Write plan.yaml, trajectory.yaml and, when wanted, report.html and the bag `trajectory` with one message for each motion."""
+        from msg_adapters.write import write_trajectories
+        place = files.make_folder(folder)
+        text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
+        if report:
+            files.write_text(place / 'report.html', self.report)
+        if self.plan.motions:
+            files.write_text(place / 'trajectory.yaml', documents.to_text(trajectory_to_mapping(self.plan.points)))
+            if bag:
+                write_trajectories(place / 'trajectory', self._messages(), storage=storage)
+        files.write_text(place / 'plan.yaml', text)
+
+    def _messages(self):
+        from imu_calibration.planning.motions import trajectory
+        names, begins = self.plan.motions[0].joint_names, np.concatenate([[0.0], self.plan.ends[:-1]])
+        return [(START_NS + round(float(begin) * 1e9), trajectory(names, segments))
+                for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]
+
+    def __str__(self):
+        return '\n'.join(summary(self.plan))
+
+
+def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
+         progress: Callable[[float], None] | None = None, with_bound: bool = True, **choices: Any) -> Planned:
+    """
+    Plan the motions that bring every parameter within its tolerance.
+
+    Parameters
+    ----------
+    stand : path-like, Table or Arm
+        What moves, with its limits.
+    calibration : path-like or Calibration, optional
+        What is known already.
+    grade : str
+        Grade of the IMU, where no noise is given.
+    imu_rate : float
+        Samples of the IMU per second.
+    progress : callable, optional
+        Told the share of the way that is done.
+    with_bound : bool
+        Whether the lower bound on the time is worked out as well.
+    choices
+        tolerances, noise, accelerometer_model, gyroscope_model, reference_model, catalogue, gravity: see `Choices`.
+
+    Raises
+    ------
+    InputError
+        When the stand cannot move, or names do not fit.
+
+    """
+    table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
+    if grade not in GRADES:
+        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
+    noise = noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
+    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
+    provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
+                  'known': Path(calibration).name if isinstance(calibration, (str, PathLike)) else 'a calibration' if known else 'nothing'}
+    return Planned(planner.plan(progress=progress, with_bound=with_bound), table, provenance)
+
+
+def summary(made: Plan) -> list[str]:
+    """Return what a plan promises, a line each."""
+    count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
+    lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters come within their tolerance']
+    if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
+        lines.append(f'no plan of these motions takes less than {made.lower_bound_seconds:.0f} s')
+    if made.missing:
+        lines.append(f'outside their tolerance whatever these joints do within their limits: {", ".join(made.missing)}')
+    return lines
