@@ -25,6 +25,7 @@ from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.goals import WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.search import LEAST_GAIN, Offers, exchanged, greedy
@@ -34,7 +35,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.motion_builder import Segment
 
-DONE = 'every parameter is within its tolerance'
+DONE = 'all that was wanted is reached'
 STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
 
 
@@ -73,7 +74,9 @@ class Plan:
     history: np.ndarray
     """Standard deviations in tolerances before the first motion and after each, of the parameters asked for, shape (n_motions + 1, k)."""
     lower_bound_seconds: float
-    """No plan made of these motions meets the tolerances in less, s."""
+    """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
+    missing: tuple[str, ...]
+    """Parameters that stay outside their tolerance, or pairs of causes that would not be told apart."""
 
     @property
     def seconds(self) -> float:
@@ -96,11 +99,6 @@ class Plan:
         names = tuple(self.model.joint_names)
         return trajectory(names, everything) if everything else TrajectoryPoints.stop(names)
 
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Parameters that stay outside their tolerance."""
-        far = self.wanted & (self.sd > self.tolerances * (1 + 1e-6))
-        return tuple(name for name, flag in zip(self.model.param_names, far, strict=True) if flag)
 
 
 class Planner:
@@ -136,7 +134,7 @@ class Planner:
 
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
-        missing = tuple(name for name, excess in self.excess.items() if excess > 1.0)
+        missing = self.situation.goal.missing(self._belief.known)
         if not missing:
             return NextMotion(None, DONE)
         place = self.situation.place_near(position)
@@ -149,14 +147,15 @@ class Planner:
         return NextMotion(motion, f'it gains most per second for {", ".join(missing[:3])}', motion.seconds_from(position), missing)
 
     def plan(self, position: np.ndarray | None = None, *, progress: Callable[[float], None] | None = None,
-             with_bound: bool = True) -> Plan:
+             with_bound: bool = True, longest: float = np.inf) -> Plan:
         """Return a whole plan from where the joints are (default: at home)."""
         situation = self.situation
         start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
         place = situation.place_near(start)
         first = () if self.known is not None else (situation.first_rest(place),)
-        sequence = greedy(situation, place, known=self.known, first=first, progress=progress)
+        sequence = greedy(situation, place, known=self.known, first=first, progress=progress, longest=longest)
         sequence = exchanged(situation, sequence, place, known=self.known, fixed=len(first))
+        with_bound = with_bound and isinstance(situation.goal, WithinTolerances)
         bound = situation.lower_bound(self.known) if with_bound else float('nan')
         return self._plan_of(sequence, start, place, bound)
 
@@ -167,7 +166,7 @@ class Planner:
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), start,
                     np.array([seconds for _, seconds in steps[1:]]), coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    np.array([situation.excess(step) for step, _ in steps]), bound)
+                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(covariance))
 
     def _named(self, number: int) -> PlannedMotion:
         """Return a motion of the repertoire; a rest where there was one already is a return."""

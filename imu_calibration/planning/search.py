@@ -15,13 +15,6 @@ LEAST_GAIN = 2e-3
 """A motion must lower the sum of logarithms of excess over tolerance by so much to be worth its while."""
 
 
-def shortfall(situation: Situation, covariance: np.ndarray) -> np.ndarray:
-    """Return for each of the covariances of z ``sum_i max(0, ln(sd_i / tolerance_i))``, shape (k,): zero when every tolerance is met."""
-    asked = situation.coordinates.asked
-    variance = np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True)
-    return 0.5 * np.maximum(np.log(np.maximum(variance, 1e-300)), 0.0).sum(axis=1)
-
-
 class Offers:
     """The gain of every motion from where the joints are."""
 
@@ -32,8 +25,8 @@ class Offers:
         self.information = situation.information + situation.way_information[place, self.places]
         self.possible = self.seconds > 0
         after = belief.after(self.information, self.seconds)
-        before = shortfall(situation, belief.known[None])[0]
-        self.left = shortfall(situation, after[:, :size, :size])
+        before = situation.goal.left(belief.known[None])[0]
+        self.left = situation.goal.left(after[:, :size, :size])
         self.gain = np.where(self.possible, before - self.left, 0.0)
 
     @property
@@ -45,7 +38,7 @@ class Offers:
 def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
            progress: Callable[[float], None] | None = None, longest: float = np.inf) -> list[int]:
     """
-    Return motions that bring every parameter within its tolerance, or as near as it can be brought, each the best per second at its time.
+    Return motions that reach the goal, or come as near as can be, each the best per second at its time.
 
     Parameters
     ----------
@@ -63,7 +56,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
 
     """
     belief, place, chosen, spent = situation.belief(known), start, [], 0.0
-    beginning = shortfall(situation, belief.known[None])[0]
+    beginning = situation.goal.left(belief.known[None])[0]
     while len(chosen) < MOST_MOTIONS and spent < longest:
         choice = Offers(situation, belief, place)
         must = len(chosen) < len(first)
@@ -74,7 +67,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         chosen.append(number)
         spent += float(choice.seconds[number])
         place = int(situation.repertoire.place_of[number])
-        left = shortfall(situation, belief.known[None])[0]
+        left = situation.goal.left(belief.known[None])[0]
         if progress is not None:
             progress(1.0 - left / max(beginning, 1e-9))
         if left == 0.0 and len(chosen) >= len(first) and meets(situation, chosen, start, known=known):
@@ -83,17 +76,19 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
 
 
 def meets(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
-    """Return whether motions bring every parameter within its tolerance."""
-    return bool(situation.excess(situation.covariance_after(sequence, start, known)[0]).max() <= 1.0)
+    """Return whether motions reach the goal."""
+    return bool(situation.goal.left(situation.covariance_after(sequence, start, known)[0][None])[0] == 0.0)
 
 
 def exchanged(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
               fixed: int = 0) -> list[int]:
     """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
-    goal = np.maximum(situation.excess(situation.covariance_after(sequence, start, known)[0]), 1.0) * (1 + 1e-9)
-    best = list(sequence)
+    def left(trial):
+        return float(situation.goal.left(situation.covariance_after(trial, start, known)[0][None])[0])
+
+    best, goal = list(sequence), left(sequence) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
         trial = best[:place] + best[place + 1:]
-        if np.all(situation.excess(situation.covariance_after(trial, start, known)[0]) <= goal):
+        if left(trial) <= goal:
             best = trial
     return best

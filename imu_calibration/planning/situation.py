@@ -11,6 +11,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.planning.belief import Belief, additive_bound, common_variance, exact_information
 from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.goals import Goal, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion
 from imu_calibration.planning.relaxation import Relaxation, relax
 from imu_calibration.planning.repertoire import Repertoire
@@ -42,6 +43,7 @@ class Situation:
 
     def __init__(self, repertoire: Repertoire, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
         self.repertoire, self.coordinates, self.noise, self.rate = repertoire, coordinates, noise, rate
+        self.goal: Goal = WithinTolerances(coordinates)
         self.predictor = WindowPredictor(repertoire.table, coordinates, noise, rate=rate)
 
     @property

@@ -13,8 +13,9 @@ from imu_calibration.report.page import render
 from imu_calibration.report.plan_figures import draw_motion, draw_progress
 from imu_calibration.units import for_people
 
-SAYS = {MotionKind.POSE: 'rests', MotionKind.RETURN: 'returns', MotionKind.SPIN: 'spins', MotionKind.SWING: 'swings',
-        MotionKind.TOGETHER: 'several joints at once', MotionKind.MOVE: 'moves'}
+SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
+        MotionKind.TOGETHER: 'joint turn', MotionKind.MOVE: 'move'}
+"""What is counted, in the singular."""
 
 
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
@@ -34,7 +35,7 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
 
 def _kinds(plan):
     counts = {kind: sum(motion.kind is kind for motion in plan.motions) for kind in SAYS}
-    return ', '.join(f'{count} {SAYS[kind]}' for kind, count in counts.items() if count)
+    return ', '.join(f'{count} {SAYS[kind]}{"s" if count > 1 else ""}' for kind, count in counts.items() if count) or 'nothing to do'
 
 
 def _rows(plan):

@@ -1,0 +1,124 @@
+"""
+Figures of the planner over random tables, tolerances and grades: ``python benchmarks/bench_plan.py [--tables N] [--seeds N]``.
+
+Each table has three axes in random directions, none closer than 60 degrees to parallel with its neighbour, 60 to 300 deg/s, and a random
+mount. Tolerances are drawn for each effect between once and three times what the fixed profile `calibration` comes to on that table, for
+biases between twice and four times, so that the profile has no time to spare on some effect; it is charged with the time after which its
+own motions, in its own order, meet the tolerances. Achieved: errors of calibrations of simulated sessions over predicted sd, root mean square
+over all parameters and seeds.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
+
+from imu_calibration.calibration.options import CalibrationOptions, choose_model  # noqa: E402
+from imu_calibration.calibration.status import tolerances_of  # noqa: E402
+from imu_calibration.effects.named_models import NAMED_MODELS  # noqa: E402
+from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
+from imu_calibration.planning.belief import exact_information  # noqa: E402
+from imu_calibration.planning.coordinates import Coordinates  # noqa: E402
+from imu_calibration.planning.noise import noise_of_grade  # noqa: E402
+from imu_calibration.planning.planner import Planner, make_planner  # noqa: E402
+from imu_calibration.planning.repertoire import Repertoire  # noqa: E402
+from imu_calibration.planning.situation import Situation  # noqa: E402
+from imu_calibration.reference.motion_limits import limits_of  # noqa: E402
+from imu_calibration.samples import SampleBlock  # noqa: E402
+from imu_calibration.simulation.motion_builder import Profile  # noqa: E402
+from imu_calibration.simulation.profiles import make_profile  # noqa: E402
+from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate  # noqa: E402
+from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
+
+from worlds.random_tables import random_table  # noqa: E402
+
+RATE = 100.0
+MARKS = np.linspace(0.1, 1.0, 19)
+"""Shares of the fixed profile at which it is looked at."""
+
+
+def fixed_profile(situation, table):
+    """Return (times, standard deviations of all parameters at each) of the fixed profile."""
+    profile = make_profile('calibration', 0, table)
+    windows = situation.predictor.predict([profile.segments])[0]
+    times, prior = np.array([window.middle for window in windows]), situation.coordinates.prior_information
+    found = []
+    for mark in MARKS:
+        known = int(np.searchsorted(times, mark * profile.duration))
+        found.append(situation.coordinates.sd(np.linalg.inv(prior + exact_information(windows[:known], times[:known], situation.noise))))
+    return MARKS * profile.duration, np.array(found)
+
+
+def drawn_tolerances(rng, model, sd):
+    """Return {section: {effect: tolerance}} by the rule above."""
+    drawn = {}
+    for effect in model.effects:
+        factor = rng.uniform(2.0, 4.0) if effect.name == 'bias' else rng.uniform(1.0, 3.0)
+        drawn.setdefault(effect.sensor, {})[effect.name] = float(factor * sd[model.slices[effect.key]].max())
+    return drawn
+
+
+def achieved(plan, table, grade, seed):
+    """Return (errors, reported standard deviations), both over predicted ones, of one simulated session that follows the plan."""
+    profile = Profile('plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names))
+    model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
+    values = random_values(model, grade, seed)
+    samples = simulate(model, values, table, profile=profile, options=SimulationOptions(noise=GRADES[grade].noise), seed=seed)
+    found = calibrate(SampleBlock(*samples), table).calibration
+    truth = dict(zip(model.param_names, values, strict=True))
+    rows = [(found.values[k] - truth[name], found.sd[k], plan.sd[plan.model.param_names.index(name)])
+            for k, name in enumerate(found.param_names) if name in truth and name in plan.model.param_names]
+    error, reported, predicted = np.array(rows).T
+    return error / predicted, reported / predicted
+
+
+def one_table(number, seeds):
+    """Return one row of figures."""
+    rng = np.random.default_rng([number, 14])
+    table, grade = random_table(rng), list(GRADES)[number % len(GRADES)]
+    noise, model = noise_of_grade(GRADES[grade].noise, RATE), choose_model(CalibrationOptions(), table)
+    situation = Situation(Repertoire(table, limits_of(table)), Coordinates(model, tolerances_of(model)), noise)
+    times, sd = fixed_profile(situation, table)
+    tolerances = drawn_tolerances(rng, model, sd[-1])
+    began = time.process_time()
+    planner: Planner = make_planner(table, noise=noise, tolerances=tolerances)
+    plan = planner.plan()
+    taken = time.process_time() - began
+    enough = np.all(sd[:, plan.wanted] <= plan.tolerances[plan.wanted], axis=1)
+    fixed = float(times[np.argmax(enough)]) if enough.any() else np.inf
+    errors, reported = zip(*(achieved(plan, table, grade, 1000 * number + seed) for seed in range(seeds)), strict=True) if seeds else ([], [])
+    return {'grade': grade, 'met': not plan.missing, 'plan': plan.seconds, 'bound': plan.lower_bound_seconds, 'fixed': fixed,
+            'rms': float(np.sqrt(np.mean(np.square(errors)))) if seeds else np.nan,
+            'reported': float(np.median(reported)) if seeds else np.nan, 'planning': taken, 'motions': len(plan.motions)}
+
+
+def main():
+    """Print a row for each table and what all of them come to."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
+    parser.add_argument('--tables', type=int, default=20)
+    parser.add_argument('--seeds', type=int, default=5)
+    parser.add_argument('--first', type=int, default=0)
+    options = parser.parse_args()
+    rows = []
+    print('table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted  reported/predicted  planning s')
+    for number in range(options.first, options.first + options.tables):
+        row = one_table(number, options.seeds)
+        rows.append(row)
+        print(f"{number:5d} {row['grade']:<11} {'yes' if row['met'] else 'NO ':<4}{row['plan']:7.1f}  {row['bound']:7.1f}  "
+              f"{row['plan'] / row['bound']:5.2f}  {row['fixed']:7.1f}  {row['plan'] / row['fixed']:5.2f}  {row['rms']:18.2f}  "
+              f"{row['reported']:18.2f}  {row['planning']:10.1f}", flush=True)
+    ratio, share = (np.array([row['plan'] / row[name] for row in rows]) for name in ('bound', 'fixed'))
+    rms = np.array([row['rms'] for row in rows])
+    print(f'tolerances met on {sum(row["met"] for row in rows)} of {len(rows)}; plan over bound: median {np.median(ratio):.2f}, '
+          f'largest {ratio.max():.2f}; plan over fixed profile: median {np.median(share):.2f}, largest {share.max():.2f}; achieved over '
+          f'predicted: median {np.nanmedian(rms):.2f}, {np.nanmin(rms):.2f} to {np.nanmax(rms):.2f}; processor time: largest '
+          f'{max(row["planning"] for row in rows):.1f} s')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,121 @@
+"""What a plan is for, as a number that falls to zero: every tolerance met, or causes told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import chi2, ncx2, norm
+
+from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.selection.search import FAMILY_WISE, TIE
+
+POWER = 0.95
+"""Chance with which causes shall be told apart."""
+
+
+class Goal(Protocol):
+    """What is wanted of the covariance of z."""
+
+    def left(self, covariance: np.ndarray) -> np.ndarray:
+        """Return how far covariances, shape (k, n, n), are from the goal, shape (k,); zero when it is reached."""
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the names of what is missing with one covariance, shape (n, n)."""
+
+
+class WithinTolerances:
+    """Every parameter asked for within its tolerance: ``sum_i max(0, ln(sd_i / tolerance_i))``."""
+
+    def __init__(self, coordinates: Coordinates):
+        self.coordinates = coordinates
+
+    def excess(self, covariance: np.ndarray) -> np.ndarray:
+        """Return standard deviations of the parameters asked for, in tolerances, shape (k, p)."""
+        asked = self.coordinates.asked
+        return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
+
+    def left(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the sum of logarithms of what is in excess."""
+        return np.maximum(np.log(self.excess(covariance)), 0.0).sum(axis=1)
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the parameters outside their tolerance."""
+        names = np.array(self.coordinates.model.param_names)[self.coordinates.wanted]
+        return tuple(names[self.excess(covariance[None])[0] > 1.0 + 1e-6].tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """One effect of a class that a recording does not tell apart."""
+
+    key: tuple[str, str]
+    """(sensor, effect name)."""
+    places: np.ndarray
+    """Its coordinates."""
+    size: np.ndarray
+    """How large it would be, in those coordinates."""
+
+
+class ToldApart:
+    """
+    Each cause of a class as large as it is suspected, seen through whichever other one is in the model instead.
+
+    The noncentrality of cause a beside cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with r the baseline and b
+    (Atkinson and Fedorov 1975); other members of the class are left out there. A pair is told apart when both have enough.
+
+    Parameters
+    ----------
+    coordinates : Coordinates
+        Of the baseline with all causes.
+    causes : sequence of Cause
+    questions : int
+        Effects that the search asks about.
+
+    """
+
+    def __init__(self, coordinates: Coordinates, causes: Sequence[Cause], questions: int):
+        self.coordinates, self.causes = coordinates, tuple(causes)
+        self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
+        self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
+
+    def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
+        """Return lambda of each pair in units of what is enough, shape (k, n_pairs)."""
+        found = np.empty((len(covariance), len(self.pairs)))
+        prior = self.coordinates.prior_information
+        for number, (a, b) in enumerate(self.pairs):
+            others = [cause.places for cause in self.causes if cause is not a and cause is not b]
+            out = np.concatenate(others) if others else np.zeros(0, int)
+            own = covariance[:, a.places[:, None], a.places]
+            if len(out):
+                cross = covariance[:, a.places[:, None], out]
+                own = own - cross @ np.linalg.solve(covariance[:, out[:, None], out], cross.transpose(0, 2, 1))
+            information = np.linalg.inv(own) - prior[np.ix_(a.places, a.places)]
+            found[:, number] = np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
+        return np.maximum(found, 1e-12)
+
+    def left(self, covariance: np.ndarray) -> np.ndarray:
+        """Return half the sum of logarithms of what is lacking, the worst pair three times."""
+        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)), 0.0)
+        return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1)
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the pairs that would not be told apart."""
+        found = self.noncentrality(covariance[None])[0]
+        return tuple(dict.fromkeys(' and '.join(sorted((a.key[1], b.key[1])))
+                                   for (a, b), value in zip(self.pairs, found, strict=True) if value < 1.0))
+
+
+def enough(size: int, questions: int) -> float:
+    """
+    Return the noncentrality with which an effect of so many parameters is named, and preferred to another, with the chance POWER.
+
+    Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
+    logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
+    """
+    threshold = chi2.isf(FAMILY_WISE / questions, size)
+    named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= POWER)
+    quantile = norm.ppf(POWER)
+    return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))

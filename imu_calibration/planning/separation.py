@@ -1,0 +1,109 @@
+"""A planner that tells causes apart: the motion after which one name remains of a class that a recording left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.effects.base import Role
+from imu_calibration.errors import InputError
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.planning.belief import exact_information
+from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.goals import Cause, ToldApart
+from imu_calibration.planning.planner import Planner
+from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.planning.situation import Situation
+from imu_calibration.reference.motion_limits import limits_of
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.profiles import make_profile
+
+SESSION = 'quick'
+"""Profile on which the mates are taken to imitate the effect that was found."""
+
+
+def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
+                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions()) -> Planner:
+    """
+    Return a planner whose goal is to tell causes apart.
+
+    Parameters
+    ----------
+    table : Table
+    calibration : Calibration
+        Of the extended model that a diagnosis ended with: it says how large the first cause is.
+    causes : sequence of (sensor, effect name)
+        The effect that was found, then those that would do as well.
+    noise : mapping
+        Sensor -> NoiseModel of single samples at `rate`.
+    rate : float
+        Samples of the IMU per second.
+    options : CalibrationOptions
+        Its tolerances and catalogue.
+
+    Raises
+    ------
+    InputError
+        When the calibration lacks the first cause, or a motion cannot show one of them.
+
+    """
+    first, *mates = causes
+    if first not in calibration.model.slices:
+        raise InputError(f"the calibration must contain '{first[1]}', which is to be told from others; give that of the diagnosis",
+                         key='calibration')
+    model = calibration.model
+    for sensor, name in mates:
+        if (sensor, name) not in model.slices:
+            model = model.with_effect(sensor, name)
+    for key in causes:
+        _require_shown_by_motion(model, key)
+    values = model.start_from(calibration.model, calibration.values)
+    coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
+    situation = Situation(Repertoire(table, limits_of(table)), coordinates, dict(noise), rate=rate)
+    questions = len(model.catalogue.effects(model.joint_names))
+    situation.goal = ToldApart(coordinates, suspected(situation, causes, table), questions)
+    names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
+    return Planner(situation, coordinates.information_from(names, calibration.covariance))
+
+
+def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table) -> list[Cause]:
+    """
+    Return the causes with their sizes: the first as it was found, the mates as large as they would have to be to pass for it.
+
+    ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the information of a usual session, r the baseline.
+    """
+    coordinates = situation.coordinates
+    windows = situation.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
+    times = np.array([window.middle for window in windows])
+    information = coordinates.prior_information + exact_information(windows, times, situation.noise)
+    places = [_places(coordinates, key) for key in causes]
+    rest = np.setdiff1d(np.arange(coordinates.size), np.concatenate(places))
+    inner = np.linalg.inv(information[np.ix_(rest, rest)])
+    start = coordinates.values[_indices(coordinates.model, causes[0])] / coordinates.units[_indices(coordinates.model, causes[0])]
+    found = [Cause(causes[0], places[0], start)]
+    for key, own in zip(causes[1:], places[1:], strict=True):
+        across = information[np.ix_(own, rest)] @ inner
+        bb = information[np.ix_(own, own)] - across @ information[np.ix_(rest, own)]
+        ba = information[np.ix_(own, places[0])] - across @ information[np.ix_(rest, places[0])]
+        found.append(Cause(key, own, np.linalg.solve(bb, ba @ start)))
+    return found
+
+
+def _indices(model, key):
+    part = model.slices[key]
+    return np.arange(part.start, part.stop)
+
+
+def _places(coordinates, key):
+    return np.array([int(np.argmax(np.abs(coordinates.basis[k]))) for k in _indices(coordinates.model, key)])
+
+
+def _require_shown_by_motion(model, key):
+    effect = model.catalogue.find(*key, model.joint_names)
+    if effect.role is Role.LIMIT or effect.time_constant or 'temperature' in effect.needs:
+        raise InputError(f"effects that are told apart by motion must depend on it, '{key[1]}' shows with time, temperature or range; "
+                         'leave it out')
