@@ -26,6 +26,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--motion', choices=('any', 'yaw-only'), default='any',
                         help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
     parser.add_argument('--calibration', metavar='FILE', help='what is known already')
+    parser.add_argument('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
+                        '--calibration contains; at most three minutes')
+    parser.add_argument('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')
     parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
     parser.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
@@ -52,7 +55,8 @@ def run(options: Namespace) -> int:
             advance(max(100 * share - told, 0.0))
             told = max(told, 100 * share)
         made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate, progress=progress,
-                    with_bound=not options.no_bound, **{name: getattr(options, name) for name in CHOICES})
+                    with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
+                    diagnosis=options.diagnosis, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made.plan, folder)
     return made.exit_code

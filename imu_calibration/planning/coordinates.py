@@ -13,6 +13,9 @@ from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 
+EXACT = 1e-4
+"""What a calibration knows better than to this share of a tolerance counts as known to it."""
+
 
 class Coordinates:
     """
@@ -80,9 +83,8 @@ class Coordinates:
         scaled = covariance[np.ix_(theirs, theirs)] / np.outer(self.units[own], self.units[own])
         basis = self.basis[own]
         values, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
-        # Directions that the gauge fixes have no variance and no component in the basis.
-        rows = (vectors.T @ basis) / np.sqrt(np.maximum(values, 1e-13 * values.max()))[:, None]
-        rows = rows[values > 1e-13 * values.max()]
+        # Directions that the gauge fixes have no variance and no component in the basis; EXACT is as good as certain.
+        rows = (vectors.T @ basis) / np.sqrt(np.maximum(values, max(1e-13 * values.max(), EXACT**2)))[:, None]
         known = rows.T @ rows - self.prior_information
         weights, directions = scipy.linalg.eigh((known + known.T) / 2)
         return (directions * np.maximum(weights, 0.0)) @ directions.T

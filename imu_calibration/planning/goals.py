@@ -19,6 +19,9 @@ POWER = 0.95
 class Goal(Protocol):
     """What is wanted of the covariance of z."""
 
+    words: str
+    """The causes to be told apart, if that is what is wanted."""
+
     def left(self, covariance: np.ndarray) -> np.ndarray:
         """Return how far covariances, shape (k, n, n), are from the goal, shape (k,); zero when it is reached."""
 
@@ -28,6 +31,8 @@ class Goal(Protocol):
 
 class WithinTolerances:
     """Every parameter asked for within its tolerance: ``sum_i max(0, ln(sd_i / tolerance_i))``."""
+
+    words = ''
 
     def __init__(self, coordinates: Coordinates):
         self.coordinates = coordinates
@@ -79,6 +84,7 @@ class ToldApart:
     def __init__(self, coordinates: Coordinates, causes: Sequence[Cause], questions: int):
         self.coordinates, self.causes = coordinates, tuple(causes)
         self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
+        self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
 
     def noncentrality(self, covariance: np.ndarray) -> np.ndarray:

@@ -77,6 +77,8 @@ class Plan:
     """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
     missing: tuple[str, ...]
     """Parameters that stay outside their tolerance, or pairs of causes that would not be told apart."""
+    told_apart: str = ''
+    """The causes that the plan is to tell apart, where it is for that."""
 
     @property
     def seconds(self) -> float:
@@ -166,7 +168,8 @@ class Planner:
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), start,
                     np.array([seconds for _, seconds in steps[1:]]), coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(covariance))
+                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(covariance),
+                    situation.goal.words)
 
     def _named(self, number: int) -> PlannedMotion:
         """Return a motion of the repertoire; a rest where there was one already is a return."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -17,12 +17,15 @@ from imu_calibration.errors import InputError
 from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.noise import noise_of_figures, noise_of_grade
 from imu_calibration.planning.planner import Plan, make_planner
+from imu_calibration.planning.separation import make_separator
 from imu_calibration.reference.table import Table
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.stand import Stand, table_of
 
+LONGEST_SEPARATION = 180.0
+"""Time that a plan takes at most to tell effects apart, s."""
 START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
@@ -88,6 +91,7 @@ class Planned:
 
 
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
+         separate: Sequence[str] = (), diagnosis: str | PathLike | None = None, longest: float = LONGEST_SEPARATION,
          progress: Callable[[float], None] | None = None, with_bound: bool = True, **choices: Any) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
@@ -102,6 +106,12 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         Grade of the IMU, where no noise is given.
     imu_rate : float
         Samples of the IMU per second.
+    separate : sequence of str
+        Effects to be told apart, the one that `calibration` contains first: the plan is for that instead of the tolerances.
+    diagnosis : path-like, optional
+        diagnosis.json, of which the first finding with others that would do as well is taken.
+    longest : float
+        Time that telling apart may take, s.
     progress : callable, optional
         Told the share of the way that is done.
     with_bound : bool
@@ -120,14 +130,45 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
     noise = noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
-    planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
+    causes = tuple(separate) or (files.read_mapping(diagnosis, 'diagnosis', class_in) if diagnosis else ())
+    if causes:
+        if known is None:
+            raise InputError('effects are told apart beside the calibration of the diagnosis that found the first, none was given; give it',
+                             key='calibration')
+        owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
+        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options)
+    else:
+        planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
     provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                   'known': Path(calibration).name if isinstance(calibration, (str, PathLike)) else 'a calibration' if known else 'nothing'}
-    return Planned(planner.plan(progress=progress, with_bound=with_bound), table, provenance)
+    if causes:
+        provenance['tells_apart'] = ', '.join(causes)
+    return Planned(planner.plan(progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+
+
+def class_in(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """
+    Return the first class of effects that a diagnosis did not tell apart, the named one first.
+
+    Raises
+    ------
+    InputError
+        When every finding has a single name.
+
+    """
+    for finding in document.get('findings') or ():
+        if finding.get('indistinguishable_from'):
+            return (finding['effect'], *finding['indistinguishable_from'])
+    raise InputError('the diagnosis must have a finding with others that would do as well, it has none; nothing is left to be told apart')
 
 
 def summary(made: Plan) -> list[str]:
     """Return what a plan promises, a line each."""
+    if made.told_apart:
+        head = f'{len(made.motions)} motions in {made.seconds:.0f} s'
+        if not made.missing:
+            return [f'{head} tell {made.told_apart} apart']
+        return [head, f'as large as they are suspected, these stay alike whatever these joints do in that time: {", ".join(made.missing)}']
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
     lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters come within their tolerance']
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
