@@ -14,7 +14,7 @@ from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
-from imu_calibration.selection import questions
+from imu_calibration.selection import investigation, questions
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import investigate
@@ -140,8 +140,28 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late):
     rivals = [Rival(question, question, behind, {names[0]: 0.3}) for behind in (0.0, 800.0)]
     added = [_disagreement(replace(found, denied=[], rivals=[rival]), names)[0, 0] for rival in rivals]
     assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
-    mates = told(found.used, late[1], replace(found, rivals=[replace(rivals[0], other=found.attempt.questions[0])])).findings[0].indistinguishable_from
+    beside = replace(found, rivals=[replace(rivals[0], other=found.attempt.questions[0])])
+    mates = told(found.used, late[1], beside).findings[0].indistinguishable_from
     assert mates[0] == found.attempt.questions[0].name
+
+
+def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(late, monkeypatch):
+    monkeypatch.setattr(investigation, '_that_help', lambda *_: [])
+    found = investigated(late)
+    assert not found.named and 'time_offset' in [question.name for question in found.doubtful]
+    names = found.attempt.baseline.param_names
+    added = _disagreement(found, names)
+    assert np.sqrt(added[names.index('gyroscope.matrix.xx'), names.index('gyroscope.matrix.xx')]) > 5e-3
+    assert not _disagreement(replace(found, doubtful=[]), names).any()
+
+
+def test_a_finding_of_the_model_as_asked_must_stand_out_too(late, monkeypatch):
+    found = investigated(late)
+    solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
+    assert by_evidence._without_faint(found, solution) is found
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda solution, question: question is not found.named[0])
+    less = by_evidence._without_faint(found, solution)
+    assert found.named[0] not in less.named and list(less.denied) == [*found.denied, found.named[0]]
 
 
 def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(late, asked, monkeypatch):

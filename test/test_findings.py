@@ -12,6 +12,7 @@ from imu_calibration.diagnosis.sentences import candidates_of
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection import search as forward
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Score
@@ -82,3 +83,33 @@ def test_what_explains_much_but_leaves_most_is_said():
     assert 'time_offset explains much (4321 nats' in nothing_named(Told)
     Told.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
     assert nothing_named(Told).startswith('nothing found')
+
+
+class LagsAndDelay(forward.Evidence):
+    """A delay is a lag of each sensor: two of the three cost the same but for rounding; what is better makes a lag negative."""
+
+    def __init__(self, better=0.0):
+        super().__init__(np.ones(3), np.zeros(3))
+        self.better = better
+
+    def heldout(self, used):
+        return 1e6 + {(0,): 300.0, (0, 1): 0.0, (1, 2): -4e-6 - self.better, (0, 2): -8e-6}.get(tuple(sorted(used)), 1e6)
+
+    def p_value(self, smaller, larger):
+        return 0.0
+
+    def fit(self, used, number=None):
+        return np.array([-0.01 if self.better and (k == 1 and 2 in used or k == 2 and 0 in used) else 0.01 for k in used]), 1e-12 * np.eye(len(used))
+
+    def normal(self, number=None):
+        raise NotImplementedError
+
+    loss = heldout
+
+
+@pytest.mark.parametrize('better', [0.0, 50.0])
+def test_rounding_replaces_nothing_and_neither_does_what_makes_another_lag_negative(better):
+    effects = CATALOGUE.find('reference', 'time_offset'), CATALOGUE.find('gyroscope', 'gyro_bandwidth'), CATALOGUE.find('accelerometer', 'accel_bandwidth')
+    delay, gyroscope, accelerometer = asked = [Question(effect, (k,), 1, effect.name) for k, effect in enumerate(effects)]
+    found = forward.Search(LagsAndDelay(better), (), asked).reconsidered([delay, gyroscope])
+    assert found == [delay, gyroscope]

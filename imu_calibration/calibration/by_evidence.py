@@ -64,15 +64,14 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         return EvidentResult(conclude(*first, table=table, options=options, provenance=provenance), None)
     found = investigate(windows, table, baseline_model(options, table, solution.model), progress=asking,
                         bias_processes=options.bias_processes)
-    asked = model.slices
-    while added := [question for question in found.named if (question.sensor, question.name) not in asked]:
+    found = _without_faint(found, solution)
+    while added := _beyond(found, first[2]):
         extended = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
         solution, gathered, model = solve_recordings(sources, table, extended, progress=progress, mapper=mapper, names=names)
-        faint = [question for question in added if not stands_out(solution, question)]
-        if not faint:
+        found = _without_faint(found, solution)
+        if len(_beyond(found, first[2])) == len(added):
             options = extended
             break
-        found = replace(found, named=[question for question in found.named if question not in faint], denied=[*found.denied, *faint])
     else:
         solution, gathered, model = first
     solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
@@ -82,6 +81,17 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
     changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
     return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
+
+
+def _beyond(found, model):
+    """Return the findings that a model lacks."""
+    return [question for question in found.named if (question.sensor, question.name) not in model.slices]
+
+
+def _without_faint(found, solution):
+    """Return the Investigation without findings that are in a solution and do not stand out there."""
+    faint = [question for question in found.named if (question.sensor, question.name) in solution.model.slices and not stands_out(solution, question)]
+    return replace(found, named=[question for question in found.named if question not in faint], denied=[*found.denied, *faint]) if faint else found
 
 
 def stands_out(solution: Solution, question: Question) -> bool:
@@ -125,8 +135,8 @@ def _point(found):
 
 
 def _disagreement(found, names):
-    """Return the covariance of what other choices would have moved the parameters by: those that parts of the recording deny, and rivals."""
-    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in found.denied]
+    """Return the covariance of what other choices would have moved the parameters by: what is denied or doubtful, and rivals."""
+    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful)]
     moves += [(rival.moves, rival.weight) for rival in found.rivals]
     total = np.zeros((len(names),) * 2)
     for moved, weight in moves:

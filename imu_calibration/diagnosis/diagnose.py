@@ -23,6 +23,9 @@ from imu_calibration.selection.investigation import Investigation, investigate
 MATE = 0.5
 """What would do as well as a finding takes at least this share of what the finding takes off the residual of the sensor that shows it."""
 
+HALF = 0.5
+"""Share of a finding that an effect which is not named would take over, from which it is told beside the finding."""
+
 
 def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
              bias_processes: dict | None = None) -> Diagnosis:
@@ -90,7 +93,7 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
     findings += [finding(attempt.search, named, place, solution=told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
-                         shows=shows, rivals=[rival.other for rival in found.rivals if rival.question.name == named[place].name])
+                         shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named),
@@ -98,6 +101,17 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
                      baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),
                      residual_traces(windows, table, baseline, after=solution),
                      len(found.used), int(np.sum(attempt.locked)))
+
+
+def _rivals(found, question):
+    """Return what would do nearly as well as a finding, and what nobody is sure of that would take over half of it."""
+    near = [rival.other for rival in found.rivals if rival.question.name == question.name]
+    values = dict(zip(found.attempt.space.names, found.attempt.values(found.named)))
+    own = [found.attempt.space.names[k] for k in question.parameters]
+    for other in found.doubtful:
+        moved = found.attempt.moved_by(found.named, other)
+        near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
+    return near
 
 
 def _clipping(limit, solution):

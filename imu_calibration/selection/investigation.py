@@ -53,6 +53,8 @@ class Investigation:
     """Effects that could not be asked about."""
     denied: Sequence[Question] = field(default_factory=list)
     """Questions that would have become findings, but the parts of the recording disagree on them."""
+    doubtful: Sequence[Question] = field(default_factory=list)
+    """Questions that likelihood asks for, but that are not named: they pay too little, or leave too much, to be sure of them."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """What would do nearly as well in the place of a finding."""
 
@@ -111,11 +113,12 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
             break
         attempt = attempted(point=attempt.point(named))
         explained = Explained(attempt.evidence, attempt.search)
-        again, denied = (same_questions(attempt, some) for some in (named, denied))
+        again, denied, chosen = (same_questions(attempt, some) for some in (named, denied, chosen))
         named = _that_help(attempt, explained, pruned(again, explained.share))
     names = {question.name for question in named}
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
-    return Investigation(used, attempt, explained, named, limits, not_testable, denied, rivals)
+    doubtful = [question for question in chosen if question not in (*named, *denied)]
+    return Investigation(used, attempt, explained, named, limits, not_testable, denied, doubtful, rivals)
 
 
 def too_few_windows(count: int) -> NotObservableError:

@@ -14,6 +14,8 @@ LEAST_GAIN = 4.0
 """Least gain of held-out log likelihood, nats."""
 PENALTY = 1.0
 """Penalty for a parameter beside what held-out prediction charges, nats."""
+BETTER = 0.01
+"""Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
 TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
 ABSURD = 50.0
@@ -128,7 +130,7 @@ class Search:
         return None
 
     def _replaced(self, chosen):
-        best, cost = None, self.cost(chosen) - 1e-6
+        best, cost = None, self.cost(chosen) - BETTER
         for place, question in enumerate(chosen):
             rest = chosen[:place] + chosen[place + 1:]
             for other in self.others(rest):
@@ -136,7 +138,7 @@ class Search:
                     continue
                 trial = chosen[:place] + [other] + chosen[place + 1:]
                 value = self.cost(trial)
-                if value < cost and self.allowed(trial, other):
+                if value < cost and all(self.allowed(trial, each) for each in trial):
                     best, cost = trial, value
         return best
 
