@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from imu_calibration.errors import InputError
-from imu_calibration.preflight.on_table import same_motion
+from imu_calibration.preflight.on_table import same_motion, signs_or_delay
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window, WindowKind
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
 
@@ -45,8 +48,9 @@ def joints(block, names=None, sign=1.0):
     (still, ('this IMU does not turn when the table does', 'right topic')),
     (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer turns as middle should', 'middle turns as outer should')),
     (lambda block: joints(block, sign=-1.0), ('outer turns the other way round', 'inner turns the other way round')),
-    (lambda block: later(block, 2.0), ('turns otherwise than the table', 'do both clocks agree')),
-], ids=('another IMU', 'exchanged joints', 'wrong signs', 'far apart in time'))
+    (lambda block: later(block, 2.0), ('about 2.0 s behind those of the joints', 'set both clocks by one source')),
+    (lambda block: later(block, 9.0), ('turns otherwise than the table', 'do both clocks agree')),
+], ids=('another IMU', 'exchanged joints', 'wrong signs', 'apart in time', 'farther apart than is looked for'))
 def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
     block, table = gimbals
     with pytest.raises(InputError) as refused:
@@ -64,6 +68,52 @@ def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds
 def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
     with pytest.raises(InputError, match="minus the reference's x"):
         calibrate(joints(shaft[0], sign=-1.0), shaft[1])
+
+
+@pytest.mark.parametrize('swing', [0.0, 0.6])
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_differ(shaft, sign, swing):
+    """Sweeps of 2 s to and fro: one second of delay and a wrong sign are one thing when all are alike, and told apart when every other one is larger."""
+    table, time = shaft[1], np.arange(6000) * 0.01
+    position = np.stack([(1.0 + swing * np.sin(0.77 * t)) * np.sin(np.pi * t) for t in (time, time - 1.0)])
+    rates = [np.gradient(each, 0.01) for each in position]
+    zero = np.zeros((len(time), 1))
+    motion = JointMotion(time, position[0][:, None], rates[0][:, None], zero, zero)
+    felt = reference_motion(table, replace(motion, rate=sign * rates[1 if sign > 0 else 0][:, None])).rate_s
+    window = Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(felt), felt, motion)
+    found = signs_or_delay([window], table)
+    if swing and sign < 0:
+        assert found is None
+    else:
+        assert found.sure == (swing > 0) and 'about 1.0 s' in found.words
+
+
+def frozen(block, *, joint, start, stop):
+    position, velocity = block.joints.position.copy(), block.joints.velocity.copy()
+    position[start:stop, joint], velocity[start:stop, joint] = position[start, joint], 0.0
+    return replace(block, joints=replace(block.joints, position=position, velocity=velocity))
+
+
+@pytest.mark.parametrize('joint', [0, 1, 2])
+def test_one_joint_that_stands_still_is_named_with_the_time(gimbals, joint):
+    block, table = gimbals
+    count = len(block.joints.position)
+    with pytest.raises(InputError, match=f'{table.joint_names[joint]} stands still from .* while the IMU turns about its axis'):
+        calibrate(frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table)
+
+
+def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_without_rests_is_named(shaft):
+    """Nothing rests, so nothing else tells a frozen reading from a quiet one."""
+    rate = shaft[0].imu.rate_s.copy()
+    moving = np.flatnonzero(np.abs(rate[:, 0]) > 1.0)
+    start = moving[len(moving) // 2]
+    rate[start:start + 1000] = rate[start]
+    with pytest.raises(InputError, match='the gyroscope must measure all the time, it repeats one reading from .* while the joints turn'):
+        calibrate(replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1])
+
+
+def test_a_wrong_gain_is_no_frozen_joint(gimbals):
+    assert calibrate(replace(gimbals[0], imu=replace(gimbals[0].imu, rate_s=1.1 * gimbals[0].imu.rate_s)), gimbals[1]).calibration
 
 
 def test_diagnose_refuses_the_same(gimbals):

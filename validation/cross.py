@@ -65,14 +65,30 @@ def outcome(found, checked):
 
 
 def spread(first, second):
-    """Return the rms of differences over combined standard deviations by group of parameters, of what both know."""
+    """Return the differences over combined standard deviations by group of parameters, of what both know."""
     groups = {}
     theirs = dict(zip(second.param_names, zip(second.values, second.sd, second.status)))
     for name, value, sd, status in zip(first.param_names, first.values, first.sd, first.status):
         other = theirs.get(name)
         if other and 'held' not in (status, other[2]) and not name.startswith('reference'):
             groups.setdefault(name.rpartition('.')[0], []).append((value - other[0]) / np.hypot(sd, other[1]))
+    return groups
+
+
+def rms(groups):
+    """Return the rms of each group of numbers."""
     return {group: float(np.sqrt(np.mean(np.square(values)))) for group, values in groups.items()}
+
+
+def halves_together(folder):
+    """Return the rms by group over the halves of all recordings."""
+    together = {}
+    for name in RECORDINGS:
+        pair = [transfer(folder, name, name, (part, part))[0] for part in (0, 1)]
+        if not any(isinstance(found, Exception) for found in pair):
+            for group, values in spread(*(found.calibration for found in pair)).items():
+                together.setdefault(group, []).extend(values)
+    return rms(together)
 
 
 def must_be_refused(folder):
@@ -107,13 +123,16 @@ def run(folder, plots):
                           *outcome(*transfer(folder, made, used)), True)
         pair = [transfer(folder, name, name)[0] for name in (first, second)]
         if not any(isinstance(found, Exception) for found in pair):
-            groups = spread(*(found.calibration for found in pair))
+            groups = rms(spread(*(found.calibration for found in pair)))
             section.claim(f'{first} and {second}: differences over combined sds, rms by group', 'at most 1.5 in every group',
                           ', '.join(f'{group} {value:.1f}' for group, value in groups.items()), max(groups.values()) <= 1.5, True)
     for name in RECORDINGS:
         for made, used in ((0, 1), (1, 0)):
             section.claim(f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after / before', 'below 1, in no motion above 1.05, or refused',
                           *outcome(*transfer(folder, name, name, (made, used))), made == 0)
+    groups = halves_together(folder)
+    section.claim('halves of the five recordings, 240 s each: differences over combined sds, rms by group', 'at most 1.5 in every group',
+                  ', '.join(f'{group} {value:.1f}' for group, value in groups.items()), max(groups.values()) <= 1.5, True)
     for what, found, noticed in must_be_refused(folder):
         section.claim(f'shaft_yaw_medium, {what}', 'refused, or said', found, noticed, True)
     section.say(text('cross'))

@@ -11,7 +11,8 @@ from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
-from imu_calibration.preflight.on_table import same_motion
+from imu_calibration.preflight.on_table import same_motion, signs_or_delay
+from imu_calibration.preflight.standing_still import standing_still
 from imu_calibration.reference.table import Table
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
@@ -55,7 +56,7 @@ def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = 
         moments = _moments(gathered.accumulator, model, sensor)
         if moments is not None:
             found += _rates(moments, gathered.kept, table) if sensor == 'gyroscope' else []
-            found += _axes(sensor, moments, table)
+            found += _axes(sensor, moments, table, gathered.kept)
     return tuple(found)
 
 
@@ -90,8 +91,10 @@ def _seen(sensor, moment):
 
 def _rates(moments, windows, table):
     found = list(_rate_units(moments))
-    stranger = None if found else same_motion(moments, windows, table)
-    return found if stranger is None else [stranger]
+    if found:
+        return found
+    stranger = (standing_still(windows, table) if table is not None else None) or same_motion(moments, windows, table)
+    return [] if stranger is None else [stranger]
 
 
 def _rate_units(moments):
@@ -113,7 +116,7 @@ def _rate_units(moments):
                       'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
 
 
-def _axes(sensor, moments, table):
+def _axes(sensor, moments, table, windows):
     cross, reference, measured = moments
     seen, inverse = _seen(sensor, reference)
     matrix = cross @ inverse
@@ -122,9 +125,14 @@ def _axes(sensor, moments, table):
     match = match_axes(matrix, seen)
     if not match.wrong:
         return
+    delay = signs_or_delay(windows, table) if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored else None
+    if delay and delay.sure:
+        yield CheckFinding('on_table', REFUSE, f'both streams must tell the same time: {delay.words}')
+        return
     what, whose = WORDS[sensor]
     yield CheckFinding('handedness', REFUSE,
-                       f'{what} must be {whose}, {_exchange(match, seen)}: {_cause(match, matrix, seen, table)}')
+                       f'{what} must be {whose}, {_exchange(match, seen)}: {_cause(match, matrix, seen, table)}'
+                       + (f'; or {delay.words}' if delay else ''))
 
 
 def _exchange(match, seen):

@@ -1,5 +1,6 @@
 """Is this IMU on this table? Whether the joints and the gyroscope tell the same motion, and if not, why."""
 
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
@@ -20,6 +21,8 @@ LARGEST_SHIFT = 5.0
 """Delays between the streams are looked for up to this size, s."""
 LEAST_SHIFT = 0.05
 """Smaller ones are left to the estimation, s."""
+ALIKE = 0.02
+"""Shares explained that differ by less do not tell a delay from a wrong sign."""
 MOST_SAMPLES = 5_000
 """Samples of moving windows that are looked at for exchanged joints."""
 MOST_JOINTS = 3
@@ -64,9 +67,8 @@ def _cause(windows, table):
     if not windows:
         return ''
     shift, share, unshifted = _best_shift(windows, table)
-    if abs(shift) > LEAST_SHIFT and share > max(SAME, 1.5 * unshifted):
-        side = 'behind' if shift > 0 else 'ahead of'
-        return f'its stamps are about {abs(shift):.1f} s {side} those of the joints; set both clocks by one source, or stamp in the drivers'
+    if abs(shift) > LEAST_SHIFT and share > max(SAME, 1.5 * max(unshifted, 0.0)):
+        return _late(shift)
     order, signs, share = _best_order(_some(windows), table)
     if share < SURE:
         return ''
@@ -74,6 +76,43 @@ def _cause(windows, table):
     changes = [f'{names[k]} turns {"the other way round" if j == k else ("as " if sign > 0 else "against what ") + names[j] + " should"}'
                for k, (j, sign) in enumerate(zip(order, signs)) if k != j or sign < 0]
     return f'{", ".join(changes)}; correct names and axes in the table description, or the joint states'
+
+
+def _late(shift):
+    side = 'behind' if shift > 0 else 'ahead of'
+    return f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; set both clocks by one source, or stamp in the drivers'
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay between the streams that explains opposite rates."""
+
+    words: str
+    """The cause and what to do."""
+    sure: bool
+    """Whether it explains them plainly better than a wrong sign."""
+
+
+def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
+    """
+    Return the delay that explains rates of the opposite sign, or None where a sign explains them better.
+
+    A table that sweeps to and fro tells half a period of delay from a wrong sign only as far as its sweeps differ.
+
+    Parameters
+    ----------
+    windows : list of Window
+        Moving windows with their samples.
+    table : Table
+
+    """
+    windows = [window for window in windows if len(window) >= 20]
+    if not windows:
+        return None
+    shift, share, unshifted = _best_shift(windows, table)
+    if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - ALIKE:
+        return None
+    return Delay(_late(shift), share > -unshifted + ALIKE)
 
 
 def _some(windows):
@@ -87,25 +126,34 @@ def _some(windows):
 
 
 def _best_shift(windows, table):
-    """Return by how much the IMU is late, s, the share of the rate's length that the joints then explain, and that without a delay."""
+    """Return by how much the IMU is late, s, the share of the rates that the joints then explain, and that without a delay, negative where opposite."""
     period = float(np.median([window.period for window in windows]))
     start, end = windows[0].time[0], windows[-1].time[-1]
-    felt, told = np.zeros((2, int((end - start) / period) + 2))
+    felt, told = np.zeros((2, int((end - start) / period) + 2, 3))
     bias = np.median(np.concatenate([window.rate_s for window in windows]), axis=0)
     for window in windows:
         first = int(np.ceil((window.time[0] - start) / period))
         grid = start + period * np.arange(first, int((window.time[-1] - start) / period) + 1)
         for line, rate in ((felt, window.rate_s - bias), (told, reference_motion(table, window.motion).rate_s)):
-            line[first:first + len(grid)] = np.interp(grid, window.time, np.linalg.norm(rate, axis=1))
-    felt, told = felt - felt.mean(), told - told.mean()
+            line[first:first + len(grid)] = np.stack([np.interp(grid, window.time, column) for column in rate.T], axis=1)
+    felt, told = felt - felt.mean(axis=0), told - told.mean(axis=0)
     size = 1 << int(np.ceil(np.log2(2 * len(felt))))
-    products = np.fft.irfft(np.fft.rfft(felt, size) * np.conj(np.fft.rfft(told, size)), size)
-    most = min(int(LARGEST_SHIFT / period), len(felt) - 1)
+    products = np.fft.irfft((np.fft.rfft(felt, size, axis=0) * np.conj(np.fft.rfft(told, size, axis=0))).sum(axis=1), size)
+    most = min(int(LARGEST_SHIFT / period), len(felt) // 2)
     products = np.concatenate([products[-most:], products[:most + 1]])
-    best = int(np.argmax(products))
+    # what a shift moves out of the recording is made up for, so that long ones are judged like short ones
+    products *= len(felt) / (len(felt) - np.abs(np.arange(-most, most + 1)))
+    best = _nearest_peak(products, most)
     # what moved outside of the windows is missing: a lower bound
-    share = np.maximum(products[[best, most]], 0.0)**2 / max((felt @ felt) * (told @ told), 1e-300)
+    share = products[[best, most]] * np.abs(products[[best, most]]) / max((felt**2).sum() * (told**2).sum(), 1e-300)
     return (best - most) * period, float(share[0]), float(share[1])
+
+
+def _nearest_peak(products, middle):
+    """Return the place of the peak nearest to no delay among those that are as good as the highest: what repeats has many."""
+    inner = products[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= products[:-2]) & (inner >= products[2:]) & (inner >= (1.0 - ALIKE) * products.max()))
+    return int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(products))
 
 
 def _best_order(windows, table):

@@ -1,0 +1,96 @@
+"""What stands still while everything else turns: a gyroscope that repeats one reading, one joint of several whose state does not follow."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.preflight.frozen_parts import TURNS
+from imu_calibration.reference.kinematics import reference_motion
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+
+LASTING = 1.0
+"""Shorter standstills are left to others, s."""
+STILL = 1e-6
+"""A joint whose state repeats turns less than this once positions are smoothed, rad/s."""
+ALONG = 0.8
+"""Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square."""
+OWN = 0.3
+"""The unexplained rate along that axis is at least this share of what is measured along it: a wrong gain leaves less."""
+
+
+def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | None:
+    """
+    Return which part stands still for a second or more while the others turn, or None.
+
+    A joint is frozen when its state does not change while the gyroscope feels a rate about its axis that the other joints do not explain.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Moving windows with their samples.
+    table : Table
+
+    """
+    windows = [window for window in windows if len(window) > 2 and len(window.motion) == len(window)]
+    if not windows:
+        return None
+    told = [reference_motion(table, window.motion).rate_s for window in windows]
+    turning = [np.linalg.norm(rate, axis=1) > TURNS for rate in told]
+    same = [np.append(np.all(np.diff(window.rate_s, axis=0) == 0, axis=1), False) for window in windows]
+    spans = _joined(span for each in zip(windows, same, turning) for span in _spans(*each))
+    if spans:
+        return CheckFinding('frozen', REFUSE, f'the gyroscope must measure all the time, it repeats one reading {_words(spans)} while the joints turn; '
+                            'look at the sensor and its driver, and leave that time out')
+    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
+    for k, name in enumerate(table.joint_names):
+        spans = _joined(span for window, rate in zip(windows, told) for span in _frozen(window, table, rate + bias, joint=k))
+        if spans:
+            return CheckFinding('frozen', REFUSE, f'joint states must follow the table, {name} stands still {_words(spans)} while the IMU turns about its '
+                                'axis; look at the driver of the table, and leave that time out')
+    return None
+
+
+def _frozen(window, table, told, *, joint):
+    """Yield (start, stop) in which a joint's state stands still while the rest of the rate lies along its axis."""
+    for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < STILL):
+        if window.time[stop - 1] - window.time[start] < LASTING:
+            continue
+        motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - told)[start:stop]
+        faster = motion.rate.copy()
+        faster[:, joint] += 1.0
+        axis = reference_motion(table, replace(motion, rate=faster)).rate_s - reference_motion(table, motion).rate_s
+        along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
+        square = float(along @ along)
+        if square > len(along) * TURNS**2 and square > ALONG * (rest**2).sum() and square > OWN**2 * (measured @ measured):
+            yield float(window.time[start]), float(window.time[stop - 1])
+
+
+def _spans(window, same, turning) -> Iterator[tuple[float, float]]:
+    """Yield (start, stop) of lasting runs of `same`, during most of which the joints turn."""
+    for start, stop in _runs(same):
+        if window.time[stop - 1] - window.time[start] >= LASTING and turning[start:stop].mean() > 0.5:
+            yield float(window.time[start]), float(window.time[stop - 1])
+
+
+def _runs(flags):
+    """Return (start, stop) of the runs of true flags, shape (n, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))).reshape(-1, 2)
+
+
+def _joined(spans):
+    """Return spans in order, those that follow one another within a second in one."""
+    joined: list[tuple[float, float]] = []
+    for start, stop in sorted(spans):
+        if joined and start - joined[-1][1] < LASTING:
+            joined[-1] = (joined[-1][0], max(stop, joined[-1][1]))
+        else:
+            joined.append((start, stop))
+    return joined
+
+
+def _words(spans):
+    words = [f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans[:3]]
+    return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
