@@ -57,7 +57,7 @@ def test_calibration_cleans_each_sample_once_for_windows_and_checks(table, seen)
 
 def test_calibration_by_hand_cleans_each_sample_once(seen):
     try:
-        calibrate_without_table([source_of(BAG, Topics(), want_joints=False)])
+        calibrate_without_table([source_of(BAG, Topics())])
     except ImuCalibrationError:
         pass   # what matters here was read
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0

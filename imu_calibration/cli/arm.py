@@ -28,7 +28,7 @@ def run(options: Namespace) -> int:
     imus = []
     for topic in map(Topics, options.imu_topic):
         open_bag(options.bag, topic, want_joints=False).close()
-        blocks = source_of(options.bag, topic, want_joints=False)()
+        blocks = source_of(options.bag, topic)()
         preflight = Preflight()
         imus.append(read_imu(blocks, [preflight])[0])
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))

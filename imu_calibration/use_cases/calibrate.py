@@ -110,12 +110,12 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         raise InputError('an earlier calibration must be compared on a table, none came; give its description', key='table')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
     table = None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))
+    joints = None if table is None else table.joint_names
     for path in recordings:
         if not isinstance(path, SampleBlock):
-            open_bag(path, topics, want_joints=table is not None).close()
+            open_bag(path, topics, want_joints=joints is not None).close()
     jobs = jobs_for(jobs, len(recordings))
-    names = None if table is None else table.joint_names
-    sources = [source_of(item, topics, names, want_joints=table is not None, quiet=jobs > 1) for item in recordings]
+    sources = [source_of(item, topics, joints, quiet=jobs > 1) for item in recordings]
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
         provenance = hashing.submit(provenance_of, recordings, kept(choices))
         if table is None:

@@ -98,8 +98,7 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     options = calibration_options(choices)
     topics = topics_of(choices)
     table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
-    names = None if table is None else table.joint_names
-    source = source_of(recording, topics, names, want_joints=table is not None)
+    source = source_of(recording, topics, None if table is None else table.joint_names)
     provenance = provenance_of([recording], kept(choices))
     with progress_bar('diagnose', 100, '%') as advance:
         if table is None:

@@ -61,7 +61,7 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
     """Return the motion of a recording: as the table says it, else as its compensated readings say it."""
     temperature = temperatures(bag, topics)
     if stand is None:
-        blocks = [block.imu for block in source_of(bag, topics, want_joints=False)() if block.imu is not None]
+        blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
         return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag))
     table = table_of(stand, [bag], topics)
     truth = session_truth(source_of(bag, topics, table.joint_names)(), table)

@@ -82,6 +82,6 @@ def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = No
 
     """
     topics = Topics(imu_topic, None, temperature_topic)
-    result = identify_noise(source_of(recording, topics, want_joints=False), nominal_of(nominal))
+    result = identify_noise(source_of(recording, topics), nominal_of(nominal))
     options = {name: value for name, value in (('imu_topic', imu_topic), ('temperature_topic', temperature_topic)) if value}
     return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

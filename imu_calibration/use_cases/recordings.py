@@ -62,12 +62,13 @@ def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *,
 
 
 def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics(), joint_names: Iterable[str] | None = None, *,
-              want_joints: bool | str = True, want_temperature: bool | str = True, quiet: bool = False) -> Source:
+              want_joints: bool | str | None = None, want_temperature: bool | str = True, quiet: bool = False) -> Source:
     """
     Return a callable that yields the blocks of a recording, each time anew; samples in memory are a recording of one block.
 
-    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`.
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read where `joint_names` says which.
     """
+    want_joints = joint_names is not None if want_joints is None else want_joints
     if isinstance(recording, SampleBlock):
         return partial(iter, (recording if want_joints else SampleBlock(recording.imu, None, recording.temperature),))
     return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints=want_joints, want_temperature=want_temperature,
