@@ -59,7 +59,8 @@ class PairedImu:
         calibration = _calibrate(imu, gravity) if made_here else calibration
         flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
         poses = calibration.poses if made_here and calibration is not None else None
-        return cls(time, *_compensated(imu, calibration), flagged, calibration, poses, period)
+        force, rate = _compensated(imu, calibration)
+        return cls(time, force, rate, flagged, calibration, poses, period)
 
 
 def clipped(values: np.ndarray) -> np.ndarray:

@@ -221,7 +221,7 @@ class LiveByHand:
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
         """Return the SessionStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result and self.result.calibration, gravity_unknown=self.options.gravity is None, hints=hints)
+        status = hand_status(self.found, self.result.calibration if self.result else None, gravity_unknown=self.options.gravity is None, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 

@@ -68,7 +68,7 @@ class HandModel:
                              'give a table, or leave it out', key='table')
 
     @cached_property
-    def extras(self) -> tuple[Effect, ...]:
+    def extras(self) -> list[Effect]:
         """Effects beyond bias and matrix, in parameter order."""
         return self.model.further
 

@@ -79,7 +79,7 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     if options.noise is not None:
         raise InputError('noise that was measured apart weighs the windows of a table; by hand it must be left out', key='table')
     asked = (options.accelerometer_model, options.gyroscope_model)
-    names = {sensor: None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
-             for sensor, text in zip(SENSORS, asked, strict=True)}
+    accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
+                                for sensor, text in zip(SENSORS, asked, strict=True))
     gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, 0.0)
-    return HandOptions(gravity, spread, tolerances=options.tolerances, **names, catalogue=options.catalogue)
+    return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope, catalogue=options.catalogue)

@@ -26,7 +26,8 @@ def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperatur
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
     warm = None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
-    return Poses(*means, *sems, start, stop, time, warm, noise, float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+    return Poses(means[0], means[1], sems[0], sems[1], start=start, stop=stop, time=time, temperature_c=warm, noise=noise,
+                 period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
 
 
 def noise_statistics(poses: Poses) -> dict:

@@ -64,13 +64,13 @@ class Fit:
     seen: tuple
     """Shares of the arm's information that are not noise of the columns, with their directions."""
 
-    def weighted(self, index: np.ndarray) -> np.ndarray:
+    def weighted(self, index: np.ndarray | slice) -> np.ndarray:
         """Return design' times the derivative of the weighted residual by the residual, for some windows, shape (n, p, 3)."""
         turned, residual = np.swapaxes(self.design[index], 1, 2), self.residual[index]
         along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
 
-    def curvature(self, index: np.ndarray) -> np.ndarray:
+    def curvature(self, index: np.ndarray | slice) -> np.ndarray:
         """Return what some windows add to the Hessian, shape (p, p)."""
         rows = np.swapaxes(self.weighted(index), 1, 2).reshape(-1, self.design.shape[2])
         return rows.T @ self.design[index].reshape(rows.shape)

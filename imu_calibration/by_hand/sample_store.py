@@ -78,6 +78,8 @@ class HandStore:
 
         """
         imu = self.samples()
+        if imu is None:
+            return False
         if len(rests) > most_rests:
             self._drop(imu, slice(0, rests[len(rests) - int(SHARE_KEPT * most_rests)].start))
         elif len(self) > self.most:

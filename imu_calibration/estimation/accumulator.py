@@ -1,6 +1,7 @@
 """The streaming least-squares system: windows go in one at a time, memory stays bounded, systems of several recordings merge."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -115,9 +116,8 @@ class Accumulator(_CentredRows):
 
     def copy(self) -> 'Accumulator':
         """Return an accumulator that goes its own way; rows and factors are never changed in place."""
-        maps = (dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows'))
-        return Accumulator(list(self.rows), *maps, [block.copy() for block in self.blocks], self.block_length,
-                           self.in_blocks, self.share)
+        maps: dict[str, Any] = {name: dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')}
+        return replace(self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps)
 
     def merge(self, other: 'Accumulator') -> None:
         """Take everything of another accumulator that has the same columns; its recordings follow this one's."""

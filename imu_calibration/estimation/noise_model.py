@@ -121,7 +121,7 @@ class NoiseModel:
         return True
 
 
-def dof_factor(dof: np.ndarray) -> np.ndarray:
+def dof_factor(dof: np.ndarray | float) -> np.ndarray:
     """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: what a variance from few data is taken larger by."""
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
 

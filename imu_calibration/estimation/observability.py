@@ -80,7 +80,7 @@ def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Seque
             break
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         strong = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
-        found.append({names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong)})
+        found.append({names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong).tolist()})
     return found
 
 

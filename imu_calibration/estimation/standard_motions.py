@@ -1,5 +1,6 @@
 """Standard motions of a table, each one minute long: what a recording may lack and a person can do."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ class Motion:
     """Short name."""
     text: str
     """What to do."""
-    make: object
+    make: Callable[[float], Sequence[Reference]]
     """Function of gravity that returns pieces of the motion, each a Reference."""
     axis: tuple | None = None
     """The one axis of the sensor that it turns about; None: it takes several, or other attitudes."""

@@ -99,12 +99,12 @@ def reduce_window(window: Window, model: SensorModel, table: Table, *, session: 
 
 def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
     """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
-    with_temperature = all(window.temperature_c is not None for window in windows)
-    temperatures = [[w.temperature_c.mean()] if w.kind == 'static' else w.temperature_c for w in windows] if with_temperature else None
+    known = [[w.temperature_c.mean()] if w.kind == 'static' else w.temperature_c for w in windows if w.temperature_c is not None]
+    temperatures = np.concatenate(known) if len(known) == len(windows) else None
     if len(windows) == 1:
-        return windows[0].motion, None if temperatures is None else np.asarray(temperatures[0])
+        return windows[0].motion, temperatures
     motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
-    return motion, None if temperatures is None else np.concatenate(temperatures)
+    return motion, temperatures
 
 
 def _reduced(window, designs, session, inputs):

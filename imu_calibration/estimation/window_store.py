@@ -62,11 +62,12 @@ class WindowStore:
             if isinstance(entry, Window):
                 yield reduce_window(entry, model, table, session=session, with_pieces=True)
             else:
-                yield _again(*entry, model, table)
+                yield _again(entry, model, table)
 
 
-def _again(reduced, motion, temperature, model, table):
+def _again(entry, model, table):
     """Return a static window's statistics with the columns taken anew."""
+    reduced, motion, temperature = entry
     sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion=motion, temperature_c=temperature).mean(axis=0),
                                                          known.mean[-3:]]))
                for name, known in reduced.sensors.items()}

@@ -32,7 +32,8 @@ def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
 
 def three_numbers(value: Any, what: str) -> tuple[float, float, float]:
     """Return three finite numbers."""
-    return several_numbers(value, 3, what)
+    x, y, z = several_numbers(value, 3, what)
+    return x, y, z
 
 
 def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:

@@ -108,7 +108,8 @@ class JointNames(Sequence):
             return names
         names = tuple(names)
         if errors is not None:
-            return cls(names, **{key: tuple(value) if isinstance(value, list) else value for key, value in errors.items()})
+            known: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in errors.items()}
+            return cls(names, **known)
         return cls(names, names, names[1:-1], tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)), place_names(names))
 
     @property
@@ -168,7 +169,7 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
 
 def _require_limits(limits: JointLimits, what: str) -> None:
     lower, upper = limits.lower, limits.upper
-    if (lower is None) != (upper is None) or (lower is not None and lower > upper):
+    if (lower is None) != (upper is None) or (lower is not None and upper is not None and lower > upper):
         raise InputError(f'table: the range of {what} must go from a smaller to a larger number, got [{lower}, {upper}]; correct it')
     for name in ('speed', 'acceleration'):
         value = getattr(limits, name)
@@ -187,7 +188,7 @@ def _mimic(item: Any, name: str) -> Mimic:
 
 def joint_to_mapping(joint: Joint) -> dict[str, Any]:
     """Return the entry that `joint_from_mapping` turns into an equal joint; what is at its default is left out, but for the place."""
-    item = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
+    item: dict[str, Any] = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
     if any(joint.rpy_deg):
         item['rpy_deg'] = list(joint.rpy_deg)
     if not joint.turns:

@@ -90,7 +90,7 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
     bandwidth, trusted = np.zeros(position.shape[1]), np.zeros(position.shape[1], bool)
     noise = floor.copy()
-    moving = np.flatnonzero(~still)
+    moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = JointRows(knots, time)
         fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=settings.robustness)

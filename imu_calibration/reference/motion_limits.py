@@ -62,7 +62,7 @@ def limits_of(table: Table) -> MotionLimits:
         column, limits = names.index(joint.source), joint.limits
         turns[column] = joint.turns
         factor, offset = (1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)
-        if factor and limits.lower is not None:
+        if factor and limits.lower is not None and limits.upper is not None:
             ends = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
             lower[column], upper[column] = max(lower[column], ends[0]), min(upper[column], ends[1])
         given = [np.inf if value is None or not factor else value / abs(factor) for value in (limits.speed, limits.acceleration)]
@@ -70,4 +70,5 @@ def limits_of(table: Table) -> MotionLimits:
     usual = np.array([USUAL[bool(turning)] for turning in turns]).T
     stuck = ~turns & ~np.isfinite(lower)
     lower[stuck] = upper[stuck] = 0.0
-    return MotionLimits(lower, upper, *np.where(np.isfinite(fastest), fastest, usual), turns)
+    speed, acceleration = np.where(np.isfinite(fastest), fastest, usual)
+    return MotionLimits(lower, upper, speed, acceleration, turns)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ class Reference:
     """Local gravity, m/s^2."""
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,)."""
-    motion: object | None = None
+    motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
     def __len__(self) -> int:

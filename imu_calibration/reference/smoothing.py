@@ -140,7 +140,7 @@ def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[fl
         coefficients, residual = spline.fit(values[:, columns], penalty, with_ends=True)
         gain, _ = spline.gains(penalty)
         noise = np.sqrt(residual / (1 - gain))
-        for place, column in enumerate(columns):
+        for place, column in enumerate(columns.tolist()):
             results[column] = Smooth(coefficients[:, place], penalty, gain * spline.n_rows, spline.bandwidth(penalty),
                                      float(noise[place]))
     return [results[column] for column in range(len(decades))]

@@ -54,7 +54,7 @@ class Table:
     def __post_init__(self) -> None:
         joints = tuple(self.joints)
         _require_joints(joints)
-        checked = {'joints': joints, 'up': unit_vector(self.up, 'up'), 'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
+        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'), 'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
         if self.mount_xyz is not None:
             checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():
@@ -102,7 +102,7 @@ class Table:
     @property
     def gravity_value(self) -> float:
         """Local gravity, m/s^2: as given, else normal gravity."""
-        return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)
+        return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)  # type: ignore[arg-type]
 
     @property
     def mat_nb(self) -> np.ndarray:

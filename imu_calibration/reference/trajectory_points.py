@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -81,11 +82,12 @@ class TrajectoryPoints:
             raise InputError(f'a trajectory must name the joints {", ".join(wanted)} and no others, got {", ".join(own) or "none"}; '
                              'name every joint once')
         order = [own.index(name) for name in wanted]
-        return replace(self, joint_names=tuple(wanted), **{name: values[:, order] for name, values in self.columns().items()})
+        columns: dict[str, Any] = {name: values[:, order] for name, values in self.columns().items()}
+        return replace(self, joint_names=tuple(wanted), **columns)
 
     def slowed(self, factor: float) -> TrajectoryPoints:
         """Return the same path at `factor` of its speed, 0 < factor <= 1."""
-        slower = {name: values * factor**order for order, (name, values) in enumerate(self.columns().items())}
+        slower: dict[str, Any] = {name: values * factor**order for order, (name, values) in enumerate(self.columns().items())}
         return replace(self, time=self.time / factor, **slower)
 
 
