@@ -56,7 +56,7 @@ demo: $(STAMP)
 	@$(PY) examples/demo.py --output $(OUTPUT)
 
 live-demo: $(STAMP)
-	@$(PY) examples/live_demo.py
+	@$(PY) examples/live_demo.py --output $(OUTPUT)
 
 test: $(STAMP)
 	$(PYTEST) $(TEST_OPTIONS)

@@ -8,7 +8,7 @@ from setuptools.command.develop import develop
 from setuptools.command.install_scripts import install_scripts
 
 NAME = 'imu_calibration'
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 
 
 class _OnPathToo:

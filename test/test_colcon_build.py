@@ -12,7 +12,7 @@ import pytest
 from ros.workspace import build, plain_environment
 
 ROOT = Path(__file__).resolve().parents[1]
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 EXECUTABLES = ('imu_calibration', *NODES)
 
 TABLE = 'table_file:={config}/table_three_axis.yaml'

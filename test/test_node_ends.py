@@ -37,7 +37,7 @@ def environment(*folders):
     return {**os.environ, 'PYTHONPATH': path, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
-@pytest.mark.parametrize('node', ['calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node'])
+@pytest.mark.parametrize('node', ['calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'])
 def test_interrupted_while_importing(node, tmp_path):
     mark = tmp_path / 'importing'
     (tmp_path / 'rclpy').mkdir()

@@ -18,7 +18,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
-EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node'}
+EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'}
 ROSDEP_KEYS = {
     'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
@@ -33,7 +33,7 @@ NOBLE = {
     'ros2cli': 'ros-jazzy-ros2cli', 'ros2doctor': 'ros-jazzy-ros2doctor', 'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
     'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs', 'sensor_msgs': 'ros-jazzy-sensor-msgs', 'std_msgs': 'ros-jazzy-std-msgs', 'std_srvs': 'ros-jazzy-std-srvs',
     'geometry_msgs': 'ros-jazzy-geometry-msgs', 'nav_msgs': 'ros-jazzy-nav-msgs', 'tf2_msgs': 'ros-jazzy-tf2-msgs',
-    'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
+    'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
 }
 """Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
 EXTRAS = {'dask'}

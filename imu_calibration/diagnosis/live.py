@@ -36,6 +36,8 @@ class Outcome(StrEnum):
     """It ended by a fault."""
 
 
+MATES, SIZE = 'mates of ', 'size of '
+"""What stands before the name of each finding, and before EFFECT.PARAMETER with a bare number in SI: for programs."""
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
 
@@ -155,4 +157,7 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
               'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
               'indistinguishable from': ' '.join(first.indistinguishable_from),
               'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]), **values}
+    for finding in diagnosis.findings:
+        values[MATES + finding.effect] = ' '.join(finding.indistinguishable_from)
+        values |= {f'{SIZE}{finding.effect}.{name}': repr(float(value)) for name, (value, _, _) in finding.parameters.items()}
     return DiagnosisState(FOUND, message, values)

@@ -3,7 +3,7 @@ calibration_node: calibrates an IMU on a table while the table moves, or by hand
 
 in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table), imu/temperature (sensor_msgs/Temperature, for thermal
 effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu), /diagnostics.
-services: ~/solve, ~/save, ~/reset.
+services: ~/solve, ~/diagnose (at once; the answer comes on /diagnostics), ~/save, ~/reset.
 """
 
 import sys
@@ -100,7 +100,7 @@ class CalibrationNode(Node):
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
                                         listeners=Listeners(self._publish_document, self._publish_residuals), hints=HINTS['calibration_node'])
-        for what in ('solve', 'save', 'reset'):
+        for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
         self._listen()

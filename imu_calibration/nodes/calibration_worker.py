@@ -198,6 +198,13 @@ class CalibrationWorker(threading.Thread):
         verdict, lines = summary(result, self.hints)
         return True, f'{verdict} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
 
+    def _diagnose(self) -> tuple[bool, str]:
+        if not self._diagnosis_period:
+            return False, "nothing is diagnosed by hand while it runs, nor where parameter 'diagnosis_period' is 0"
+        self._publish_solution(pending=True)
+        self._diagnosis.want(urgent=True)
+        return True, f'asked what the model gets wrong on {self.live.n_windows} windows; the answer comes on /diagnostics'
+
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
         try:

@@ -28,7 +28,7 @@ class DiagnosisThread:
     def __init__(self, period: float):
         self.period, self._pacer, self._ending = period, SolvePacer(SHARE), False
         self._thread: threading.Thread | None = None
-        self._next, self._wanted = time.monotonic() + period, False
+        self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
         self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
 
@@ -43,25 +43,25 @@ class DiagnosisThread:
         """Whether a question is being answered."""
         return self._thread is not None and self._thread.is_alive()
 
-    def want(self) -> None:
-        """Ask as soon as possible, whatever the period."""
-        self._wanted = bool(self.period)
+    def want(self, urgent: bool = False) -> None:
+        """Ask as soon as the share of the time allows, whatever the period; at once when it is urgent."""
+        self._wanted, self._urgent = bool(self.period), urgent and bool(self.period)
 
     def forget(self) -> None:
         """Take back what was said: the session starts anew."""
-        self.state, self._wanted = DiagnosisState() if self.period else self.state, False
+        self.state, self._wanted, self._urgent = DiagnosisState() if self.period else self.state, False, False
         self._session += 1
 
     def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
         """Start answering `make_question()` (or None) when that is wanted, or when the period is over and there is news."""
         now = time.monotonic()
-        due = self._wanted or (bool(self.period) and is_news and now >= self._next and self._pacer.due(now))
+        due = self._urgent or ((self._wanted or (bool(self.period) and is_news and now >= self._next)) and self._pacer.due(now))
         if not due or self.is_running or self._ending:
             return
         question = make_question()
         if question is None:
             return
-        self._wanted = False
+        self._wanted = self._urgent = False
         self._thread = threading.Thread(target=self._answer, args=(question, now, self._session), name='diagnosis', daemon=True)
         self._thread.start()
 

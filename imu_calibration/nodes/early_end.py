@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 """Executables of this package; the nodes of other packages that import it keep their own interrupt."""
 
 

@@ -5,6 +5,7 @@ HINTS = {
                          'joint_topic': 'remap joint_states', 'temperature_topic': 'remap imu/temperature'},
     'compensator_node': {'calibration': "parameter 'calibration_file'", 'imu_topic': 'remap imu/data_raw',
                          'target_frame': "parameter 'target_frame'", 'temperature_topic': 'remap imu/temperature'},
+    'planner_node': {'table': "parameter 'table_file'", 'joint_topic': 'remap joint_states'},
     'simulator_node': {'calibration': "parameter 'calibration_file'", 'table': "parameter 'table_file'"},
 }
 """Node -> {key of `errors.KEYS`: what it is called there}, of what the node has; none for a node that no such error reaches."""

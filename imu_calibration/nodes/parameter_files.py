@@ -14,7 +14,7 @@ from pathlib import Path
 
 from imu_calibration.settings import Setting, describe
 
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node')
+NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 
 
 def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:

@@ -66,6 +66,7 @@ class SimulatorSettings:
                          symptom='noise too large or small')
     hide: str = setting('', '', 'what else is wrong with the IMU, by its physics, names joined by +: ' + ', '.join(CAUSES),
                         symptom='the diagnosis finds something else, or nothing', session=True)
+    hide_size: float = setting(1.0, '1', 'size of that, in units of the size that is drawn', (0.0, 100.0), 'too small: nobody finds it')
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
     imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
     imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time',
@@ -100,7 +101,7 @@ class SimulatorNode(Node):
         self._table, self._motion = self._make_table()
         model, values = self._true_imu()
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
-        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], self._imu_seed())
+        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], self._imu_seed(), settings.hide_size)
         self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,
                                           start_ns=start_ns, causes=causes)
         self._trajectories = queue.Queue()

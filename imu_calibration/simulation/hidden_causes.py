@@ -70,9 +70,9 @@ CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
 """Name -> function of a generator that draws the size and returns what the cause does; `narrow_range` belongs last."""
 
 
-def hidden_causes(names: Sequence[str], seed: int) -> list[Cause]:
+def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Cause]:
     """
-    Return the causes of those names, each drawn from a generator of its own.
+    Return the causes of those names, each drawn from a generator of its own, `size` times as large as drawn.
 
     Raises
     ------
@@ -83,4 +83,11 @@ def hidden_causes(names: Sequence[str], seed: int) -> list[Cause]:
     for name in names:
         if name not in CAUSES:
             raise InputError(f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them")
-    return [CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])) for name in CAUSES if name in names]
+    return [_scaled(CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])), size) for name in CAUSES if name in names]
+
+
+def _scaled(cause, size):
+    def answer(felt):
+        answered = cause(felt)
+        return felt._replace(force=felt.force + size * (answered.force - felt.force), rate=felt.rate + size * (answered.rate - felt.rate))
+    return cause if size == 1.0 else answer

@@ -1,0 +1,176 @@
+"""What to do next until nothing is left to do: a motion, a question to the diagnosis, or the end with its reason."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.settings import setting
+
+TIME_OVER = 'the time given is over'
+IN_VAIN = 'motions no longer bring what the plan promises: what limits is not noise'
+PATIENCE = 6
+"""Motions after which something must have come of them."""
+LEAST_SHARE = 0.93
+"""Share of the logarithms of excess over tolerance that may be left after them; what is left beyond is not worth the time."""
+
+
+class MotionPlanner(Protocol):
+    """What a campaign asks of a planner (`planning.planner.Planner`)."""
+
+    @property
+    def excess(self) -> dict[str, float]:
+        """Standard deviation over tolerance of each parameter asked for."""
+
+    def take(self, calibration: Any) -> None:
+        """Take what was really learnt."""
+
+    def next_motion(self, position: np.ndarray) -> Any:
+        """Return the NextMotion from where the joints are, and count on it."""
+
+
+
+@dataclass(frozen=True)
+class CampaignSettings:
+    """When to end."""
+
+    time_limit: float = setting(1800.0, 's', 'time given to all motions together, by the stamps of the joint states', (1.0, 1e6),
+                                'too small: parameters stay outside their tolerance')
+    separations: int = setting(2, '1', 'how often motions are asked for that tell apart what the diagnosis cannot; 0: never, and '
+                               'nothing is diagnosed at the end', (0, 20), 'too small: a finding keeps its mates')
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """What a diagnosis named, and what it cannot be told from."""
+
+    effect: str
+    """Published name."""
+    mates: tuple[str, ...] = ()
+    """Effects that cannot be told from it."""
+    sizes: dict[str, float] = field(default_factory=dict)
+    """Parameter -> value, SI."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do next: exactly one of a motion, a question and an end."""
+
+    motion: Any = None
+    """PlannedMotion to be driven."""
+    diagnose: bool = False
+    """Whether to ask what the model gets wrong."""
+    why: str = ''
+    """One line."""
+
+
+class Campaign:
+    """
+    Goes from motion to motion.
+
+    Parameters
+    ----------
+    planner : MotionPlanner
+    settings : CampaignSettings
+    make_separator : callable, optional
+        Returns a planner of the motions that tell a Suspect from its mates, or raises an ImuCalibrationError when there are none.
+
+    """
+
+    def __init__(self, planner: MotionPlanner, settings: CampaignSettings = CampaignSettings(),
+                 make_separator: Callable[[Suspect], MotionPlanner] | None = None):
+        self.planner, self.settings, self._make_separator = planner, settings, make_separator
+        self._separator: MotionPlanner | None = None
+        self.findings: list[Suspect] | None = None
+        """What the last diagnosis named, the strongest first; None before the first."""
+        self.separations = 0
+        self._is_asked = False
+        self._left: list[float] = []
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The parameter furthest outside its tolerance, and its standard deviation over tolerance."""
+        excess = self.planner.excess
+        return max(excess.items(), key=lambda item: item[1]) if excess else ('', 0.0)
+
+    def take(self, calibration: Any) -> None:
+        """Take what was really learnt from the motions so far."""
+        self.planner.take(calibration)
+        self._left.append(sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0))
+
+    def take_findings(self, findings: list[Suspect] | None) -> str:
+        """Take what the diagnosis said, None when it did not answer; return what is done about it, '' for nothing."""
+        self._is_asked = True
+        self.findings = self.findings if findings is None else findings
+        for finding in findings or []:
+            if finding.mates and self.separations < self.settings.separations and self._make_separator is not None:
+                what = f'{finding.effect} cannot be told from {", ".join(finding.mates)} by the motion so far'
+                try:
+                    self._separator = self._make_separator(finding)
+                except ImuCalibrationError as error:
+                    return f'{what}, and no motion is known that separates them: {error}'
+                self.separations += 1
+                self._left.clear()
+                return f'{what}: planning the motion that separates them'
+        return ''
+
+    @property
+    def is_separating(self) -> bool:
+        """Whether the motions at present are those that tell causes apart."""
+        return self._separator is not None
+
+    def decide(self, position: np.ndarray, elapsed: float) -> Decision:
+        """
+        Return what to do next.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n_joints,)
+            Where the joints rest.
+        elapsed : float
+            Seconds since the first motion began.
+
+        """
+        if elapsed >= self.settings.time_limit:
+            return Decision(why=f'{TIME_OVER}{self._outside()}')
+        step = None if self._separator is None else self._separator.next_motion(position)
+        if step is None or step.motion is None:   # a calibration knows nothing of causes that its model lacks: what they say is hoped for
+            has_separated, self._separator = self._separator is not None, None
+            if has_separated:
+                return Decision(diagnose=True, why='the causes should be told apart by now')
+            if self._promises_in_vain:
+                return self._ending(IN_VAIN)
+            step = self.planner.next_motion(position)
+        if step.motion is not None and elapsed + step.seconds > self.settings.time_limit:
+            return Decision(why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}')
+        if step.motion is not None:
+            self._is_asked = False
+            return Decision(step.motion, why=step.reason)
+        return self._ending(step.reason)
+
+    def _ending(self, reason):
+        if self.settings.separations and not self._is_asked:
+            return Decision(diagnose=True, why=reason)
+        return Decision(why=reason + self._outside() + self._named())
+
+    @property
+    def _promises_in_vain(self):
+        """Whether the last motions have brought next to nothing of what a planner must have hoped for when it chose them."""
+        return len(self._left) > PATIENCE and self._left[-1] > LEAST_SHARE * self._left[-1 - PATIENCE] > 0
+
+    def _outside(self):
+        missing = [name for name, excess in self.planner.excess.items() if excess > 1.0]
+        if not missing:
+            return ''
+        return f'; outside its tolerance: {", ".join(missing[:3])}' + (f' and {len(missing) - 3} more' if missing[3:] else '')
+
+    def _named(self):
+        if not self.findings:
+            return ''
+        mates = [f' (not to be told from {", ".join(each.mates)})' if each.mates else '' for each in self.findings]
+        return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))

@@ -1,0 +1,244 @@
+"""The driver: one motion after the other, watched by what the joints really do; whatever is wrong stops everything with one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from imu_calibration.constants import DEG
+from imu_calibration.driving.path_watch import PathWatch, at_rest
+from imu_calibration.errors import InputError
+from imu_calibration.reference.motion_limits import MotionLimits
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.settings import setting
+from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
+
+MARGIN = 1e-6
+"""What a trajectory may lie beyond a limit by rounding, relative to it."""
+OVERSPEED = 1.25
+"""Measured speed in units of the limit from which the joints are stopped; rates from encoders are noisy."""
+
+
+class DriveState(StrEnum):
+    """What a driver is doing."""
+
+    IDLE = 'idle'
+    """Nothing moves before it is asked for."""
+    MOVING = 'moving'
+    """The joints follow a trajectory."""
+    SETTLING = 'settling'
+    """They have come to its end and swing out."""
+    MEASURING = 'measuring'
+    """They rest, and the calibration takes what was seen."""
+    STOPPED = 'stopped'
+    """Something was wrong, or somebody said stop."""
+    DONE = 'done'
+    """There is nothing more to do."""
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """How far joints may stray, and how long they may take."""
+
+    following_tolerance: float = setting(0.05, 'rad', 'a joint that turns stops everything when it is further from its path, however late '
+                                         'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late')
+    following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above')
+    stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long have stalled, or the trajectory was refused',
+                                    (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing')
+    silence: float = setting(1.0, 's', 'without joint states for so long everything is stopped', (0.1, 60.0),
+                             'too small: stops when the machine is busy')
+    settling_time: float = setting(0.5, 's', 'the joints must have rested for so long before the next motion', (0.0, 60.0),
+                                   'too small: what swings out is measured')
+    settling_patience: float = setting(20.0, 's', 'joints that do not come to rest for so long stop everything', (0.5, 600.0),
+                                       'too small: a soft arm is called restless')
+    first_speed: float = setting(0.3, '1', 'share of its speed at which the first motion after a start is made', (0.01, 1.0),
+                                 'too large: a wrong table is noticed at full speed')
+
+
+class Driver:
+    """
+    Takes motions, hands out what to send, and watches.
+
+    Parameters
+    ----------
+    joint_names : sequence of str
+        Joints in the order of the columns.
+    limits : MotionLimits
+    settings : DriverSettings
+
+    """
+
+    def __init__(self, joint_names: tuple[str, ...], limits: MotionLimits, settings: DriverSettings = DriverSettings()):
+        self.joint_names, self.limits, self.settings = tuple(joint_names), limits, settings
+        self.state, self.reason, self.motions = DriveState.IDLE, 'nothing moves before start', 0
+        self.tolerance = np.where(limits.turns, settings.following_tolerance, settings.following_tolerance_m)
+        self.position: np.ndarray | None = None
+        """Where the joints were seen last."""
+        self._time, self._heard = 0.0, -np.inf
+        self._watch: PathWatch | None = None
+        self._rested_at, self._rested_since, self._settling_since = np.zeros(len(joint_names)), 0.0, 0.0
+        self._slow = True
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether joints may be in motion at the driver's word."""
+        return self.state in (DriveState.MOVING, DriveState.SETTLING)
+
+    @property
+    def progress(self) -> float:
+        """How far along its path the motion is, s of the path's own time; 0 without one."""
+        return 0.0 if self._watch is None else self._watch.progress
+
+    def start(self) -> None:
+        """Allow motions; the first one will be slow."""
+        self._slow = True
+        self._become(DriveState.IDLE, 'started')
+
+    def begin(self, points: TrajectoryPoints, words: str, now: float) -> TrajectoryPoints:
+        """
+        Return what is to be sent for a motion from where the joints are.
+
+        Parameters
+        ----------
+        points : TrajectoryPoints
+        words : str
+            What the motion is, for people.
+        now : float
+            Seconds of a steady clock.
+
+        Raises
+        ------
+        InputError
+            When nothing may move at present, or the motion goes beyond a limit.
+
+        """
+        if self.state not in (DriveState.IDLE, DriveState.MEASURING):
+            raise InputError(f'a motion may begin where the joints rest and nothing is wrong, the state is {self.state}: {self.reason}; '
+                             'start anew')
+        if self.position is None or now - self._heard > self.settings.silence:
+            raise InputError('joint states must come before anything moves, none came; publish them')
+        points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
+        self._require_within_limits(points)
+        self._watch, self._slow = PathWatch(self.position, points, self.tolerance), False
+        self.motions += 1
+        self._become(DriveState.MOVING, words)
+        return points
+
+    def _require_within_limits(self, points):
+        assert self.position is not None
+        path = trajectory_from(at_rest(self.position), points)
+        beyond, speed, acceleration = excess(path, self.limits)
+        # Where an encoder says that a joint stands a little beyond its end, it may go back from there.
+        outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
+        beyond -= max(float(np.max(outside)), 0.0)
+        if beyond > MARGIN or max(speed, acceleration) > 1.0 + MARGIN or points.acceleration is None:
+            raise InputError('a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
+                             f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
+                             'acceleration; it is not sent')
+
+    def observe(self, time: float, position: np.ndarray, rate: np.ndarray, *, now: float) -> bool:
+        """
+        Take what the joints do; return whether everything has to be stopped.
+
+        Parameters
+        ----------
+        time : float
+            Of the joint state's stamp, s.
+        position, rate : ndarray, shape (n_joints,)
+            NaN where the message has no rates.
+        now : float
+            Seconds of a steady clock.
+
+        """
+        self._time, self._heard, self.position = time, now, np.asarray(position, float)
+        if self._watch is None or not self.is_driving:
+            return False
+        if trouble := self._beyond(position, rate):
+            return self.stop(trouble)
+        if self.state is DriveState.MOVING:
+            self._watch.observe(time, self.position)
+            if trouble := self._straying():
+                return self.stop(trouble)
+            if self._watch.at_end:
+                self._rested_at, self._rested_since, self._settling_since = self.position, time, time
+                self._become(DriveState.SETTLING, self.reason)
+            return False
+        return self._settle()
+
+    def tick(self, now: float) -> bool:
+        """Look at the clock; return whether everything has to be stopped."""
+        if self.is_driving and now - self._heard > self.settings.silence:
+            return self.stop(f'nothing was heard of the joints for {now - self._heard:.1f} s: stopped; see that joint states are published')
+        return False
+
+    def refused(self, why: str) -> bool:
+        """Take note that the controller does not do what it was asked; return whether everything has to be stopped."""
+        return self.is_driving and self.stop(f'the controller does not follow: {why}')
+
+    def stop(self, why: str) -> bool:
+        """Stop for a reason, from any state; return True."""
+        self._watch = None
+        self._become(DriveState.STOPPED, why)
+        return True
+
+    def wait(self, why: str) -> None:
+        """Rest until the next motion is asked for."""
+        self._watch = None
+        self._become(DriveState.IDLE, why)
+
+    def finish(self, why: str) -> None:
+        """There is nothing more to do."""
+        self._watch = None
+        self._become(DriveState.DONE, why)
+
+    def _become(self, state: DriveState, reason: str) -> None:
+        self.state, self.reason = state, reason
+
+    def _beyond(self, position, rate):
+        """Return what is wrong with where the joints are and how fast they go, '' when nothing is."""
+        assert self.position is not None
+        over = np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
+        if np.max(over) > 0:
+            joint = int(np.argmax(over))
+            return f'joint {self._told(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
+        fast = np.abs(np.nan_to_num(rate)) / self.limits.speed
+        if np.max(fast) > OVERSPEED:
+            joint = int(np.argmax(fast))
+            return (f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest speed: stopped; '
+                    'see the limits in the description of the joints and in the controller')
+        return ''
+
+    def _straying(self):
+        """Return what is wrong with how the joints follow, '' when nothing is."""
+        watch = self._watch
+        if watch.has_strayed:
+            joint = watch.suspect()
+            return (f'joint {self._told(joint, self.position)} does not follow: the joints are '
+                    f'{self._amount(joint, watch.deviation.max() * self.tolerance[joint])} from their path: stopped; '
+                    'see whether something holds it')
+        if watch.has_stalled_for <= self.settings.stall_patience:
+            return ''
+        if not watch.has_begun:
+            return (f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '
+                    'listen, see what it says')
+        return (f'joint {self.joint_names[watch.suspect()]} has not come further for {watch.waited:.1f} s: stopped; '
+                'see whether something holds it')
+
+    def _settle(self):
+        """Wait for rest; return whether everything has to be stopped."""
+        if np.any(np.abs(self.position - self._rested_at) > 0.1 * self.tolerance):
+            self._rested_at, self._rested_since = self.position, self._time
+        if self._time - self._rested_since >= self.settings.settling_time:
+            self._watch = None
+            self._become(DriveState.MEASURING, self.reason)
+        elif self._time - self._settling_since > self.settings.settling_patience:
+            return self.stop(f'the joints do not come to rest within {self.settings.settling_patience:g} s: stopped; see what moves them')
+        return False
+
+    def _told(self, joint, position):
+        return f'{self.joint_names[joint]}, at {self._amount(joint, position[joint])},'
+
+    def _amount(self, joint, value):
+        return f'{value / DEG:.1f} deg' if self.limits.turns[joint] else f'{1000.0 * value:.1f} mm'

@@ -1,0 +1,137 @@
+"""
+Ways to ask a controller for a motion: its topic, or its action where control_msgs is installed.
+
+The topic is fire and forget: what became of a trajectory is seen in the joint states alone. The action says why it refuses one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from trajectory_msgs.msg import JointTrajectory
+
+from imu_calibration.errors import InputError
+from imu_calibration.nodes.qos import output_qos
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from msg_adapters.joint_trajectory import encode_trajectory
+
+COMMANDS = ('topic', 'action', 'auto')
+"""How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""
+DEPTH = 10
+RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left its path',
+           -5: 'a joint did not reach the end'}
+"""Error codes of FollowJointTrajectory, in words."""
+
+
+class TopicCommand:
+    """Sends trajectories to the topic `joint_trajectory`."""
+
+    def __init__(self, node: Node):
+        self._publisher = node.create_publisher(JointTrajectory, 'joint_trajectory', output_qos(DEPTH))
+        self.name = self._publisher.topic_name
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether somebody listens."""
+        return self._publisher.get_subscription_count() > 0
+
+    def send(self, points: TrajectoryPoints) -> None:
+        """Send a trajectory."""
+        self._publisher.publish(encode_trajectory(points))
+
+    def stop(self, joint_names: tuple[str, ...]) -> None:
+        """Send the trajectory without points: the controller stops."""
+        self.send(TrajectoryPoints.stop(joint_names))
+
+
+class ActionCommand:
+    """
+    Sends trajectories as goals of FollowJointTrajectory; a stop cancels the goal, and goes to the topic as well.
+
+    Parameters
+    ----------
+    node : Node
+    action_type : type
+        ``control_msgs.action.FollowJointTrajectory``.
+    client : object
+        An ``rclpy.action.ActionClient`` of it.
+    refused : callable
+        Called with one line when a goal is refused or ends otherwise than by success or a stop.
+
+    """
+
+    def __init__(self, node: Node, action_type: Any, client: Any, *, refused: Callable[[str], None]):
+        self._topic, self._action, self._client, self._refused = TopicCommand(node), action_type, client, refused
+        self._handle: Any = None
+        self._number = 0
+        self.name = 'follow_joint_trajectory'
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether the server is there."""
+        return bool(self._client.server_is_ready())
+
+    def send(self, points: TrajectoryPoints) -> None:
+        """Send a trajectory as a goal."""
+        from rclpy.serialization import deserialize_message
+        self._number += 1
+        number = self._number
+        goal = self._action.Goal(trajectory=deserialize_message(encode_trajectory(points), JointTrajectory))
+        self._client.send_goal_async(goal).add_done_callback(lambda future: self._answered(number, future.result()))
+
+    def stop(self, joint_names: tuple[str, ...]) -> None:
+        """Cancel the goal, and send the trajectory without points: whichever comes first stops the joints."""
+        self._number += 1   # what becomes of the goal is no news any more
+        handle, self._handle = self._handle, None
+        self._topic.stop(joint_names)
+        if handle is not None:
+            handle.cancel_goal_async()
+
+    def _answered(self, number: int, handle: Any) -> None:
+        if number != self._number:   # stopped before the server had answered
+            if handle.accepted:
+                handle.cancel_goal_async()
+            return
+        if not handle.accepted:
+            self._refused('it refused the goal')
+            return
+        self._handle = handle
+        handle.get_result_async().add_done_callback(lambda future: self._ended(number, future.result().result))
+
+    def _ended(self, number: int, result: Any) -> None:
+        if number != self._number:
+            return
+        self._handle = None
+        if result.error_code != 0:
+            text = getattr(result, 'error_string', '')
+            self._refused(RESULTS.get(result.error_code, f'error code {result.error_code}') + (f' ({text})' if text else ''))
+
+
+def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicCommand | ActionCommand:
+    """
+    Return the way to command joints that `how` (one of `COMMANDS`) says.
+
+    Raises
+    ------
+    InputError
+        When it is none of them, or asks for an action without control_msgs.
+
+    """
+    if how not in COMMANDS:
+        raise InputError(f"parameter 'command' must be one of {', '.join(COMMANDS)}, got '{how}'; choose one")
+    if how == 'topic':
+        return TopicCommand(node)
+    try:
+        from control_msgs.action import FollowJointTrajectory
+    except ImportError:
+        if how == 'action':
+            raise InputError("parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, or use topic") from None
+        return TopicCommand(node)
+    from rclpy.action import ActionClient
+    client = ActionClient(node, FollowJointTrajectory, 'follow_joint_trajectory')
+    if how == 'auto' and not client.wait_for_server(timeout_sec=1.0):
+        client.destroy()
+        return TopicCommand(node)
+    return ActionCommand(node, FollowJointTrajectory, client, refused=refused)

@@ -1,0 +1,271 @@
+"""
+planner_node: moves a table or an arm so that calibration_node can determine every parameter, and no further.
+
+in: joint_states (sensor_msgs/JointState), imu/calibration (std_msgs/String, from calibration_node), /diagnostics (its diagnosis).
+out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed; /diagnostics.
+services: ~/start (all motions that are needed), ~/next (one motion), ~/stop (at any moment). Nothing moves before ~/start or ~/next.
+"""
+
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from imu_calibration import files
+from imu_calibration.calibration.document import Calibration, calibration_from_text
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
+from imu_calibration.driving.campaign import Campaign, CampaignSettings, Suspect
+from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
+from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
+from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.hints import HINTS
+from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
+from imu_calibration.nodes.joint_commands import make_command
+from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.planner_worker import Peers, PlannerWorker
+from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.planning.planner import make_planner
+from imu_calibration.reference.motion_limits import limits_of
+from imu_calibration.resources import config_file
+from imu_calibration.settings import setting
+from imu_calibration.simulation.sensor_noise import GRADES
+from msg_adapters.joint_state import joint_row
+from msg_adapters.stamps import UnusableMessage
+
+PERIOD = 0.1
+"""Seconds between two looks at the clock."""
+ANSWER_PATIENCE = 60.0
+"""Seconds to wait for a solution, and for a diagnosis that has begun."""
+_LEVELS = {DriveState.STOPPED: ERROR_LEVEL}
+
+
+@dataclass(frozen=True)
+class PlannerNodeSettings:
+    """What is moved, for which parameters, and how it is commanded."""
+
+    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
+                              'config/table_three_axis.yaml', symptom='other joints, or limits that are not theirs', session=True)
+    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
+                                   symptom='motions go on for too long, or end too early', session=True)
+    accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
+    gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
+    reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
+    grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
+                         symptom='the predicted standard deviations are not those that are reached')
+    imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
+                              'the predicted standard deviations are not those that are reached')
+    command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
+                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
+    calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows', symptom='~/start says that nobody calibrates')
+
+
+class PlannerNode(Node):
+    """Listens to the joints, and does what its worker decides."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('planner_node', **options)
+        self.settings = declare_parameters(self, PlannerNodeSettings)
+        self._campaign_settings = declare_parameters(self, CampaignSettings)
+        driver_settings = declare_parameters(self, DriverSettings)
+        settings = self.settings
+        if settings.grade not in GRADES:
+            raise InputError(f"parameter 'grade' must be one of {', '.join(sorted(GRADES))}, got '{settings.grade}'; choose one")
+        self._table = files.read_table(files.user_path(settings.table_file) if settings.table_file else config_file('table_three_axis.yaml'))
+        tolerances = files.read_tolerances(files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml'))
+        self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
+                                           settings.reference_model or None, tolerances)
+        self._lock, self._stamp, self._documents, self._told = threading.RLock(), 0.0, [], {}
+        self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
+        self._names = tuple(self._table.joint_names)
+        self.driver = Driver(self._names, limits_of(self._table), driver_settings)
+        self._command = make_command(self, settings.command, self._refused)
+        self.worker = PlannerWorker(self.driver, self._make_campaign,
+                                    peers=Peers(self._measure, self._latest, self._diagnose, self._command.send, self._stop_joints, self._say),
+                                    lock=self._lock)
+        self.worker.stamp = lambda: self._stamp
+        self._joints = MatchedInput(self, JointState, 'joint_states', callback=self._joint_state, single=False, raw=False)
+        self._calibrations = MatchedInput(self, String, 'imu/calibration', callback=self._document, raw=False, latched=True)
+        watch_inputs(self, [self._joints, self._calibrations])
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostic, 100)
+        self._calibrator = {what: self.create_client(Trigger, f'{settings.calibration_node}/{what}') for what in ('solve', 'diagnose')}
+        for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
+            self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
+        self.create_timer(PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        self.worker.start()
+        self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; nothing moves before ~/start')
+
+    def close(self) -> str:
+        """Stop what moves; return what became of it."""
+        was_driving = self.driver.is_driving
+        self.worker.end()
+        return 'stopped in mid-motion' if was_driving else ''
+
+    def _make_campaign(self) -> Campaign:
+        noise = noise_of_grade(GRADES[self.settings.grade].noise, self.settings.imu_rate)
+        planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate, options=self._options,
+                               calibration=self._latest())
+        return Campaign(planner, self._campaign_settings)
+
+    # What arrives.
+
+    def _joint_state(self, message: JointState) -> None:
+        try:
+            stamp_ns, position, rate = joint_row(message, self._names)
+        except UnusableMessage as error:
+            self._complaints.event(f'joint_states: {error}; it is left out')
+            return
+        now = time.monotonic()
+        self._stamp = stamp_ns * 1e-9 if stamp_ns else now
+        with self._lock:
+            must_stop = self.driver.observe(self._stamp, np.array(position), np.array(rate), now=now)
+        if must_stop:
+            self._stopped()
+
+    def _document(self, message: String) -> None:
+        with self._heard:
+            self._documents.append(message.data)
+            self._heard.notify_all()
+
+    def _diagnostic(self, message: DiagnosticArray) -> None:
+        wanted = f'{self.settings.calibration_node.lstrip("/")}: diagnosis'
+        for status in message.status:
+            if status.name.endswith(wanted):
+                with self._heard:
+                    self._told = {pair.key: pair.value for pair in status.values}
+                    self._heard.notify_all()
+
+    def _tick(self) -> None:
+        with self._lock:
+            must_stop = self.driver.tick(time.monotonic())
+        if must_stop:
+            self._stopped()
+
+    def _refused(self, why: str) -> None:
+        with self._lock:
+            must_stop = self.driver.refused(why)
+        if must_stop:
+            self._stopped()
+
+    def _stopped(self) -> None:
+        self._stop_joints()
+        self._say(ERROR, self.driver.reason)
+
+    def _stop_joints(self) -> None:
+        self._command.stop(self._names)
+        self._diagnostics.publish_now()
+
+    # What the worker asks.
+
+    def _latest(self) -> Calibration | None:
+        with self._heard:
+            text = self._documents[-1] if self._documents else None
+        return None if text is None else calibration_from_text(text)
+
+    def _ask(self, what: str) -> Trigger.Response | None:
+        """Call a service of the calibration node from the worker's thread."""
+        future, done = self._calibrator[what].call_async(Trigger.Request()), threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        return future.result() if done.wait(ANSWER_PATIENCE) else None
+
+    def _measure(self) -> Calibration | None:
+        known = len(self._documents)
+        answer = self._ask('solve')
+        if answer is None:
+            raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; see whether it runs")
+        if not answer.success:
+            self._say(INFO, f'no calibration yet: {answer.message}')
+            return None
+        with self._heard:
+            self._heard.wait_for(lambda: len(self._documents) > known, timeout=2.0)
+        return self._latest()
+
+    def _diagnose(self) -> list[Suspect] | None:
+        known = self._told.get('diagnoses', '0')
+        answer = self._ask('diagnose')
+        if answer is None or not answer.success:
+            self._say(INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
+            return None
+        with self._heard:
+            came = self._heard.wait_for(lambda: self._told.get('diagnoses', '0') != known and self._told.get('being made') == 'False',
+                                        timeout=ANSWER_PATIENCE)
+            told = dict(self._told)
+        return findings_from(told) if came else None
+
+    # What people ask.
+
+    def _go(self, motions: int) -> tuple[bool, str]:
+        if self.driver.is_driving or self.worker.doing:
+            return False, f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it'
+        if self.driver.position is None:
+            return False, self._joints.silence()
+        if not self._command.is_heard:
+            return False, f'nobody listens to {self._command.name}: start the controller, or remap joint_trajectory'
+        if not self._calibrator['solve'].service_is_ready():
+            return False, f'nobody takes the windows: {self._calibrator["solve"].srv_name} is not there; start calibration_node'
+        self.worker.go(motions)
+        return True, 'one motion, then it rests' if motions > 0 else 'plans and moves until every parameter is within its tolerance; the first motion is slow'
+
+    def _stop(self) -> tuple[bool, str]:
+        self.worker.halt('stopped by ~/stop')
+        return True, 'stopped: nothing moves before the next ~/start'
+
+    def _serve(self, what: str, answer: Any, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.success, response.message = answer()
+        except ImuCalibrationError as error:
+            response.success, response.message = False, error.told(HINTS['planner_node'])
+        self._say(INFO if response.success else ERROR, f'~/{what}: {response.message}')
+        self._diagnostics.publish_now()
+        return response
+
+    def _say(self, level: str, line: str) -> None:
+        if self.context.ok():
+            say(self.get_logger(), level, line)
+
+    def _statuses(self) -> list:
+        driver, worker = self.driver, self.worker
+        name, excess = worker.worst
+        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}', 'it takes [s]': f'{worker.seconds:.1f}',
+                  'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside, 'furthest outside': name,
+                  'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name}
+        if worker.campaign is not None and worker.campaign.findings is not None:
+            values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
+                       'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),
+                       'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating}
+        faults = self._joints.faults() + self._calibrations.faults()
+        text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
+        return [make_status(_LEVELS.get(driver.state, WARN if faults else OK), 'drive', text, values=values)]
+
+
+def findings_from(told: dict[str, str]) -> list[Suspect]:
+    """Return what the values of calibration_node's status 'diagnosis' say, the strongest first."""
+    if told.get('outcome') != FOUND:
+        return []
+    found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]
+    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{effect}.'): float(value) for key, value in told.items()
+                                           if key.startswith(f'{SIZE}{effect}.')}) for effect, mates in found]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node; return the exit code."""
+    return run_node(PlannerNode, arguments, hints=HINTS['planner_node'])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

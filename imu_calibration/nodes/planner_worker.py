@@ -1,0 +1,184 @@
+"""The thread behind planner_node: what next, when the joints rest; plans, questions and answers take their time, and the joints are watched meanwhile."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from imu_calibration.driving.campaign import Campaign, Suspect
+from imu_calibration.driving.driver import Driver, DriveState
+from imu_calibration.errors import ImuCalibrationError, shortened
+from imu_calibration.nodes.complaints import ERROR, INFO
+
+PERIOD = 0.05
+"""Seconds between two looks at the driver."""
+
+
+@dataclass(frozen=True)
+class Peers:
+    """What the worker asks of others; each answers or gives None when no answer comes in time."""
+
+    measure: Callable[[], Any]
+    """Returns the calibration (a document) that has everything seen so far."""
+    latest: Callable[[], Any]
+    """Returns the last calibration that was heard of."""
+    diagnose: Callable[[], list[Suspect] | None]
+    """Returns what the model gets wrong, the strongest first."""
+    send: Callable[[Any], None]
+    """Sends a trajectory."""
+    stop: Callable[[], None]
+    """Stops the joints."""
+    say: Callable[[str, str], None]
+    """Tells a person (level, line)."""
+
+
+class PlannerWorker(threading.Thread):
+    """
+    Drives a campaign to its end.
+
+    Parameters
+    ----------
+    driver : Driver
+        Guarded by `lock`: the thread that hears the joint states uses it as well.
+    make_campaign : callable
+        Returns a new Campaign; takes seconds.
+    peers : Peers
+    lock : threading.RLock
+
+    """
+
+    def __init__(self, driver: Driver, make_campaign: Callable[[], Campaign], *, peers: Peers, lock: Any):
+        super().__init__(name='planner', daemon=True)
+        self.driver, self._make_campaign, self._peers, self._lock = driver, make_campaign, peers, lock
+        self.campaign: Campaign | None = None
+        self.doing = ''
+        """What the thread is busy with, in words."""
+        self.motion: Any = None
+        """The motion that is driven, or was driven last."""
+        self.seconds = 0.0
+        """How long it was to take."""
+        self.worst: tuple[str, float] = ('', 0.0)
+        self.outside = 0
+        """Parameters outside their tolerance."""
+        self._wanted, self._wake, self._ending = 0, threading.Event(), False
+        self._began: float | None = None
+        self.stamp: Callable[[], float] = time.monotonic
+        """Seconds by which the time limit counts."""
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the first motion of the campaign began."""
+        return 0.0 if self._began is None else self.stamp() - self._began
+
+    def go(self, motions: int) -> None:
+        """Make so many motions from now on; -1: all that are needed."""
+        with self._lock:
+            if self.driver.state in (DriveState.STOPPED, DriveState.DONE) or motions < 0:
+                self.driver.start()
+            if motions < 0 and self.campaign is not None and self._wanted == 0:
+                self._began = None   # a new start has its own time
+        self._wanted = motions
+        self._wake.set()
+
+    def halt(self, why: str) -> None:
+        """Stop at once."""
+        self._wanted = 0
+        with self._lock:
+            self.driver.stop(why)
+        self._peers.stop()
+
+    def forget(self) -> None:
+        """Plan anew at the next start."""
+        self.campaign = None
+
+    def end(self, timeout: float = 10.0) -> None:
+        """End the thread, and stop what moves."""
+        self._ending = True
+        self._wake.set()
+        if self.driver.is_driving:
+            self.halt('the node is ending')
+        if self.is_alive():
+            self.join(timeout)
+
+    def run(self) -> None:
+        """Work until `end`."""
+        while not self._ending:
+            self._wake.wait(PERIOD)
+            self._wake.clear()
+            if self._wanted and not self.driver.is_driving:
+                try:
+                    self._next()
+                except ImuCalibrationError as error:
+                    self._give_up(str(error))
+                except Exception as error:   # whatever fails must not leave the joints to themselves
+                    self._give_up(f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}')
+                self.doing = ''
+
+    def _give_up(self, why):
+        if self.driver.state is not DriveState.STOPPED:
+            self.halt(why)
+        self._wanted = 0
+        self._peers.say(ERROR, why)
+
+    def _next(self):
+        if self.driver.state is DriveState.STOPPED:   # by what was seen of the joints
+            self._wanted = 0
+            return
+        if self.campaign is None:
+            self.doing = 'planning'
+            self.campaign = self._make_campaign()
+        if self.driver.state is DriveState.MEASURING:
+            self._measure()
+        decision = self._decide()
+        while decision is not None and decision.diagnose:
+            self.doing = 'asking what the model gets wrong'
+            self._peers.say(INFO, f'{decision.why}; asking what the model gets wrong')
+            asked = self.campaign.take_findings(self._peers.diagnose())
+            if asked:
+                self._peers.say(INFO, asked)
+            if (calibration := self._peers.latest()) is not None:
+                self.campaign.take(calibration)
+            decision = self._decide()
+        if decision is not None:
+            self._carry_out(decision)
+
+    def _measure(self):
+        self.doing = 'waiting for the calibration'
+        calibration = self._peers.measure()
+        if calibration is not None:
+            self.campaign.take(calibration)
+        if self._wanted > 0:
+            self._wanted -= 1
+        if not self._wanted:
+            with self._lock:
+                if self.driver.state is DriveState.MEASURING:
+                    self.driver.wait('rests until the next motion is asked for')
+
+    def _decide(self):
+        if not self._wanted or self._ending:
+            return None
+        self.doing = 'planning'
+        decision = self.campaign.decide(self.driver.position, self.elapsed)
+        self.worst, self.outside = self.campaign.worst, sum(excess > 1.0 for excess in self.campaign.planner.excess.values())
+        return decision
+
+    def _carry_out(self, decision):
+        if decision.motion is None:
+            self._wanted = 0
+            with self._lock:
+                self.driver.finish(decision.why)
+            self._peers.say(INFO, f'done after {self.driver.motions} motions: {decision.why}')
+            return
+        with self._lock:
+            if not self._wanted:   # stopped while the plan was made
+                return
+            points = self.driver.begin(decision.motion.points(self.driver.position), decision.motion.words, time.monotonic())
+            self.motion, self.seconds = decision.motion, points.duration
+            self._began = self.stamp() if self._began is None else self._began
+            self._peers.send(points)
+        self._peers.say(INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
+
+

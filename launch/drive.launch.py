@@ -1,0 +1,43 @@
+"""
+Let a table or an arm move by itself until the IMU on it is calibrated; nothing moves before ~/start.
+
+    ros2 launch imu_calibration drive.launch.py table:=/path/to/table.yaml joint_trajectory:=/joint_trajectory_controller/joint_trajectory
+
+    ros2 service call /planner_node/start std_srvs/srv/Trigger
+"""
+
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+
+
+def generate_launch_description():
+    """Describe calibration_node and planner_node, for the same table."""
+    table = {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+             'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+    save = {'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str)}
+    topics = [('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
+              ('joint_trajectory', LaunchConfiguration('joint_trajectory'))]
+    return LaunchDescription([
+        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
+                              description='table description with the limits of its joints, YAML'),
+        DeclareLaunchArgument('save_file', default_value='',
+                              description='where ~/save of calibration_node writes; empty: calibration.yaml in the working directory'),
+        DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
+        DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
+        DeclareLaunchArgument('joint_trajectory', default_value='joint_trajectory', description='topic of the controller'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        _node('calibration_node', topics, table, save),
+        _node('planner_node', topics, table),
+    ])
+
+
+def _node(name, topics, *parameters):
+    return Node(package='imu_calibration', executable=name, output='screen', remappings=topics,
+                parameters=[PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters])

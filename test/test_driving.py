@@ -1,0 +1,288 @@
+"""The driver: nothing moves before start, limits are kept, and whatever the joints do otherwise than asked stops everything with one sentence."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imu_calibration.driving.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect
+from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
+from imu_calibration.driving.path_watch import at_rest
+from imu_calibration.errors import InputError
+from imu_calibration.reference.motion_limits import MotionLimits
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
+from imu_calibration.simulation.table_controller import ControllerSettings, TableController
+
+STEP = 0.01
+NAMES = ('outer', 'inner')
+LIMITS = MotionLimits(np.array([-np.inf, -1.5]), np.array([np.inf, 1.5]), np.array([2.0, 1.0]), np.array([4.0, 2.0]), np.ones(2, bool))
+
+
+def motion_points(limits, seed, names=NAMES, start=None, kind=None):
+    """A planned motion from a place: a move, then a rest, a spin or a swing, with points every 0.05 s."""
+    rng = np.random.default_rng(seed)
+    builder = MotionBuilder(len(names), limits=limits)
+    if start is not None:
+        builder._position = start
+    low, high = np.where(np.isfinite(limits.lower), limits.lower, -3.0), np.where(np.isfinite(limits.upper), limits.upper, 3.0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    builder.move_to(middle + 0.5 * half * rng.uniform(-1, 1, len(names)))
+    builder.rest(1.0)
+    kind = kind or rng.choice(['swing', 'spin', 'rest'])
+    if kind == 'swing':
+        frequency = 0.5
+        builder.swing(0.5 * np.minimum.reduce([0.4 * half, limits.speed / (2 * np.pi * frequency), limits.acceleration / (2 * np.pi * frequency)**2]),
+                      np.full(len(names), frequency), 4.0)
+    if kind == 'spin' and limits.endless.any():
+        rates = np.where(limits.endless, 0.9 * np.degrees(limits.speed), 0.0)
+        builder.spin([rates, -rates], 2.0)
+    profile = Profile('motion', tuple(builder.segments))
+    time = np.append(np.arange(0.05, profile.duration, 0.05), profile.duration)
+    motion = profile.at(time)
+    motion.rate[-1], motion.acceleration[-1] = 0.0, 0.0
+    return TrajectoryPoints(names, time, motion.position, motion.rate, motion.acceleration)
+
+
+class Bench:
+    """A driver and a simulated table, joint states every `STEP`, with the noise of an encoder."""
+
+    def __init__(self, limits=LIMITS, names=NAMES, driver=DriverSettings(), **controller):
+        self.table = TableController(None, names, limits=limits, settings=ControllerSettings(**controller))
+        self.driver, self.now, self.rng, self.silent = Driver(names, limits, driver), 0.0, np.random.default_rng(1), False
+        self.sent, self.stops = [], 0
+        self.look()
+
+    def look(self):
+        """Go on by a step; a stop is obeyed at once."""
+        self.now += STEP
+        motion = self.table.at(np.array([self.now]))
+        told = motion.position[0] + self.rng.normal(0, 1e-4, len(self.driver.joint_names))
+        must_stop = self.driver.tick(self.now) if self.silent else self.driver.observe(self.now, told, motion.rate[0], now=self.now)
+        if must_stop:
+            self.stops += 1
+            self.table.follow(self.now, TrajectoryPoints.stop(self.driver.joint_names))
+
+    def move(self, points):
+        """Begin a motion."""
+        self.sent.append(self.driver.begin(points, 'a motion', self.now))
+        self.table.follow(self.now, self.sent[-1])
+
+    def until_it_rests(self, seconds=120.0):
+        """Go on until the driver no longer drives."""
+        end = self.now + seconds
+        while self.driver.is_driving and self.now < end:
+            self.look()
+        return self.driver.state
+
+
+@pytest.mark.parametrize('kind', ['rest', 'spin', 'swing'])
+@pytest.mark.parametrize('controller', [{}, {'lag': 0.4}, {'speed_scaling': 0.3}])
+def test_a_motion_is_followed_to_its_end_however_slow_and_late_the_controller_is(kind, controller):
+    bench = Bench(**controller)
+    bench.driver.start()
+    for seed in (1, 2):
+        bench.move(motion_points(LIMITS, seed, start=bench.driver.position, kind=kind))
+        assert bench.until_it_rests() is DriveState.MEASURING, bench.driver.reason
+    assert bench.stops == 0 and bench.driver.motions == 2
+    np.testing.assert_allclose(bench.driver.position, bench.sent[-1].position[-1], atol=1e-3)
+
+
+def test_the_first_motion_after_a_start_is_slow_and_the_next_is_not():
+    bench = Bench()
+    bench.driver.start()
+    points = motion_points(LIMITS, 1)
+    bench.move(points)
+    assert bench.sent[0].duration == pytest.approx(points.duration / 0.3)
+    bench.until_it_rests()
+    again = motion_points(LIMITS, 2, start=bench.driver.position)
+    bench.move(again)
+    assert bench.sent[1].duration == again.duration
+
+
+def test_nothing_moves_before_joint_states_and_after_a_stop():
+    driver, points = Driver(NAMES, LIMITS), motion_points(LIMITS, 1)
+    with pytest.raises(InputError, match='joint states must come before anything moves'):
+        driver.begin(points, 'a motion', 0.0)
+    bench = Bench()
+    bench.driver.stop('somebody said so')
+    with pytest.raises(InputError, match='the state is stopped: somebody said so; start anew'):
+        bench.move(points)
+    bench.driver.start()
+    bench.move(points)
+    with pytest.raises(InputError, match='the state is moving'):   # one motion at a time
+        bench.move(points)
+
+
+@pytest.mark.parametrize('moment', np.linspace(0.0, 9.0, 7))
+def test_stop_is_safe_at_any_moment(moment):
+    bench = Bench()
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 3, kind='spin'))
+    while bench.now < moment:
+        bench.look()
+    bench.driver.stop('stopped by hand')
+    bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))
+    after = bench.table.at(bench.now + np.linspace(0, 3, 1000))
+    assert np.max(np.abs(after.acceleration) / LIMITS.acceleration) < 1 + 1e-6 and not after.rate[-1].any()
+    assert bench.driver.state is DriveState.STOPPED and not bench.driver.observe(bench.now, np.full(2, 9.0), np.full(2, 9.0), now=bench.now)
+
+
+@pytest.mark.parametrize('controller, sentence', [
+    ({'stall_joint': 'inner', 'stall_time': 2.0}, r'joint inner(, at .* deg, does not follow: the joints are .* deg from their path| has not come further)'),
+    ({'stall_joint': 'inner', 'stall_time': 0.0}, r'joint inner'),
+    ({'refuse_after': 0}, r'nothing moved for 3\.\d s after a trajectory was sent: stopped; the controller refused it or does not listen')])
+def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_sentence(controller, sentence):
+    bench = Bench(**controller)
+    bench.driver.start()
+    points = motion_points(LIMITS, 4, kind='swing')
+    try:
+        bench.move(points)
+    except InputError:   # as on a topic, nobody is told that it was refused
+        pass
+    assert bench.until_it_rests() is DriveState.STOPPED and bench.stops == 1
+    assert re.match(sentence, bench.driver.reason), bench.driver.reason
+    assert '\n' not in bench.driver.reason and bench.now < 25.0
+
+
+def test_a_joint_that_is_pushed_off_its_path_beyond_its_range_or_too_fast_stops_everything():
+    for place, rate, words in (([0.0, 0.2], [0.0, 0.0], 'does not follow'), ([0.0, 1.6], [0.0, 0.0], 'inner, at 91.7 deg, is beyond its range'),
+                               ([0.0, 0.0], [0.0, 2.0], 'inner turns at 2.00 times its largest speed')):
+        bench = Bench()
+        bench.driver.start()
+        bench.move(motion_points(LIMITS, 5))
+        assert bench.driver.observe(bench.now + STEP, np.array(place), np.array(rate), now=bench.now)
+        assert bench.driver.state is DriveState.STOPPED and words in bench.driver.reason
+
+
+def test_joint_states_that_fall_silent_stop_everything():
+    bench = Bench()
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 6))
+    for _ in range(50):
+        bench.look()
+    bench.silent, before = True, bench.now
+    assert bench.until_it_rests() is DriveState.STOPPED and bench.now - before < 1.1
+    assert bench.driver.reason.startswith('nothing was heard of the joints for 1.0 s: stopped')
+
+
+def test_joints_that_do_not_come_to_rest_stop_everything():
+    bench = Bench(driver=DriverSettings(settling_patience=2.0))
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 7, kind='rest'))
+    while bench.driver.state is DriveState.MOVING:
+        bench.look()
+    place = bench.driver.position
+    for k in range(300):
+        if bench.driver.observe(bench.now + k * STEP, place + 0.02 * np.sin(k * 0.5), np.zeros(2), now=bench.now):
+            break
+    assert 'do not come to rest within 2 s' in bench.driver.reason
+
+
+def random_limits(seed):
+    """Limits of a table of one to six joints, some endless, some slow, some that slide."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 7))
+    turns = rng.random(count) < 0.8
+    endless = turns & (rng.random(count) < 0.5)
+    low, span = rng.uniform(-3, 0, count), rng.uniform(0.2, 5.0, count)
+    return MotionLimits(np.where(endless, -np.inf, low), np.where(endless, np.inf, low + span), rng.uniform(0.05, 6.0, count),
+                        rng.uniform(0.1, 20.0, count), turns)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(0, 10**6), st.floats(0.5, 4.0))
+def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
+    limits = random_limits(seed)
+    names = tuple(f'joint_{k}' for k in range(len(limits)))
+    start = np.clip(np.zeros(len(limits)), limits.lower, limits.upper)
+    driver = Driver(names, limits)
+    driver.start()
+    driver.observe(0.0, start, np.zeros(len(limits)), now=0.0)
+    points = motion_points(limits, seed, names=names, start=start)
+    # What a planner does wrong: it is in a hurry. `hurry` above the slow first motion's 1 / 0.3 is too fast where the motion is at its limits.
+    asked = TrajectoryPoints(names, points.time / hurry, points.position, points.rate * hurry, points.acceleration * hurry**2)
+    try:
+        sent = driver.begin(asked, 'a motion', 0.0)
+    except InputError as error:
+        assert 'within the limits of the joints' in str(error) and driver.state is DriveState.IDLE and hurry > 1.0
+        return
+    beyond, speed, acceleration = excess(trajectory_from(at_rest(start), sent), limits, step=0.001)
+    assert beyond < 1e-5 and speed < 1 + 1e-3 and acceleration < 1 + 1e-3
+
+
+def test_a_motion_without_accelerations_or_of_other_joints_is_not_sent():
+    bench = Bench()
+    bench.driver.start()
+    points = motion_points(LIMITS, 1)
+    with pytest.raises(InputError, match='must have accelerations'):
+        bench.move(TrajectoryPoints(NAMES, points.time, points.position, points.rate))
+    with pytest.raises(InputError, match='and no others'):
+        bench.move(TrajectoryPoints(('outer', 'tool'), points.time, points.position, points.rate, points.acceleration))
+
+
+class OldHand:
+    """Stands for a planner: so many motions of ten seconds, each of which halves what is left until `floor`."""
+
+    def __init__(self, motions=4, floor=0.0):
+        self.motions, self.floor, self.excess, self.separated = motions, floor, {'accelerometer.bias.x': 16.0}, []
+        self.separable = True
+
+    def separator(self, suspect):
+        self.separated.append(suspect)
+        if not self.separable:
+            raise InputError('no joint turns')
+        return OldHand(2)
+
+    def take(self, excess):
+        self.excess = {'accelerometer.bias.x': max(excess, self.floor)}
+
+    def next_motion(self, position):
+        self.motions -= 1
+        moves = self.motions >= 0
+        return SimpleNamespace(motion='a motion' if moves else None, seconds=10.0, reason='it helps' if moves else 'all within tolerance', missing=())
+
+
+def carried_out(campaign, answers=(), most=60):
+    """What a campaign decides, each motion taking ten seconds and halving what is left; the answers of the diagnosis in order."""
+    decided, elapsed, left, answers = [], 0.0, 16.0, list(answers)
+    for _ in range(most):
+        decision = campaign.decide(np.zeros(2), elapsed)
+        decided.append('move' if decision.motion else 'diagnose' if decision.diagnose else decision.why)
+        if decision.motion:
+            elapsed, left = elapsed + 10.0, left / 2
+            campaign.take(left)
+        elif decision.diagnose:
+            campaign.take_findings(answers.pop(0) if answers else [])
+        else:
+            return decided
+    raise AssertionError(f'no end: {decided}')
+
+
+def test_a_campaign_moves_asks_what_is_wrong_separates_and_ends_with_its_reason():
+    hand = OldHand()
+    assert carried_out(Campaign(hand)) == ['move'] * 4 + ['diagnose', 'all within tolerance']
+    assert carried_out(Campaign(OldHand(), CampaignSettings(separations=0))) == ['move'] * 4 + ['all within tolerance']
+    hand = OldHand()
+    campaign, alike, alone = Campaign(hand, make_separator=hand.separator), Suspect('gyro_quadratic', ('gyro_scale_asymmetry',), {'x': 1e-3}), Suspect('gyro_scale_asymmetry')
+    decided = carried_out(campaign, [[alike], [alone]])
+    assert decided == ['move'] * 4 + ['diagnose', 'move', 'move', 'diagnose', 'all within tolerance; beyond bias and matrix there is gyro_scale_asymmetry']
+    assert hand.separated == [alike] and campaign.separations == 1
+    stubborn = Campaign(hand := OldHand(), CampaignSettings(separations=2), hand.separator)
+    assert carried_out(stubborn, [[alike]] * 9)[-1].endswith('there is gyro_quadratic (not to be told from gyro_scale_asymmetry)')
+    assert stubborn.separations == 2
+    hand.separable = False
+    assert 'no motion is known that separates them: no joint turns' in Campaign(hand, make_separator=hand.separator).take_findings([alike])
+
+
+def test_a_campaign_ends_when_the_time_is_over_or_motions_bring_nothing_any_more():
+    over = carried_out(Campaign(OldHand(100), CampaignSettings(time_limit=35.0)))
+    assert over[:3] == ['move'] * 3 and len(over) == 4 and over[3].startswith(f'{TIME_OVER}: the next motion takes 10 s; outside its tolerance: ')
+    assert carried_out(Campaign(OldHand(100), CampaignSettings(time_limit=30.0)))[3].startswith(f'{TIME_OVER}; outside')
+    vain = carried_out(Campaign(OldHand(100, floor=8.0)))   # misfit, say, that no motion takes away
+    assert vain[:PATIENCE + 1] == ['move'] * (PATIENCE + 1) and vain[-2] == 'diagnose' and vain[-1].startswith(IN_VAIN)
+    assert carried_out(Campaign(OldHand(30)))[-1] == 'all within tolerance'   # what goes on halving is worth its while

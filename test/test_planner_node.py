@@ -1,0 +1,218 @@
+"""planner_node over DDS, its ways to command joints, and what goes wrong with a table."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration.errors import InputError
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
+
+pytest.importorskip('rclpy')
+from imu_calibration.diagnosis.live import FOUND  # noqa: E402
+from imu_calibration.driving.campaign import Suspect  # noqa: E402
+from imu_calibration.nodes import joint_commands  # noqa: E402
+from imu_calibration.nodes.planner_node import findings_from  # noqa: E402
+
+from ros.live_station import TABLE, Station  # noqa: E402
+
+NAMES = ('outer', 'inner')
+POINTS = TrajectoryPoints(NAMES, np.array([1.0]), np.array([[0.1, 0.2]]), np.zeros((1, 2)), np.zeros((1, 2)))
+
+
+def test_findings_are_read_from_the_values_of_the_status():
+    told = {'outcome': str(FOUND), 'effect': 'gyro_quadratic', 'mates of gyro_quadratic': 'gyro_scale_asymmetry gyro_rate_product',
+            'size of gyro_quadratic.x': '0.001', 'mates of time_offset': '', 'size of time_offset.t': '-2e-05', 'x': '0.001 +- 0.1 s/rad'}
+    assert findings_from(told) == [Suspect('gyro_quadratic', ('gyro_scale_asymmetry', 'gyro_rate_product'), {'x': 1e-3}),
+                                   Suspect('time_offset', (), {'t': -2e-5})]
+    assert findings_from(told | {'outcome': 'nothing found'}) == findings_from({}) == []
+
+
+class Future:
+    """Stands for a future of rclpy: answered when the test says so."""
+
+    def __init__(self):
+        self.answer, self._then = None, []
+
+    def add_done_callback(self, then):
+        self._then.append(then)
+
+    def done(self, answer):
+        self.answer = answer
+        for then in self._then:
+            then(self)
+
+    def result(self):
+        return self.answer
+
+
+class Goal:
+    """Stands for a goal handle."""
+
+    def __init__(self, accepted=True):
+        self.accepted, self.cancelled, self.ended = accepted, 0, Future()
+
+    def cancel_goal_async(self):
+        self.cancelled += 1
+
+    def get_result_async(self):
+        return self.ended
+
+
+class Action:
+    """Stands for ``rclpy.action.ActionClient``: control_msgs is not on PyPI, so no server of its action can be run here."""
+
+    def __init__(self, *_):
+        self.goals, self.futures = [], []
+
+    def server_is_ready(self):
+        return True
+
+    def send_goal_async(self, goal):
+        self.goals.append(goal)
+        self.futures.append(Future())
+        return self.futures[-1]
+
+
+@pytest.fixture
+def action(monkeypatch):
+    """An ActionCommand with a stand-in for control_msgs and its server, what it sent to the topic, and what it complained of."""
+    package, module = ModuleType('control_msgs'), ModuleType('control_msgs.action')
+    module.FollowJointTrajectory = SimpleNamespace(Goal=lambda trajectory: SimpleNamespace(trajectory=trajectory))
+    monkeypatch.setitem(sys.modules, 'control_msgs', package)
+    monkeypatch.setitem(sys.modules, 'control_msgs.action', module)
+    monkeypatch.setattr('rclpy.action.ActionClient', Action)
+    sent, complaints = [], []
+    publisher = SimpleNamespace(publish=sent.append, topic_name='/joint_trajectory', get_subscription_count=lambda: 1)
+    node = SimpleNamespace(create_publisher=lambda *_: publisher)
+    return joint_commands.make_command(node, 'action', complaints.append), sent, complaints
+
+
+def test_a_goal_holds_the_trajectory_and_its_end_is_told_in_words(action):
+    command, sent, complaints = action
+    command.send(POINTS)
+    trajectory = command._client.goals[0].trajectory
+    assert list(trajectory.joint_names) == list(NAMES) and list(trajectory.points[0].positions) == [0.1, 0.2] and not sent
+    goal = Goal()
+    command._client.futures[0].done(goal)
+    goal.ended.done(SimpleNamespace(result=SimpleNamespace(error_code=-4, error_string='inner is late')))
+    assert complaints == ['a joint left its path (inner is late)']
+    command.send(POINTS)
+    command._client.futures[1].done(Goal(accepted=False))
+    assert complaints[1:] == ['it refused the goal']
+    command.send(POINTS)
+    command._client.futures[2].done(goal := Goal())
+    goal.ended.done(SimpleNamespace(result=SimpleNamespace(error_code=0, error_string='')))
+    assert len(complaints) == 2
+
+
+def test_a_stop_cancels_the_goal_and_empties_the_topic_whenever_it_comes(action):
+    command, sent, complaints = action
+    command.send(POINTS)
+    command.stop(NAMES)   # before the server has answered
+    command._client.futures[0].done(early := Goal())
+    command.send(POINTS)
+    command._client.futures[1].done(late := Goal())
+    command.stop(NAMES)
+    late.ended.done(SimpleNamespace(result=SimpleNamespace(error_code=-4, error_string='')))
+    assert early.cancelled == late.cancelled == 1 and len(sent) == 2 and complaints == []
+    assert sent[0] == joint_commands.encode_trajectory(TrajectoryPoints.stop(NAMES))
+
+
+def test_an_action_without_control_msgs_is_refused_and_auto_takes_the_topic(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'control_msgs', None)
+    node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(topic_name='/joint_trajectory'))
+    with pytest.raises(InputError, match='control_msgs is not installed: install ros-jazzy-control-msgs, or use topic'):
+        joint_commands.make_command(node, 'action', print)
+    assert isinstance(joint_commands.make_command(node, 'auto', print), joint_commands.TopicCommand)
+    with pytest.raises(InputError, match="'command' must be one of topic, action, auto"):
+        joint_commands.make_command(node, 'telepathy', print)
+
+
+class Loop(Station):
+    """A simulated table, calibration_node and planner_node."""
+
+    def begin(self, folder, planner=None, **simulator):
+        """Start the three nodes and wait until they know each other."""
+        self.watch_diagnostics()
+        self.calibration_node(folder)
+        self.simulator = self.start('simulator_node', {'table_file': TABLE, 'profile': 'none', 'time_factor': 4.0, 'imu_rate': 100.0, 'joint_rate': 100.0,
+                                                       'seed': 3, 'imu_seed': 5, 'start_time': 1.8e9, **simulator})
+        self.planner = self.start('planner_node', {'table_file': TABLE, 'first_speed': 1.0, **(planner or {})})
+        self.until(lambda: 'simulator_node: table' in self.status and 'planner_node: drive' in self.status, 'the nodes')
+        return self
+
+    def ask(self, what):
+        """Call a service of the planner until it takes it: discovery takes its time."""
+        answers = []
+        self.until(lambda: answers.append(self.call(f'/planner_node/{what}')) or answers[-1].success, what)
+        return answers[-1].message
+
+    def drive(self):
+        """Return what the planner says."""
+        return self.status['planner_node: drive'].message
+
+    def value(self, key):
+        """Return a figure of the planner."""
+        return next(pair.value for pair in self.status['planner_node: drive'].values if pair.key == key)
+
+
+@pytest.mark.dds
+@pytest.mark.slow
+def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_path):
+    with Loop(tmp_path / 'out.txt') as loop:
+        loop.begin(tmp_path)
+        loop.spin_for(2.0)
+        assert loop.value('state') == 'idle' and loop.value('motion') == '0'   # nothing moves before start
+        loop.ask('next')
+        loop.until(lambda: loop.value('motion') == '1' and loop.value('state') == 'idle', 'the end of one motion')
+        assert 'rests until the next motion is asked for' in loop.drive()
+        loop.ask('start')
+        loop.until(lambda: loop.value('state') in ('done', 'stopped'), 'the end', 180.0)
+        assert loop.drive().startswith('done: ') and int(loop.value('motion')) >= 3, loop.drive()
+        documents = loop.watch_documents()
+        loop.until(lambda: documents, 'the calibration')
+        assert loop.processes.end(loop.planner) == 0
+    said = (tmp_path / 'out.txt').read_text()
+    assert 'motion 1, ' in said and 'asking what the model gets wrong' in said and 'Traceback' not in said
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize('fault, words', [
+    ({'refuse_after': 0}, 'the controller refused it or does not listen'), ({'stall_joint': 'middle', 'stall_time': 0.0}, 'joint middle')])
+def test_a_table_that_refuses_or_stalls_ends_everything_with_one_sentence(tmp_path, fault, words):
+    with Loop(tmp_path / 'out.txt') as loop:
+        loop.begin(tmp_path, **fault)
+        loop.ask('start')
+        loop.until(lambda: loop.value('state') == 'stopped', 'the stop')
+        assert words in loop.drive() and loop.status['planner_node: drive'].level == b'\x02', loop.drive()
+        loop.spin_for(1.0)
+        assert loop.value('state') == 'stopped'   # and nothing goes on
+
+
+@pytest.mark.dds
+def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_moving(tmp_path):
+    from sensor_msgs.msg import JointState
+    with Loop(tmp_path / 'out.txt') as loop:
+        # A table with slow joints, so that a motion is long enough to be stopped in.
+        slow = {'speed_deg_s': 15.0, 'acceleration_deg_s2': 30.0}
+        table = yaml.safe_load(TABLE.read_text())
+        table['joints'] = [joint | slow for joint in table['joints']]
+        path = tmp_path / 'slow.yaml'
+        path.write_text(yaml.safe_dump(table))
+        loop.begin(tmp_path, {'table_file': path}, table_file=path)
+        places = []
+        loop.node.create_subscription(JointState, 'joint_states', lambda m: places.append(list(m.position)), 1000)
+        loop.ask('start')
+        loop.until(lambda: loop.value('motion') == '2' and loop.value('state') == 'moving', 'the second motion')
+        assert loop.call('/planner_node/stop').message.startswith('stopped: nothing moves')
+        loop.until(lambda: len(places) > 200 and np.ptp(places[-100:], axis=0).max() == 0.0, 'rest')
+        assert loop.drive() == 'stopped: stopped by ~/stop'
+        assert 'nothing moves' in loop.call('/planner_node/stop').message   # twice is no harm
+        loop.ask('start')   # goes on with what is known; slowly at first
+        loop.until(lambda: loop.value('state') == 'moving', 'another motion')
+        loop.processes.end(loop.simulator)
+        loop.until(lambda: 'nothing was heard of the joints' in loop.drive(), 'the silence')
+        assert loop.value('state') == 'stopped'
