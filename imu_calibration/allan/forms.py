@@ -92,27 +92,27 @@ def _is_part(form, wider):
     return all(name in wider or (name == RANDOM_WALK.name and GAUSS_MARKOV in wider) for name in form)
 
 
-def choose_form(moments: Moments) -> Choice:
-    """Fit every form, with quantisation where the curve shows it."""
-    fits = _all_forms(moments, ())
+def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
+    """Fit every form, with quantisation where the curve shows it; `excess` is the factor on all covariances of a curve that nothing explains."""
+    fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
     if score_at_zero(moments, wider.fit, 0) < CLEAR:
-        fits = _all_forms(moments, (QUANTISATION.name,))
+        fits = _all_forms(moments, (QUANTISATION.name,), excess)
     return Choice(fits, moments)
 
 
-def _all_forms(moments, fast):
+def _all_forms(moments, fast, excess):
     n_scales = int(moments.used.sum())
-    fits = [fit_form(moments, form, fast) for form in FORMS if len(fast) + 2 * len(form) + 3 <= n_scales]
+    fits = [fit_form(moments, form, fast, excess) for form in FORMS if len(fast) + 2 * len(form) + 3 <= n_scales]
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 
-def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = ()) -> FormFit:
-    """Fit white noise, `fast` processes and the slow ones of a form."""
+def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), excess: float = 1.0) -> FormFit:
+    """Fit white noise, `fast` processes and the slow ones of a form; squares larger than chance by `excess` count by so much less."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
-    return FormFit(tuple(form), fit, log_cost(moments, fit) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
+    return FormFit(tuple(form), fit, log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
 
 
 def _likeliest(moments, fit):
@@ -135,8 +135,8 @@ def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
     return fit_with_time(moments, processes) if GAUSS_MARKOV in names else fit_processes(moments, processes)
 
 
-def log_cost(moments: Moments, fit: MomentFit) -> float:
-    """Return minus twice the log likelihood of the logarithms of the variances, but for a constant."""
+def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
+    """Return minus twice the log likelihood of the logarithms of the variances, but for a constant; `excess` is a factor on their covariance."""
     some = moments.scales.tau[moments.used] * INDEPENDENT <= moments.scales.longest
     expected = (moments.design(fit.processes) @ fit.coefficients)[some]
     covariance = fit.covariance[np.ix_(some, some)]
@@ -144,7 +144,7 @@ def log_cost(moments: Moments, fit: MomentFit) -> float:
     spread = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
     whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(spread, spread))
     rest = whiten(np.log(moments.target[some] / expected) - digamma(freedom / 2) + np.log(freedom / 2))
-    return float(rest @ rest) + whiten.log_determinant
+    return float(rest @ rest) / excess + whiten.log_determinant
 
 
 def without_finest(moments: Moments, count: int) -> Moments:

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.special import factorial
 
-SMALL = 0.02
+SMALL = 1.0
 """Below this argument the Gauss-Markov kernel is summed as a series: its leading terms cancel in fourth differences."""
+SERIES = 1.0 / factorial(np.arange(20, 2, -1))
+"""Coefficients of ``exp(u) - 1 - u - u^2 / 2``, the highest first, without the factor u^3."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +36,6 @@ class NoiseProcess:
     """Whether the kernel lives on the sampling instants only (a spike at zero)."""
     time: float = 0.0
     """Correlation time, s."""
-    local: bool = False
-    """Whether second differences that do not overlap are independent."""
 
 
 def allan_variance(process: NoiseProcess, tau: np.ndarray) -> np.ndarray:
@@ -71,11 +72,11 @@ def _random_walk(lag):
 
 
 QUANTISATION = NoiseProcess('quantisation', 'Q', 's', _quantisation, 'The output comes in steps: variance 3 Q^2 / tau^2.',
-                              lattice=True, local=True)
-WHITE = NoiseProcess('white_noise', 'N', '/sqrt(Hz)', _white, 'Every sample errs by itself: variance N^2 / tau.', local=True)
+                            lattice=True)
+WHITE = NoiseProcess('white_noise', 'N', '/sqrt(Hz)', _white, 'Every sample errs by itself: variance N^2 / tau.')
 FLICKER = NoiseProcess('bias_instability', 'B', '', _flicker,
                        'The bias has noise of density B^2 / (2 pi f): variance (2 ln 2 / pi) B^2 at every tau.')
-RANDOM_WALK = NoiseProcess('random_walk', 'K', '/s/sqrt(Hz)', _random_walk, 'The bias walks at random: variance K^2 tau / 3.', local=True)
+RANDOM_WALK = NoiseProcess('random_walk', 'K', '/s/sqrt(Hz)', _random_walk, 'The bias walks at random: variance K^2 tau / 3.')
 
 
 @lru_cache(maxsize=512)
@@ -85,8 +86,7 @@ def gauss_markov(time: float) -> NoiseProcess:
         u = np.abs(lag) / time
         values = np.expm1(-u) + u - 0.5 * u**2
         small = u < SMALL
-        u = u[small]
-        values[small] = u**3 * (-1 / 6 + u * (1 / 24 + u * (-1 / 120 + u * (1 / 720 - u / 5040))))
+        values[small] = -u[small]**3 * np.polyval(SERIES, -u[small])
         return -time**2 * values
     return NoiseProcess('gauss_markov', 'sigma', '', kernel, f'The bias wanders and forgets within {time:g} s.', time=time)
 

@@ -11,10 +11,12 @@ import numpy as np
 from imu_calibration.allan.processes import NoiseProcess, allan_variance
 
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
-DENSE = np.arange(-18, 19) / 6
-"""Lags around each place where a difference begins or ends, in units of the shorter averaging time."""
-GROWTH, REACH = 2.0, 64.0
+DENSE = np.arange(-36, 37) / 12
+"""Lags around each place where a difference begins or ends, in units of the shorter averaging time: correlations are good to some thousandths."""
+GROWTH, REACH = 1.5, 64.0
 """Further lags grow by this factor, up to this many of the longer averaging time."""
+ROUNDING = 1e-14
+"""Share of the terms of a fourth difference below which it is nothing but what rounding leaves of them."""
 MOST_LENGTHS = 24
 """Stretches are sorted into this many lengths at most."""
 
@@ -99,19 +101,20 @@ class ScaleCovariance:
 
     def _correlation(self, process):
         """Return the covariance of second differences at the lags for a unit coefficient, shape (n_pairs, n_lags)."""
-        if process.name == 'gauss_markov':   # one for each correlation time: too many to keep
-            return self._evaluate(process, self._lag)
         if process not in self._correlations:
+            for known in [other for other in self._correlations if other.time]:   # those of all correlation times are too many to keep
+                del self._correlations[known]
             self._correlations[process] = self._evaluate(process, self._lag)
         return self._correlations[process]
 
     def _evaluate(self, process, lag):
-        total = np.zeros(lag.shape)
+        total, size = np.zeros(lag.shape), np.zeros(lag.shape)
         for i, at_short in enumerate(SECOND_DIFFERENCE):
             for j, at_long in enumerate(SECOND_DIFFERENCE):
-                total += at_short * at_long * process.kernel((lag + j * self._long - i * self._short) * self.period)
-        if process.local:   # what rounding leaves of terms that cancel
-            total[(lag >= 2 * self._short) | (lag <= -2 * self._long)] = 0.0
+                term = at_short * at_long * process.kernel((lag + j * self._long - i * self._short) * self.period)
+                total += term
+                size += np.abs(term)
+        total[np.abs(total) < ROUNDING * size] = 0.0
         return total / (self._short * self._long * self.period**2)
 
 

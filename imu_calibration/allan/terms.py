@@ -71,7 +71,7 @@ class AxisNoise:
 def identify_axis(moments: Moments) -> AxisNoise:
     """Return the noise of one axis from its Allan variances."""
     moments, excess = fit_range(moments)
-    choice = choose_form(moments)
+    choice = choose_form(moments, excess)
     best, rivals = choice.best, choice.rivals
     fast = tuple(name for name in (QUANTISATION.name,) if name in best.fit.names)
     terms: dict[str, Term] = {}
