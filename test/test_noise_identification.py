@@ -94,8 +94,10 @@ def test_the_covariance_between_scales_is_that_of_quadratic_forms(process):
 @pytest.mark.parametrize('process', [FLICKER, RANDOM_WALK, *(gauss_markov(time) for time in (4.0, 87.0, 321.0, 3000.0))], ids=lambda p: f'{p.name}{p.time:g}')
 def test_correlations_of_a_long_record_are_correlations(process):
     """
-    Rounding once made correlations of thirty between the shortest averaging times, and lags too far apart eigenvalues of minus the ridge: likelihoods
-    then jumped by ten from one correlation time to the next.
+    No correlation is beyond one, no eigenvalue below zero by much of the ridge.
+
+    Rounding once made correlations of thirty between the shortest averaging times, and lags too far apart eigenvalues of minus the ridge:
+    likelihoods then jumped by ten from one correlation time to the next.
     """
     covariance = scales_of(1_080_000, 0.01).product(process, process)
     sd = np.sqrt(np.diag(covariance))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from test_adapters_copy import raw_messages
+from test_live_calibration import blocks
 
 from imu_calibration import files
 from imu_calibration.allan.bias_processes import bias_processes
@@ -15,19 +16,25 @@ from imu_calibration.allan.document import noise_to_text
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, Term
+from imu_calibration.by_hand.live import LiveByHand
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.measured_noise import with_measured_noise
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.diagnosis.live import LiveDiagnosis
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.nodes.adoption import adopt
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples
 from msg_adapters.imu import FIELDS, parse_imu
 
+from worlds import physics
 from worlds.compensation_cases import random_calibration
 from worlds.noise_worlds import flicker
 
@@ -117,6 +124,19 @@ def test_calibrate_takes_the_measured_noise_and_says_so(calibrated, noise_file):
     walk = 2e-5 * np.sqrt(3600.0 / 2)   # what counts within an hour
     assert document['statistics']['accelerometer']['wander_sd'] == pytest.approx(walk, rel=1e-6)
     assert document['provenance']['options']['noise'] == 'noise.yaml'
+
+
+def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise_file):
+    """On a table the biases move as was measured; by hand the noise is refused as it is offline."""
+    session, options = physics.make_session(3), CalibrationOptions(noise=files.read_noise(noise_file))
+    live, diagnosis = LiveCalibration(Table.from_mapping(session.table), options), LiveDiagnosis(300_000)
+    for block in blocks(session.imu, session.joints):
+        diagnosis.add(live.push(block))
+    known = live.solve(pending=True).solution.noise
+    assert {sensor: known[sensor].bias_processes[:len(wanted)] for sensor, wanted in options.bias_processes.items()} == options.bias_processes
+    assert diagnosis.question(live).bias_processes == options.bias_processes
+    with pytest.raises(InputError, match='by hand it must be left out'):
+        LiveByHand(options, LiveSettings())
 
 
 def test_by_hand_the_noise_is_refused_in_one_line(noise_file, tmp_path, capsys):

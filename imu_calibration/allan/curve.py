@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.allan.between_parts import Parts
 from imu_calibration.allan.deviation import AllanSums, averaging_factors
 from imu_calibration.allan.sample_grid import SampleGrid, spread
 from imu_calibration.allan.still_parts import StillPart
@@ -27,6 +28,8 @@ class AllanCurve:
     """The same with the trends left in, shape (n_scales, 6)."""
     lengths: tuple[int, ...]
     """Samples of each part."""
+    parts: tuple[Parts, ...]
+    """The variances of each part, one for each axis."""
 
     @property
     def tau(self) -> np.ndarray:
@@ -130,4 +133,6 @@ class _PartReader:
         self._close()
         usable = self._bare.terms > 0
         bare, raw = self._bare.variance()[usable], self._raw.variance()[usable]
-        return AllanCurve(self._period, self._bare.factors[usable], bare, raw, tuple(self._bare.lengths))
+        variance, terms = (values[:, usable] for values in self._bare.by_stretch())
+        parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
+        return AllanCurve(self._period, self._bare.factors[usable], bare, raw, tuple(self._bare.lengths), parts)

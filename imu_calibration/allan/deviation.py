@@ -54,6 +54,7 @@ class AllanSums:
         self.squares = np.zeros((len(factors), n_columns))
         self.terms = np.zeros(len(factors), np.int64)
         self.lengths: list[int] = []
+        self._until: list[tuple[np.ndarray, np.ndarray]] = [(self.squares.copy(), self.terms.copy())]
         levels = octaves_beyond(self.factors)
         self._levels = [_Level(np.flatnonzero(levels == k), self.factors[levels == k] >> k, n_columns)
                         for k in range(int(levels.max(initial=0)) + 1)]
@@ -96,9 +97,15 @@ class AllanSums:
         """Close the stretch; what comes next has no connection with it."""
         if self._length:
             self.lengths.append(self._length)
+            self._until.append((self.squares.copy(), self.terms.copy()))
         self._offset, self._length = None, 0
         for level in self._levels:
             level.forget()
+
+    def by_stretch(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of each stretch, (n_stretches, n_scales, n_columns), and their numbers of terms, (n_stretches, n_scales)."""
+        squares, terms = (np.diff(np.array(values), axis=0) for values in zip(*self._until))
+        return squares / (2.0 * np.maximum(terms, 1)[:, :, None]), terms.astype(float)
 
     def variance(self) -> np.ndarray:
         """Return the Allan variances, shape (n_scales, n_columns); NaN without a term."""

@@ -56,6 +56,7 @@ def _sensor_section(sensor, axes):
     section['sample_sd'] = [float(axis.sample_sd) for axis in axes]
     section['shortest_averaging_time'] = [float(axis.shortest) for axis in axes]
     section['excess'] = [float(axis.excess) for axis in axes]
+    section['scatter_between_rests'] = [float(axis.scatter) for axis in axes]
     section['oscillation'] = [None if axis.oscillation is None else list(axis.oscillation) for axis in axes]
     return section
 
@@ -135,7 +136,8 @@ def _axis(section, k, deviation):
     others = tuple(tuple(form) for form in section['also_possible'][k])
     return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, trends, record_for, float(section['sample_sd'][k]),
                        float(section['shortest_averaging_time'][k]), float(section['excess'][k]),
-                       _pair((section.get('oscillation') or [None] * 3)[k]), tuple(float(v) for v in deviation))
+                       _pair((section.get('oscillation') or [None] * 3)[k]),
+                       float((section.get('scatter_between_rests') or [0.0] * 3)[k]), tuple(float(v) for v in deviation))
 
 
 def _pair(values):

@@ -51,6 +51,8 @@ class AxisFigures:
     """Factor on all variances of the fit because the curve departs from the model by more than chance."""
     oscillation: tuple[float, float] | None = None
     """Frequency (Hz) and amplitude of an oscillation that shows as a hump, where no model explains the curve."""
+    scatter: float = 0.0
+    """Standard deviation of the level of the variances from rest to rest, over the level."""
     deviation: tuple[float, ...] = ()
     """Allan deviations at the averaging times of the document."""
 

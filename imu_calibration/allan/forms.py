@@ -93,7 +93,7 @@ def _is_part(form, wider):
 
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
-    """Fit every form, with quantisation where the curve shows it; `excess` is the factor on all covariances of a curve that nothing explains."""
+    """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of a curve that nothing explains."""
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
     if score_at_zero(moments, wider.fit, 0) < CLEAR:
@@ -136,7 +136,7 @@ def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
 
 
 def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
-    """Return minus twice the log likelihood of the logarithms of the variances, but for a constant; `excess` is a factor on their covariance."""
+    """Return minus twice the log likelihood of the logarithms of the variances but for a constant, with `excess` times their covariance."""
     some = moments.scales.tau[moments.used] * INDEPENDENT <= moments.scales.longest
     expected = (moments.design(fit.processes) @ fit.coefficients)[some]
     covariance = fit.covariance[np.ix_(some, some)]

@@ -94,7 +94,7 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     curve = read_curve(source(), parts, found.period, detrending=detrending, time_of=clock.time, nominal=nominal)
     _require_scatter(curve)
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
-    moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]))
+    moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]), curve.parts[axis])
                     for axis, variance in enumerate(curve.variance.T))
     flat = tuple(part for of_epoch in parts for part in of_epoch)
     return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found)
@@ -125,7 +125,8 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
 def _axis_figures(record, k, axis, times):
     trends = tuple(TrendFigure(trend.name, trend.coefficient, trend.sd, trend.time) for trend in record.trends[k])
     return AxisFigures(axis.terms, axis.form, axis.others, axis.alternatives, trends, _record_for(axis, times), float(record.sample_sd[k]),
-                       axis.shortest, axis.excess, axis.oscillation, tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
+                       axis.shortest, axis.excess, axis.oscillation, axis.scatter,
+                       tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
 
 
 def _record_for(axis, times):

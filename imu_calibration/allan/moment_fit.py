@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import nnls
 
+from imu_calibration.allan.between_parts import Parts
 from imu_calibration.allan.processes import NoiseProcess, gauss_markov
 from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.trends import KeptShare
@@ -64,6 +65,10 @@ class Moments:
     """Which scales take part, bool, shape (n_scales,)."""
     kept: KeptShare = KeptShare()
     """What is left of each process after trends were taken out."""
+    parts: Parts = Parts()
+    """The variances of each part at rest."""
+    scatter: float = 0.0
+    """Standard deviation of the level of the noise from part to part, over the level."""
 
     @cached_property
     def times(self) -> np.ndarray:
@@ -92,6 +97,14 @@ class Moments:
         """The variances used, shape (n_used,)."""
         return self.variance[self.used]
 
+    def covariance(self, design: np.ndarray, tensor: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the covariance of the variances used for coefficients `values`: by chance, and by a level that differs between parts."""
+        chance = np.einsum('p,q,pqij->ij', values, values, tensor)
+        if not self.scatter:
+            return chance
+        level = self.scatter * np.sqrt(self.parts.share())[self.used] * (design @ values)
+        return chance + np.outer(level, level)
+
 
 def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None,
                   *, start: np.ndarray | None = None) -> MomentFit:
@@ -115,7 +128,7 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
         values[k] = value
     floor = FLOOR * np.min(target[:, None] / design, axis=0)
     for _ in range(STEPS):
-        covariance = _covariance(tensor, np.maximum(values, floor))
+        covariance = moments.covariance(design, tensor, np.maximum(values, floor))
         whitener = Whitener(covariance)
         new = values.copy()
         if len(free):
@@ -127,13 +140,9 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
         values = new
         if done:
             break
-    covariance = _covariance(tensor, np.maximum(values, floor))
+    covariance = moments.covariance(design, tensor, np.maximum(values, floor))
     residual = Whitener(covariance)(target - design @ values)
     return MomentFit(tuple(processes), values, covariance, float(residual @ residual))
-
-
-def _covariance(tensor, values):
-    return np.einsum('p,q,pqij->ij', values, values, tensor)
 
 
 class Whitener:

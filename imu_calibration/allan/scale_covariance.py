@@ -12,7 +12,7 @@ from imu_calibration.allan.processes import NoiseProcess, allan_variance
 
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
 DENSE = np.arange(-36, 37) / 12
-"""Lags around each place where a difference begins or ends, in units of the shorter averaging time: correlations are good to some thousandths."""
+"""Lags around where a difference begins or ends, in units of the shorter averaging time; good to thousandths of a correlation."""
 GROWTH, REACH = 1.5, 64.0
 """Further lags grow by this factor, up to this many of the longer averaging time."""
 ROUNDING = 1e-14

@@ -16,6 +16,8 @@ TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bia
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
 BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise found', 'bound': 'none seen: the largest possible'}
+WORTH_SAYING = 0.04
+"""Scatter of the variances between rests that is said: two per cent of the noise."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,8 @@ def _axis_lines(name, sensor, axis):
     if axis.excess > 1:
         found.append(f'{name}: the curve departs from every model by {np.sqrt(axis.excess):.2g} times what chance allows'
                      f'{_hump(sensor, axis)}; intervals are wider by that')
+    if axis.scatter > WORTH_SAYING:
+        found.append(f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance; intervals are wider by that')
     return found
 
 

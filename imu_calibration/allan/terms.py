@@ -66,11 +66,14 @@ class AxisNoise:
     """Factor on all covariances because the curve departs from the model by more than chance, at least 1."""
     oscillation: tuple[float, float] | None = None
     """Frequency (Hz) and amplitude of what makes the largest hump of a curve that no model explains."""
+    scatter: float = 0.0
+    """Standard deviation of the level of the variances from rest to rest, over the level."""
 
 
 def identify_axis(moments: Moments) -> AxisNoise:
     """Return the noise of one axis from its Allan variances."""
     moments, excess = fit_range(moments)
+    moments = replace(moments, scatter=scatter_of(moments))
     choice = choose_form(moments, excess)
     best, rivals = choice.best, choice.rivals
     fast = tuple(name for name in (QUANTISATION.name,) if name in best.fit.names)
@@ -84,7 +87,14 @@ def identify_axis(moments: Moments) -> AxisNoise:
         for name in set(other.form) - set(best.form) - set(alternatives):
             alternatives |= _figures(choice, name, excess)
     return AxisNoise(best.form, _doubted(terms, best, rivals), tuple(rival.form for rival in rivals), alternatives, best.fit,
-                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best.fit) if excess > 1 else None)
+                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best.fit) if excess > 1 else None, moments.scatter)
+
+
+def scatter_of(moments: Moments) -> float:
+    """Return by how much the level of the variances differs from part to part beyond chance, as a model with every slope says of chance."""
+    fit = fit_names(moments, RICHEST[0])
+    expected = moments.design(fit.processes) @ fit.coefficients
+    return moments.parts.scatter(moments.used, np.diag(fit.covariance) / expected**2)
 
 
 def _hump(moments, fit):
@@ -97,12 +107,17 @@ def _hump(moments, fit):
 
 
 def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the model says of every averaging time: the variance, and the degrees of freedom of a measured one."""
+    """
+    Return what the model says of every averaging time of a recording: the variance, and the degrees of freedom of a measured one.
+
+    The level of the noise differs there from part to part as it did where it was identified.
+    """
     every = replace(moments, used=np.ones_like(moments.used))
     fit = axis.fit
     expected = every.design(fit.processes) @ fit.coefficients
     spread = np.einsum('p,q,pqii->i', fit.coefficients, fit.coefficients, every.tensor(fit.processes))
-    return expected, 2.0 * expected**2 / (spread * axis.excess)
+    level = axis.scatter**2 * moments.parts.share() if axis.scatter else 0.0
+    return expected, 2.0 / (spread * axis.excess / expected**2 + level)
 
 
 def fit_range(moments: Moments) -> tuple[Moments, float]:

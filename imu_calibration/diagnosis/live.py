@@ -111,7 +111,8 @@ class LiveDiagnosis:
         windows = self.recent.list() + live.open_windows
         if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
             return None
-        return DiagnosisQuestion(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten)
+        return DiagnosisQuestion(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten,
+                                 live.options.bias_processes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +127,13 @@ class DiagnosisQuestion:
     """The model to diagnose."""
     forgotten: int = 0
     """Windows that were no longer there."""
+    bias_processes: dict = field(default_factory=dict)
+    """Sensor -> how its bias moves, where that was measured apart."""
 
     def answer(self, progress: Callable[[float], object] | None = None) -> DiagnosisState:
         """Diagnose and return the DiagnosisState; `progress` is called with the share done and may raise to end it."""
         try:
-            return describe(diagnose(self.windows, self.table, self.model, progress=progress), self.forgotten)
+            return describe(diagnose(self.windows, self.table, self.model, progress=progress, bias_processes=self.bias_processes), self.forgotten)
         except ImuCalibrationError as error:
             return DiagnosisState(WAITING, str(error), {'windows': len(self.windows)})
 

@@ -74,6 +74,9 @@ class CalibrationNodeSettings:
     effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, tolerance, text}, '
                                 'or a calibration that has some; a model may name them then', symptom='the node refuses a model that names them',
                                 session=True, fixed='motion is gathered for the model')
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: how its biases move from window to window, on a table; empty: what '
+                              'the windows say of it', symptom='standard deviations of the biases are too large or too small', session=True,
+                              fixed='one session is judged by one noise')
     save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, also when '
                              'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, with ~/save alone',
                              symptom='the node says at its start that the place is not writable', live=True, session=True)
@@ -129,7 +132,8 @@ class CalibrationNode(Node):
         catalogue = files.read_effects(files.user_path(settings.effects_file)) if settings.effects_file else CATALOGUE
         place = files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml')
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
-                                  files.read_tolerances(place, catalogue), windows, catalogue=catalogue)
+                                  files.read_tolerances(place, catalogue), windows, catalogue=catalogue,
+                                  noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
         return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)
