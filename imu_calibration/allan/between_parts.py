@@ -28,8 +28,8 @@ class Parts:
         """
         Return the standard deviation between parts of the level of the variances, over the level, beyond what chance makes.
 
-        The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with the numbers of terms for weights, averaged
-        over the averaging times as precisely as each knows it.
+        The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with the numbers of terms for weights,
+        averaged over the averaging times as precisely as each knows it.
 
         Parameters
         ----------
