@@ -103,11 +103,11 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
 
 def _all_forms(moments, fast, excess):
     n_scales = int(moments.used.sum())
-    fits = [fit_form(moments, form, fast, excess) for form in FORMS if len(fast) + 2 * len(form) + 3 <= n_scales]
+    fits = [fit_form(moments, form, fast, excess=excess) for form in FORMS if len(fast) + 2 * len(form) + 3 <= n_scales]
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 
-def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), excess: float = 1.0) -> FormFit:
+def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> FormFit:
     """Fit white noise, `fast` processes and the slow ones of a form; squares larger than chance by `excess` count by so much less."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
