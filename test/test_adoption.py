@@ -18,17 +18,17 @@ SETTINGS = CompensatorSettings()
 
 
 def test_another_sensor_does_not_take_the_place_of_this_one():
-    before = adopt(calibration_to_text(GOOD), 'a file', SETTINGS, None)
-    assert adopt(calibration_to_text(replace(GOOD, values=GOOD.values + 1e-4)), 'the topic', SETTINGS, None, before=before).source == 'the topic'
+    before = adopt(calibration_to_text(GOOD), 'a file', SETTINGS, frames=None)
+    assert adopt(calibration_to_text(replace(GOOD, values=GOOD.values + 1e-4)), 'the topic', SETTINGS, frames=None, before=before).source == 'the topic'
     with pytest.raises(DocumentError, match="the same sensor, 'imu_link', this one is for 'another_link'"):
-        adopt(calibration_to_text(replace(GOOD, frame_id='another_link')), 'the topic', SETTINGS, None, before=before)
+        adopt(calibration_to_text(replace(GOOD, frame_id='another_link')), 'the topic', SETTINGS, frames=None, before=before)
 
 
 def test_what_speaks_against_itself_is_refused_unless_told():
     text = calibration_to_text(replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',)))
     with pytest.raises(DocumentError, match='the residuals are large'):
-        adopt(text, 'a file', SETTINGS, None)
-    assert 'its verdict is bad' in adopt(text, 'a file', replace(SETTINGS, anyway=True), None).caveats[0]
+        adopt(text, 'a file', SETTINGS, frames=None)
+    assert 'its verdict is bad' in adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None).caveats[0]
 
 
 def test_whatever_a_document_does_becomes_one_line(monkeypatch):
@@ -37,10 +37,10 @@ def test_whatever_a_document_does_becomes_one_line(monkeypatch):
         raise IndexError('list index out of range')
     monkeypatch.setattr(adoption, '_prepared', fails)
     with pytest.raises(DocumentError, match='must be usable, this one is not: IndexError: list index out of range'):
-        adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, None)
+        adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None)
 
 
 def test_only_what_changed_by_more_than_its_sd_is_worth_a_line():
-    before, sd = adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, None), np.sqrt(np.diag(GOOD.covariance))
-    little, much = (adopt(calibration_to_text(replace(GOOD, values=GOOD.values + share * sd)), 'the topic', SETTINGS, None) for share in (0.1, 3.0))
+    before, sd = adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None), np.sqrt(np.diag(GOOD.covariance))
+    little, much = (adopt(calibration_to_text(replace(GOOD, values=GOOD.values + share * sd)), 'the topic', SETTINGS, frames=None) for share in (0.1, 3.0))
     assert not little.says_more_than(before) and much.says_more_than(before)

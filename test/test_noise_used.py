@@ -181,11 +181,11 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
         output = tmp_path / file.stem
         assert main(['compensate', str(BAG), '--calibration', str(truth), '--anyway', '--noise', str(file), '--output', str(output)]) == 0
         of_bags.append(parse_imu(raw_messages(output, '/imu/data_corrected')[-1][1]).doubles[FIELDS['force_cov']][0])
-        live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), None).compensation
+        live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), frames=None).compensation
         of_nodes.append(live.covariances(np.zeros((3, 3)), np.zeros((3, 3)))[0][0, 0])
     assert of_bags[1] / of_bags[0] == pytest.approx(4.0, rel=0.05) and of_nodes[1] / of_nodes[0] == pytest.approx(4.0, rel=0.02)
     with pytest.raises(InputError, match='missing.yaml'):
-        adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True), None)
+        adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True), frames=None)
 
 
 def test_the_noise_becomes_metres():
@@ -199,3 +199,11 @@ def test_the_noise_becomes_metres():
 def test_white_noise_that_may_be_none_counts_with_its_bound():
     axis = AxisFigures({'white_noise': Term('white_noise', 0.0, (0.0, 3e-4), 'weak', 'may be none')})
     assert axis.white == 3e-4
+
+
+def test_an_axis_that_allows_any_walk_is_not_the_worst():
+    """A vibration can hide a walk of any size; filters want a number, which the other axes have."""
+    open_end = axis_of(white_noise=1e-4)
+    open_end.terms['random_walk'] = Term('random_walk', None, (0.0, np.inf), HELD)
+    axes = (open_end, axis_of(white_noise=1e-4), axis_of(white_noise=1e-4))
+    assert NoiseFigures(axes, axes, 100.0).densities('gyroscope').walk == 1e-9

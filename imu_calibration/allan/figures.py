@@ -115,9 +115,9 @@ class NoiseFigures:
         return {'accelerometer': self.accelerometer, 'gyroscope': self.gyroscope}[name]
 
     def densities(self, sensor: str, horizon: float = HORIZON, worst: Callable = max) -> 'Densities':
-        """Return the two numbers that most filters take for a sensor: those of its worst axis."""
+        """Return the two numbers that most filters take for a sensor: those of its worst axis that the curve says anything of."""
         walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
-        walk, basis = worst(walks)
+        walk, basis = worst([found for found in walks if np.isfinite(found[0])] or walks)
         return Densities(float(worst(axis.white for axis in self.sensor(sensor))), float(walk), basis)
 
 
