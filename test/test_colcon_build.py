@@ -71,7 +71,7 @@ def test_the_ament_index_finds_the_package_with_its_files(workspace):
     assert done.returncode == 0, done.stderr
     share = Path(done.stdout.strip())
     assert share == prefix(workspace) / 'share' / 'imu_calibration'
-    for folder, pattern in (('config', '*.yaml'), ('launch', '*.launch.py')):
+    for folder, pattern in (('config', '*.*'), ('launch', '*.launch.py')):
         source = sorted(path.name for path in (ROOT / folder).glob(pattern))
         assert source and sorted(path.name for path in (share / folder).iterdir() if path.is_file()) == source
     assert (share / 'package.xml').is_file()

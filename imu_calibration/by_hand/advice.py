@@ -6,11 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.by_hand.model import GYRO_MATRIX, HandModel, unpack
+from imu_calibration.calibration.coverage import DIRECTIONS
 from imu_calibration.effects.base import AXES
 from imu_calibration.reference.reference_motion import skew
-
-STANDARD_POSES = tuple(np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d))
-"""Six faces, twelve edges and eight corners turned up."""
 
 
 def missing_motion(model: HandModel, factor: np.ndarray, values: np.ndarray, *, statuses: Sequence[str], tolerances: np.ndarray,
@@ -64,13 +62,14 @@ def _predicted(rows, priors, tolerances):
 
 def _pose_candidates(model, values, sd):
     bias, matrix, *_ = unpack(values)
-    for up in STANDARD_POSES:
+    for up in DIRECTIONS:
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], time=np.zeros(1), temperature_c=np.full(1, model.model.temperature_ref_c))[1]
-        yield rows / sd, f'hold it still with {_direction(up)} up'
+        yield rows / sd, f'hold it still with {direction_words(up)} up'
 
 
-def _direction(up):
+def direction_words(up: np.ndarray) -> str:
+    """Return a standard direction for people: '+x -z'."""
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
@@ -81,13 +80,13 @@ def _turn_candidates(model, sd):
         carried = -up  # after half a turn about a level axis
         across = np.array([about, np.cross(about, up)])
         rows = np.zeros((2, model.size))
-        rows[:, GYRO_MATRIX] = (across @ skew(carried) @ _psi_by_matrix(about)).reshape(2, 9)
+        rows[:, GYRO_MATRIX] = (across @ skew(carried) @ rotation_slopes(about)).reshape(2, 9)
         yield rows / sd, (f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
                           'still before and after')
 
 
-def _psi_by_matrix(about, angle=np.pi):
-    """Derivative of the rotation error in the turned frame by the matrix entries, near the identity, shape (3, 9)."""
+def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
+    """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
     cross = skew(about)
     # integral over the turn of the rotation still to come, C(angle - t)
     to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross

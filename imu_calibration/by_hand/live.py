@@ -9,11 +9,13 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import POSES_LEAST
 from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.next_pose import hand_coverage
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.result import HandResult
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand
+from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
@@ -218,6 +220,10 @@ class LiveByHand:
         if self.result is None:
             return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
         return group_states(self.result)
+
+    def coverage(self) -> Coverage:
+        """Return the Coverage: which attitudes are worth having, where to go next."""
+        return hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
         """Return the SessionStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import conclude, solve_gathered
+from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, table_coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
@@ -245,6 +246,10 @@ class LiveCalibration:
         parts = [measured[told] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
                  for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
         return ImuSamples(window.stamp_ns[told], *parts, self._collector.gathered.frame_id)
+
+    def coverage(self) -> Coverage:
+        """Return the Coverage: which attitudes are worth having, which motion helps most."""
+        return replace(NOTHING_SEEN, frame_id=self.frame_id) if self.result is None else table_coverage(self.result, self.frame_id)
 
     def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.effect_states import GroupState, Progress
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
@@ -100,6 +101,9 @@ class LiveSession(Protocol):
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
         """Return how far the session has come beyond what `groups` tell, or None; `hints` as for `errors.with_hint`."""
+
+    def coverage(self) -> Coverage:
+        """Return which attitudes are worth having, and what to do next."""
 
     def change_windows(self, windows: WindowSettings) -> None:
         """Find windows or poses by other settings from now on."""

@@ -80,6 +80,11 @@ def _poses(directions, temperatures=(None,)):
     return make
 
 
+def rest_with_up(up: tuple | np.ndarray) -> 'Motion':
+    """Return the motion of a rest with one direction of the sensor up."""
+    return Motion('rest', 'rest', _poses([tuple(up)]))
+
+
 def _two_axis(gravity):
     """Turn about an axis that itself turns: rates about two axes at once, with the cross term in the angular acceleration."""
     pieces = []

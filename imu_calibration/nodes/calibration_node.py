@@ -2,7 +2,8 @@
 calibration_node: calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose.
 
 in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table), imu/temperature (sensor_msgs/Temperature, for thermal
-effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu), /diagnostics.
+effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu),
+imu/coverage (visualization_msgs/MarkerArray, latched: what is still worth having, where to go next), /diagnostics.
 services: ~/solve, ~/diagnose (at once; the answer comes on /diagnostics), ~/save, ~/reset.
 """
 
@@ -16,6 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from imu_calibration import files
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
@@ -27,6 +29,7 @@ from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, Listeners
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
+from imu_calibration.nodes.coverage_markers import markers_of
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, watch_inputs
@@ -101,8 +104,10 @@ class CalibrationNode(Node):
         self._gatherer = LiveGatherer(self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
+        self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
-                                        listeners=Listeners(self._publish_document, self._publish_residuals), hints=HINTS['calibration_node'])
+                                        listeners=Listeners(self._publish_document, self._publish_residuals, self._publish_coverage),
+                                        hints=HINTS['calibration_node'])
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
@@ -183,6 +188,9 @@ class CalibrationNode(Node):
     def _publish_residuals(self, residuals: Any) -> None:
         for message in rows(encode_imu(residuals)):
             self._publish(self._residual, bytes(message))
+
+    def _publish_coverage(self, coverage: Any) -> None:
+        self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg()))
 
     def _publish(self, publisher: Any, message: Any) -> None:
         try:

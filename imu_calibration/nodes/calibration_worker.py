@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from imu_calibration.calibration.coverage import bars_of
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.pacing import SolvePacer
@@ -36,6 +37,8 @@ class Listeners:
     """Called with the text of each new calibration document."""
     residuals: Callable[[Any], None]
     """Called with ImuSamples."""
+    coverage: Callable[[Any], None] = lambda coverage: None
+    """Called with each new Coverage."""
 
 
 class CalibrationWorker(threading.Thread):
@@ -73,6 +76,7 @@ class CalibrationWorker(threading.Thread):
         self._lock, self._wake, self._ending = threading.Lock(), threading.Event(), False
         self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
         self.place.note_saved(self.live.n_windows)
+        self._covered: tuple[int, int, int] | None = None
         self._trouble = ''
         self._faults: dict[str, str] = {}
         self._note_fault('place', self.place.try_place())
@@ -111,7 +115,7 @@ class CalibrationWorker(threading.Thread):
             while not self._ending:
                 self._wake.wait(PERIOD)
                 self._wake.clear()
-                for step in (self._take, self._answer, self._solve_when_due, self._autosave, self._diagnose_when_due, self._tell):
+                for step in (self._take, self._answer, self._solve_when_due, self._autosave, self._diagnose_when_due, self._tell, self._cover):
                     self._survive(step)
             self._survive(self._take)
         finally:
@@ -287,6 +291,13 @@ class CalibrationWorker(threading.Thread):
         self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values, self.live.status(self.hints), diagnosis,
                                  str(self.place.calibration))
+
+    def _cover(self) -> None:
+        """Make the picture anew when there is something new in it."""
+        seen = (id(self.live), self.live.n_windows if self.live.on_table is None else 0, self._n_solutions)
+        if seen != self._covered:
+            self._covered = seen
+            self.listeners.coverage(replace(self.live.coverage(), bars=bars_of(self.state.groups)))
 
     def _diagnosis_state(self) -> DiagnosisState:
         state = self._diagnosis.state

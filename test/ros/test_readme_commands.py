@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.dds]
 PATIENCE = 90.0
 ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'started anew',
            'param describe': 'Fixed|settling', 'param set': 'Set parameter successful', 'topic echo /diagnostics': 'name: .*calibration_node: streams',
-           'imu inspect': 'gravity reads 9.78', 'ros2 doctor': 'checks passed'}
+           'imu inspect': 'gravity reads 9.78', 'imu watch': 'streams .*messages come', 'ros2 doctor': 'checks passed'}
 """Beginnings of questions -> what stands in the answer."""
 
 

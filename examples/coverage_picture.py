@@ -1,0 +1,73 @@
+"""Draws docs/coverage.png: what imu/coverage shows of a calibration by hand at its beginning, on the way and at its end, from the markers that are published."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from builtin_interfaces.msg import Time
+from visualization_msgs.msg import Marker
+
+from imu_calibration.by_hand.next_pose import foretold, hand_coverage, knowledge_of, shortest_turn
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.status import NOTHING
+from imu_calibration.calibration.coverage import DIRECTIONS, Bar, Coverage, Step
+from imu_calibration.nodes.coverage_markers import markers_of
+
+PICTURE = Path(__file__).resolve().parents[1] / 'docs' / 'coverage.png'
+MINIMUM = 8.0
+"""Points; markers are drawn in proportion to their scale."""
+
+
+def states():
+    """Yield a Coverage at the beginning, after six poses and at the end of a session that does what the picture says."""
+    options = HandOptions(gravity=9.81)
+    knowledge, seen = knowledge_of(NOTHING, None, options), [np.array([0.0, 0.0, 1.0])]
+    yield replace(hand_coverage(NOTHING, None, options), seen=np.array(seen), up=seen[0])
+    steps = foretold(knowledge)
+    for index in steps[:6]:
+        knowledge = replace(knowledge, information=knowledge.after(DIRECTIONS[index:index + 1])[0], up=DIRECTIONS[index])
+        seen.append(DIRECTIONS[index])
+    left = foretold(knowledge)
+    target = DIRECTIONS[left[0]]
+    text = hand_coverage(NOTHING, None, options).next.text.split(' with ')[0]
+    yield Coverage(knowledge.best()[1], np.array(seen), seen[-1], Step(text + ' where the arrow points', target, *shortest_turn(seen[-1], target)), 5.0 * len(left))
+    done = (Bar('accelerometer bias', 0.5, 'determined'),)
+    yield Coverage(np.zeros(len(DIRECTIONS)), np.array([*seen, *DIRECTIONS[left]]), DIRECTIONS[left[-1]], Step(''), 0.0, done)
+
+
+def draw(axes, coverage):
+    """Draw the markers of a Coverage."""
+    for marker in markers_of(coverage, Time()).markers:
+        color = (marker.color.r, marker.color.g, marker.color.b, marker.color.a)
+        points = np.array([(point.x, point.y, point.z) for point in marker.points])
+        place = (marker.pose.position.x, marker.pose.position.y, marker.pose.position.z)
+        if marker.action == Marker.DELETEALL:
+            continue
+        if marker.type == Marker.SPHERE:
+            axes.scatter(*place, s=(MINIMUM + 170 * marker.scale.x)**2 / 2.5, color=color, edgecolors='none')
+        elif marker.type == Marker.SPHERE_LIST:
+            axes.scatter(*points.T, s=14, color=color)
+        elif marker.type == Marker.ARROW:
+            axes.quiver(*points[0], *(points[1] - points[0]), color=color, linewidth=2.5, arrow_length_ratio=0.18)
+        elif marker.type == Marker.LINE_STRIP:
+            axes.plot(*points.T, color=color, linewidth=2.5)
+        elif marker.type == Marker.TEXT_VIEW_FACING:
+            axes.set_title(marker.text, fontsize=9)
+    axes.set_box_aspect((1, 1, 1))
+    axes.set(xlim=(-0.42, 0.42), ylim=(-0.42, 0.42), zlim=(-0.42, 0.42))
+    axes.view_init(elev=22, azim=40)
+    axes.set_axis_off()
+
+
+def main():
+    """Write the picture."""
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), subplot_kw={'projection': '3d'}, layout='constrained')
+    for part, coverage in zip(axes, states(), strict=True):
+        draw(part, coverage)
+    figure.savefig(PICTURE, dpi=85)
+    print(f'written: {PICTURE}')
+
+
+if __name__ == '__main__':
+    main()

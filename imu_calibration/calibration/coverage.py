@@ -1,0 +1,145 @@
+"""What a session has seen and what is still worth having: a sphere of directions that can be turned up, judged by information, not by visits."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.effect_states import GroupState
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.estimation.observability import added_information
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.standard_motions import MOTIONS, rest_with_up
+
+DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
+"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
+ENOUGH = 0.02
+"""A cell that gives less than this share of what is missing is no longer worth a pose."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One parameter group in units of its tolerance."""
+
+    name: str
+    """SENSOR EFFECT."""
+    ratio: float
+    """Largest standard deviation over tolerance; NaN before the first solution."""
+    status: str
+    """'waiting', 'held', 'weak' or 'determined'."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What to do next."""
+
+    text: str
+    """For people; '' when nothing is missing."""
+    up: np.ndarray | None = None
+    """Direction of the sensor frame to turn up and hold, unit vector, shape (3,)."""
+    axis: np.ndarray | None = None
+    """Axis of the sensor frame to turn about, counter-clockwise seen from its tip, unit vector, shape (3,)."""
+    angle: float = 0.0
+    """How far, rad; 0: on and on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What is shown of a session."""
+
+    worth: np.ndarray
+    """Share of what is missing that a rest with each of `DIRECTIONS` up would give, 0 to 1, shape (26,)."""
+    seen: np.ndarray
+    """Directions that have been up at rest, unit vectors, shape (k, 3)."""
+    up: np.ndarray | None
+    """What is up now, or at the last rest, shape (3,)."""
+    next: Step
+    """What to do next."""
+    seconds: float
+    """What is left, s; NaN when nobody knows."""
+    bars: tuple[Bar, ...] = ()
+    """Every parameter group."""
+    arms: np.ndarray | None = None
+    """Sensitive points of the accelerometer's axes, m in the sensor frame, rows x, y, z, shape (3, 3); None while they are not known."""
+    frame_id: str = ''
+    """Frame of the sensor."""
+
+    @property
+    def done(self) -> bool:
+        """Whether every group is determined."""
+        return bool(self.bars) and all(bar.status == DETERMINED for bar in self.bars)
+
+
+NOTHING_SEEN = Coverage(np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan'))
+"""Before anything is known."""
+
+
+def bars_of(groups: Sequence[GroupState]) -> tuple[Bar, ...]:
+    """Return a Bar for every group of parameters."""
+    return tuple(Bar(f'{group.sensor} {group.effect}', group.sd / group.tolerance, str(group.status)) for group in groups)
+
+
+def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
+    """Return how far standard deviations are beyond their tolerances, summed: ``sum log max(sd / tolerance, 1)``; leading axes are kept."""
+    return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
+
+
+def share_gained(before: float, after: np.ndarray) -> np.ndarray:
+    """Return which share of the excess is taken off, 0 to 1."""
+    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
+
+
+def table_coverage(result: CalibrationResult, frame_id: str = '') -> Coverage:
+    """
+    Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    frame_id : str
+
+    """
+    solution = result.solution
+    wanted = np.array(result.model.requested, bool)
+    base = solution.information + np.diag(1 / make_prior(solution.model).sd**2)
+
+    def left(more):
+        sd = np.sqrt(np.clip(np.diag(inverse_normal(base + more)), 0, None))
+        return excess(sd[wanted], result.tolerances[wanted])
+    gravity = result.gravity
+    rests = [rest_with_up(up) for up in DIRECTIONS]
+    after = np.array([left(added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)) for motion in rests])
+    worth = share_gained(left(0.0), after)
+    return Coverage(worth, _rests_of(result), None, _next_on_table(result), float('nan'), (), _arms(result), frame_id)
+
+
+def _rests_of(result):
+    """Return the directions that were up in static windows."""
+    errors = result.window_errors()
+    force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
+    return force / np.linalg.norm(force, axis=1, keepdims=True) if len(force) else np.zeros((0, 3))
+
+
+def _next_on_table(result):
+    """Return the motion that serves the parameter worst off."""
+    needed = result.needed
+    if not needed:
+        return Step('')
+    names = list(result.calibration.param_names)
+    worst = max(needed, key=lambda name: result.calibration.sd[names.index(name)] / result.tolerances[names.index(name)])
+    text = needed[worst][0]
+    motion = next((motion for motion in MOTIONS if motion.text == text), None)
+    return Step(text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float))
+
+
+def _arms(result):
+    """Return the sensitive points, None while one of them is not determined."""
+    effect = next((e for e in result.model.effects if e.name == 'accel_size_effect'), None)
+    if effect is None:
+        return None
+    part = result.model.slices[effect.key]
+    known = all(status == DETERMINED for status in result.calibration.status[part])
+    return result.calibration.values[part].reshape(3, 3) if known else None

@@ -1,0 +1,112 @@
+"""``imu_calibration watch``: a running calibration_node in the terminal."""
+
+import time
+from argparse import Namespace
+from typing import Any
+
+from imu_calibration.cli.parser import OneLineParser
+from imu_calibration.cli.show import console
+from imu_calibration.cli.watch_screen import NodeStatus, screen
+from imu_calibration.errors import InputError
+
+NAME = 'watch'
+HELP = 'Watch a running calibration_node: bars in units of tolerance, next motion, streams, first finding; ends with the node.'
+GONE = 5.0
+"""Seconds without a word after which the node is gone."""
+PERIOD = 0.25
+
+
+def add_arguments(parser: OneLineParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
+    parser.add_argument('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
+    parser.add_argument('--once', action='store_true', help='show what there is, and end')
+
+
+def run(options: Namespace) -> int:
+    """Show what the node says until it ends."""
+    try:
+        import rclpy
+    except ImportError as error:
+        raise InputError('to watch a node rclpy must be installed, it is not; source ROS, or install ros-jazzy-rclpy') from error
+    from rclpy.context import Context
+    from rclpy.executors import ExternalShutdownException
+    context = Context()
+    rclpy.init(context=context)
+    try:
+        return _watch(NodeWatcher(context, options.node.strip('/')), options)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        context.try_shutdown()
+
+
+def _watch(watcher, options):
+    """Wait for the node, then show it."""
+    from rich.live import Live
+    end = time.monotonic() + options.patience
+    while not watcher.complete and time.monotonic() < end:
+        watcher.spin(PERIOD)
+    if not watcher.statuses:
+        others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
+        raise InputError(f"'{options.node}' must run, nothing came of it on /diagnostics in {options.patience:g} s; start it, or name it "
+                         f'with --node, as `ros2 node list` shows it{others}')
+    out = console()
+    if options.once:
+        out.print(watcher.screen())
+        return 0
+    with Live(watcher.screen(), console=out, refresh_per_second=4, transient=False) as live:
+        while time.monotonic() - watcher.heard < GONE:
+            watcher.spin(PERIOD)
+            live.update(watcher.screen())
+    out.print(f'{watcher.name} has ended')
+    return 0
+
+
+class NodeWatcher:
+    """Listens to one node."""
+
+    def __init__(self, context: Any, name: str):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.executors import SingleThreadedExecutor
+        self.name, self.statuses, self.others, self.picture, self.heard = name, {}, set(), '', time.monotonic()
+        self._node = rclpy.create_node('imu_calibration_watch', context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._node)
+        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 100)
+        self._listen_to_picture(name)
+
+    def _listen_to_picture(self, name):
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from visualization_msgs.msg import MarkerArray
+        topic = '/' + '/'.join([*name.split('/')[:-1], 'imu/coverage'])
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._node.create_subscription(MarkerArray, topic, self._draw, latched)
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is something to show."""
+        return bool(self.statuses) and bool(self.picture)
+
+    def _take(self, array):
+        for status in array.status:
+            node, _, name = status.name.partition(': ')
+            if node == self.name:
+                values = {pair.key: pair.value for pair in status.values}
+                self.statuses[name], self.heard = NodeStatus(status.level[0], status.message, values), time.monotonic()
+            else:
+                self.others.add(node)
+
+    def _draw(self, array):
+        self.picture = next((marker.text for marker in array.markers if marker.text), '')
+
+    def spin(self, seconds: float) -> None:
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def screen(self) -> Any:
+        """Return what is shown now."""
+        return screen(self.name, self.statuses, self.picture)
