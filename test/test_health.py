@@ -6,7 +6,7 @@ import pytest
 from imu_calibration.compensation.bias_update import MOST_MOVED, GyroBiasUpdate
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, LEAST, MOVED, WAITING, CalibrationHealth, HealthOptions
 from imu_calibration.compensation.stop_watch import StopWatch
-from imu_calibration.compensation.stops import LONGEST, StopDetector
+from imu_calibration.compensation.stops import LONGEST, Stop, StopDetector
 from imu_calibration.constants import DEG
 
 from worlds.drives import RATE, SD, G, drive, plain_calibration
@@ -136,3 +136,10 @@ def test_a_stop_that_grows_is_one_measurement():
 def test_a_slow_turn_is_no_bias():
     update = GyroBiasUpdate(np.full(3, SD), 600.0)
     assert not update.measure(0.0, 5.0, rate=np.array([0.0, 0.0, 1.2 * MOST_MOVED]), variance=np.full(3, 1e-12)) and not update.predict(5.0)[0].any()
+
+
+def test_a_turn_faster_than_any_bias_moves_is_no_stop():
+    calm, turning = (CalibrationHealth(plain_calibration(), None, HealthOptions(update=True)) for _ in range(2))
+    for health, rate in ((calm, 0.0), (turning, 1.2 * MOST_MOVED)):
+        health.judge(Stop(0.0, 5.0, 500, np.array([0.0, 0.0, G, 0.0, 0.0, rate]), np.array([0.0, 0.0, G, 0.0, 0.0, rate]), np.full(6, 1e-3)))
+    assert calm.state.word == HOLDS and turning.state.word == WAITING

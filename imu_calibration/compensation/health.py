@@ -5,7 +5,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.compensation.bias_update import EARTH_RATE, GyroBiasUpdate
+from imu_calibration.compensation.bias_update import EARTH_RATE, MOST_MOVED, GyroBiasUpdate
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.fitted import FittedErrors
@@ -101,8 +101,8 @@ class CalibrationHealth:
             Of corrected readings without any update; its `others` are the measured specific force and rate.
 
         """
-        if stop.seconds < LEAST:
-            return
+        if stop.seconds < LEAST or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
+            return   # too short, or a slow and steady turn
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
         of_mean = np.square(np.maximum(stop.shake_sd, self.noise_sd)) / stop.n_samples
@@ -139,4 +139,4 @@ class CalibrationHealth:
             return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again', values)
         if self.update is not None and force_off <= LIMIT:
             return HealthState(FOLLOWED, '; '.join(lines) + ': taken off as long as stops show it', values)
-        return HealthState(MOVED, '; '.join(lines) + ': calibrate again', values)
+        return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)
