@@ -168,3 +168,19 @@ def test_the_configuration_of_rviz_shows_the_topic_as_it_is_published():
     [display] = [each for each in found['Visualization Manager']['Displays'] if each['Class'].endswith('MarkerArray')]
     assert display['Topic']['Value'] == '/imu/coverage' and display['Topic']['Durability Policy'] == 'Transient Local'
     assert found['Visualization Manager']['Global Options']['Fixed Frame'] == 'imu_link'
+
+
+def test_the_layout_for_foxglove_shows_picture_parameters_and_residuals():
+    """As the layout classes of foxglove-sdk 0.30 write it; the topics are those that the node publishes."""
+    import json
+    text = (ROOT / 'config/coverage.foxglove.json').read_text()
+    found = json.loads(text)
+
+    def panels(part):
+        if part['type'] == 'panel':
+            return [part]
+        return [panel for item in part['items'] for panel in panels(item['content'])]
+    kinds = {panel['panelType']: panel['config'] for panel in panels(found['content'])}
+    assert found['version'] == 1 and set(kinds) == {'ThreeDee', 'DiagnosticsSummary', 'Plot'}
+    assert kinds['ThreeDee']['topics'] == {'/imu/coverage': {'visible': True}} and kinds['DiagnosticsSummary']['topicToRender'] == '/diagnostics'
+    assert text.count('/imu/residual.linear_acceleration.') == 3 and text.count('/imu/residual.angular_velocity.') == 3
