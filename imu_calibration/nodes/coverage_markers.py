@@ -1,6 +1,7 @@
 """A `Coverage` as visualization_msgs/MarkerArray: the same picture in RViz, Foxglove and every other viewer of markers."""
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -15,7 +16,7 @@ WANTED, SEEN, DONE, ARROW, NOW, WHITE = ((0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (
 TINY = 0.03
 
 
-def markers_of(coverage: Coverage, stamp) -> MarkerArray:
+def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     """
     Return the picture, in the frame of the sensor; each message replaces the one before.
 
@@ -23,7 +24,7 @@ def markers_of(coverage: Coverage, stamp) -> MarkerArray:
     the turn that leads there; blue points: what has been up; the arms of the three sensitive points; one line of text.
     """
     frame = coverage.frame_id or 'imu_link'
-    made = [_marker('all', 0, None, frame=frame, stamp=stamp), *_cells(coverage), *_seen(coverage), *_next(coverage), *_arms(coverage), _text(coverage)]
+    made = [_marker('all', 0, Marker.SPHERE), *_cells(coverage), *_seen(coverage), *_next(coverage), *_arms(coverage), _text(coverage)]
     made[0].action = Marker.DELETEALL
     for marker in made:
         marker.header.frame_id, marker.header.stamp = frame, stamp
@@ -38,9 +39,9 @@ def line_of(coverage: Coverage) -> str:
     return what + ('' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left')
 
 
-def _marker(name, number, kind, *, frame='', stamp=None, color=WHITE, alpha=1.0, scale=(1.0, 1.0, 1.0)):
+def _marker(name, number, kind, *, color=WHITE, alpha=1.0, scale=(1.0, 1.0, 1.0)):
     marker = Marker(ns=name, id=number, action=Marker.ADD, color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=alpha))
-    marker.type = Marker.SPHERE if kind is None else kind
+    marker.type = kind
     marker.scale.x, marker.scale.y, marker.scale.z = map(float, scale)
     marker.pose.orientation.w = 1.0
     return marker
