@@ -22,7 +22,7 @@ N_BASE = len(BASE_NAMES)
 ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
 BASE_NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
 """Zero bias, identity matrices."""
-UNKNOWN_BY_HAND = {'angular acceleration', 'attitude'}
+UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
 """Quantities that gravity in poses and the rates between them do not tell."""
 REPEATS = 4
 """Fixed-point steps that invert an effect: each gains a factor of its size against the input, a thousand or more."""

@@ -30,5 +30,6 @@ def run(options: Namespace) -> int:
         found.save(folder)
         out = console()
         out.print(str(found), soft_wrap=True)
-        out.print(f'written: diagnosis.json, calibration.yaml and report.html in {folder}', soft_wrap=True)
+        also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'
+        out.print(f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}', soft_wrap=True)
         return found.exit_code

@@ -4,6 +4,7 @@ from typing import Callable, Sequence
 
 import numpy as np
 
+from imu_calibration.diagnosis.beyond.look import look_beyond
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import candidates_of, sentence
@@ -96,7 +97,8 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), unexplained(attempt, found.explained, named), candidates_of(attempt.search, named),
+    rests = look_beyond(found, table, unexplained(attempt, found.explained, named))
+    return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named),
                      tuple(found.not_testable),
                      baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),
                      residual_traces(windows, table, baseline, after=solution),

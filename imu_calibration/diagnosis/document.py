@@ -52,7 +52,8 @@ def _gain(gain):
 
 def _rest(sensor, rest):
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': rest.unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor], 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
-            'share': rest.share, 'where': rest.where}
+            'share': rest.share, 'where': rest.where, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
+            'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping()]}
 
 
 def _plain(value):

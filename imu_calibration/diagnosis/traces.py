@@ -60,7 +60,7 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     before, after : Solution
 
     """
-    motion, temperature, rows = _all_samples(windows)
+    motion, temperature, rows = all_samples(windows)
     outputs = {'accelerometer': np.concatenate([w.force_s for w in windows]), 'gyroscope': np.concatenate([w.rate_s for w in windows])}
     errors, references = [], []
     for solution in (before, after):
@@ -83,7 +83,7 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
                   {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
 
 
-def _all_samples(windows):
+def all_samples(windows):
     """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
     motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
     lengths = [len(w.motion) for w in windows]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -43,6 +44,12 @@ class Unexplained:
     """What noise alone would leave there, shape (k, 3)."""
     unit: str | None = None
     """Unit of `rms` where it is not that of the sensor: 'rad/turn' where turns by hand leave most."""
+    axes: tuple = ()
+    """Axes of the sensor that carry it, the strongest first."""
+    regimes: tuple = ()
+    """Conditions under which it appears (`beyond.regimes.Regime`), at most one for each axis."""
+    proposal: Any = None
+    """Formula that it follows (`beyond.proposals.Proposal`), or None."""
 
 
 def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:

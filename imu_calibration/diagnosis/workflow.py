@@ -9,6 +9,7 @@ import numpy as np
 from imu_calibration.by_hand.inquiry import too_few_poses
 from imu_calibration.by_hand.workflow import evident_result, read_by_hand
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
+from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
@@ -16,6 +17,8 @@ from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import LEAVES_MOST
+from imu_calibration.diagnosis.unexplained import Unexplained
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
@@ -42,6 +45,8 @@ class DiagnosisResult:
     """What the data consist of: 'windows' or 'poses'."""
     options: CalibrationOptions
     """What was asked for."""
+    proposed: Calibration | None = None
+    """The calibration with the formulas that are proposed for what stays unexplained, where there are any."""
 
     @property
     def document(self) -> dict[str, Any]:
@@ -85,9 +90,24 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spread.windows))
     result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated=calibrated.result.solution)
+    proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
     if report:
         report(1.0)
-    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options))
+    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options), proposed)
+
+
+def _with_proposals(source, table, options, result, diagnosis, provenance):
+    """Return the calibration of the model that was found with the proposed formulas in it, or None where there are none."""
+    effects = proposed_effects(diagnosis)
+    if not effects:
+        return None
+    model = result.calibration.model
+    catalogue = model.catalogue.with_effects(*effects)
+    texts = {sensor: '+'.join([*(e.name for e in model.effects if e.sensor == sensor and e.role is not Role.LIMIT),
+                               *(e.name for e in effects if e.sensor == sensor)]) for sensor in (*SENSORS, 'reference')}
+    chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
+                     reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
+    return calibrate([source], table, chosen, provenance=provenance).calibration
 
 
 def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(), provenance: dict[str, Any] | None = None,
@@ -145,9 +165,22 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
             lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
+            lines += [f'   {line}' for line in beyond_lines(sensor, rest)]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
+
+
+def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
+    """Return where a rest sits and what formula it follows, as lines."""
+    lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
+    lines += [f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)' for regime in rest.regimes]
+    return lines + ([f'formula: {rest.proposal.sentence}'] if rest.proposal is not None else [])
+
+
+def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
+    """Return the formulas that a diagnosis proposes, as effects."""
+    return [effect for rest in diagnosis.unexplained.values() if rest.proposal is not None for effect in rest.proposal.effects]
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:

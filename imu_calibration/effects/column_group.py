@@ -81,7 +81,10 @@ class ColumnGroup:
             When a column is not finite everywhere.
 
         """
-        values = {name: getattr(ref, field)[index] for name, field, index in self._places}
+        try:
+            values = {name: getattr(ref, field)[index] for name, field, index in self._places}
+        except IndexError as error:
+            raise InputError(f"the columns of '{self.name}' speak of more joints than there are: {', '.join(self.text)}; correct them") from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
         if 'tau' in self.names:

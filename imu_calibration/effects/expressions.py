@@ -14,17 +14,23 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 
+MOST_JOINTS = 7
+"""Joints that a column can speak of."""
 QUANTITIES = {
     'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
     'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
     'attitude': {f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')},
+    'joint angle': {f'angle_{k + 1}': ('joint_angle', k) for k in range(MOST_JOINTS)},
+    'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MOST_JOINTS)},
     'time': {'time': ('time',)},
     'temperature': {'temperature_c': ('temperature_c',)},
     'reference temperature': {'temperature_ref_c': (None,)},
     'time constant': {'tau': (None,)},
 }
-"""Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s."""
+"""Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints from the base outwards."""
+KNOWN = 'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, temperature_ref_c, tau'
+"""The names for people."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
@@ -74,7 +80,7 @@ class _Refused(Exception):
 
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place:place + 30].split())
-    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {", ".join(PLACES)} with {", ".join(FUNCTIONS)} and powers up to '
+    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {KNOWN} with {", ".join(FUNCTIONS)} and powers up to '
                       f'{HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it')
 
 

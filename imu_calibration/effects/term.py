@@ -9,10 +9,13 @@ from imu_calibration.effects.coefficients import Amplitudes
 from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.errors import InputError
 
-MOTIONS = (('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
+JOINTS = {'joint angle', 'joint rate'}
+"""Quantities that only a table knows."""
+MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)), ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
            ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
 """Standard motions that show a quantity; the first that a column uses is taken."""
-DRAWN_AGAINST = ('temperature', 'time', 'force', 'rate')
+DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'time': 'time', 'force': 'force', 'rate': 'rate'}
+"""Quantity -> what a residual is drawn against where a column uses it; the first."""
 MANY = 100.0
 """Tolerances in the prior's standard deviation, where nobody says more."""
 
@@ -77,7 +80,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | Non
     if not settles:
         del definition['time_constant']
     spread = MANY * tolerance if prior_sd is None else prior_sd
-    needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration'})
+    needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
     shape = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
     if settles:
         shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
@@ -85,11 +88,11 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | Non
     return Effect(
         name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason, explanation=text, needs=needs,
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
-        compensation='none' if group.uses & {'time', 'attitude'} else 'exact', groups=(group,),
-        coefficients=Amplitudes(name, name, len(columns) == 3, settles), smooth=not group.uses & {'force', 'rate', 'angular acceleration'},
+        compensation='none' if group.uses & {'time', 'attitude', *JOINTS} else 'exact', groups=(group,),
+        coefficients=Amplitudes(name, name, len(columns) == 3, settles), smooth=not group.uses - {'time', 'temperature', 'reference temperature', 'time constant'},
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
-        against=tuple(quantity for quantity in DRAWN_AGAINST if quantity in group.uses)[:1])
+        against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
 
 
 def from_definition(name: str, definition: dict[str, Any]) -> Effect:

@@ -46,9 +46,10 @@ def _piece_information(model, sensor, values, noise, piece):
 
 
 def _columns(layout, name, rows, piece):
-    """Return the columns of a group; zeros where the motion has no temperature, and for what a warp makes."""
+    """Return the columns of a group; zeros where the motion has no temperature or no joints, and for what a warp makes."""
     group = layout.groups.get(name)
-    unknown = group is None or (piece.temperature_c is None and 'temperature' in group.uses)
+    unknown = group is None or (piece.temperature_c is None and 'temperature' in group.uses) or (
+        piece.motion is None and bool(group.uses & {'joint angle', 'joint rate'}))
     return np.zeros((len(piece), rows.stop - rows.start)) if unknown else group.columns(piece, layout.point)
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.errors import InputError
+
 
 @dataclass(frozen=True, eq=False)
 class Reference:
@@ -30,6 +32,22 @@ class Reference:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def joint_angle(self) -> np.ndarray:
+        """Angles of the joints from the base outwards, rad, shape (n, n_joints)."""
+        return self._joints.position
+
+    @property
+    def joint_rate(self) -> np.ndarray:
+        """Rates of the joints, rad/s, shape (n, n_joints)."""
+        return self._joints.rate
+
+    @property
+    def _joints(self):
+        if self.motion is None:
+            raise InputError('a column that speaks of joints needs a table or an arm, there is none; leave the effect out')
+        return self.motion
 
     def select(self, index: np.ndarray | slice) -> 'Reference':
         """Return the reference at `index` (slice, mask or integer array)."""

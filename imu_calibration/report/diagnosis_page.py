@@ -6,7 +6,7 @@ import numpy as np
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Diagnosis, Finding
 from imu_calibration.diagnosis.traces import Traces
-from imu_calibration.diagnosis.workflow import DiagnosisResult
+from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines, proposed_effects
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
@@ -40,9 +40,19 @@ def diagnosis_report(result: DiagnosisResult) -> str:
                   lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
                   traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
-                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], not_testable=list(diagnosis.not_testable),
+                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], beyond=_beyond(diagnosis),
+                  not_testable=list(diagnosis.not_testable),
                   groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
+
+
+def _beyond(diagnosis):
+    """Return where rests sit and what formulas they follow, and what may be done with these."""
+    lines = [line[0].upper() + line[1:] + '.' for sensor, rest in diagnosis.unexplained.items() for line in beyond_lines(sensor, rest)]
+    if proposed_effects(diagnosis):
+        lines.append('extended.yaml holds the model with the formula in it; take it where another recording confirms it: imu_calibration '
+                     'check, or diagnose with --effects extended.yaml.')
+    return lines
 
 
 def _headline(diagnosis, rests):

@@ -31,6 +31,11 @@ class Diagnosed:
         return self.result.calibration
 
     @property
+    def proposed(self) -> Calibration | None:
+        """The calibration with the formulas that are proposed for what stays unexplained; None where there are none."""
+        return self.result.proposed
+
+    @property
     def findings(self) -> tuple:
         """What the model lacked, the strongest first."""
         return self.result.diagnosis.findings
@@ -59,11 +64,13 @@ class Diagnosed:
         return diagnosis_report(self.result)
 
     def save(self, folder: str | PathLike) -> None:
-        """Write diagnosis.json, report.html and the extended calibration.yaml into a folder."""
+        """Write diagnosis.json, report.html, the extended calibration.yaml and, with proposed formulas, extended.yaml into a folder."""
         page, place = self.report, files.make_folder(folder)
         files.write_text(place / 'diagnosis.json', json.dumps(self.document, indent=1) + '\n')
         files.write_text(place / 'report.html', page)
         files.write_text(place / 'calibration.yaml', calibration_to_text(self.calibration))
+        if self.proposed is not None:
+            files.write_text(place / 'extended.yaml', calibration_to_text(self.proposed))
 
     def __str__(self):
         return '\n'.join(self.result.lines)

@@ -203,6 +203,7 @@ def _sense(world, triads, temperature_c, values, events, cause):
     if 'second_warm_up' in values:
         since = np.maximum(world.time - events['second_start'], 0.0)
         outputs[0] -= values['second_warm_up'] * np.outer(np.expm1(-since / events['second_constant']), events['direction'])
+    outputs = [out + more for out, more in zip(outputs, cause.added(world, temperature_c, force_s, rate_s, plate[2]))]
     return cause.delivered(world.time, outputs, rate_s)
 
 

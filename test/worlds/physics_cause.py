@@ -24,6 +24,10 @@ class Cause:
         """Return force and rate of the sensor's body, given those of the table's plate, in s, each (n, 3)."""
         return force_s, rate_s
 
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return what comes onto the outputs of accelerometer and gyroscope, each (n, 3) or 0, given the world and what the body feels."""
+        return 0.0, 0.0
+
     def delivered(self, time, outputs, rate_s):
         """Return the two outputs (n, 3) as the driver hands them on, given the true rate of the body."""
         return outputs

@@ -1,0 +1,178 @@
+"""The rest of one sensor in short blocks, beside the columns of everything that was asked: what regimes and formulas are judged on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from imu_calibration.diagnosis.traces import all_samples
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import References, columns
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import Explained
+
+BLOCK = 0.25
+"""Least length of a block of a moving window, s; at rest a window is one block."""
+MOST_BLOCKS = 1200
+"""Blocks of one recording, about: their covariance is factored whole."""
+WITHIN = 5
+"""Rows at which the columns of a block are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestBlocks:
+    """Means over blocks of one sensor's residual and of the columns of everything that was asked."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    ref: Reference
+    """True motion at the rows within the blocks, in order of blocks."""
+    starts: np.ndarray
+    """First row of each block, shape (b,)."""
+    time: np.ndarray
+    """Middle of each block, s, shape (b,)."""
+    window: np.ndarray
+    """Number of the window of each block, shape (b,)."""
+    locked: np.ndarray
+    """Whether its window takes no part in choosing, shape (b,)."""
+    design: tuple
+    """Per axis ``[columns of the parameters that act on it | residual]``, shape (b, q_a + 1)."""
+    index: tuple
+    """Per axis the parameters of the space that these columns belong to."""
+    variance: np.ndarray
+    """Variance of a block's residual by the white noise, shape (b, 3)."""
+    processes: tuple
+    """How every bias moves (BiasProcess)."""
+
+    def means(self, rows: np.ndarray) -> np.ndarray:
+        """Return means over the blocks of something known at the rows, shape (b, ...)."""
+        counts = np.diff(np.append(self.starts, len(rows)))
+        return np.add.reduceat(rows, self.starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
+
+    def whitener(self, select: np.ndarray) -> 'Whitener':
+        """Return what makes the blocks `select` (mask) independent, of unit variance."""
+        return Whitener(self, select)
+
+
+class Whitener:
+    """Makes rows of some blocks independent: white noise of each block and a bias that moves."""
+
+    def __init__(self, blocks: RestBlocks, select: np.ndarray):
+        variance, time = blocks.variance[select], blocks.time[select]
+        self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
+        apart = np.abs(time[:, None] - time[None, :])
+        covariance = np.diag(variance.mean(axis=1))
+        for process in blocks.processes:
+            covariance += process.sd**2 * np.exp(-apart / process.time)
+        self._factor, self._select = np.linalg.cholesky(covariance), select
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Return whitened rows, shape as what was selected; divide by ``scale[axis]`` for an axis."""
+        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
+
+
+def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, explained: Explained) -> dict[str, RestBlocks]:
+    """
+    Return sensor -> RestBlocks of the windows that an attempt reduced.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Those that were fitted to, in order.
+    table : Table
+    attempt : Attempt
+        The linearisation whose columns are meant.
+    explained : Explained
+        What noise alone leaves.
+
+    """
+    length = max(BLOCK, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MOST_BLOCKS)
+    parts = [_cut(window, length) for window in windows]
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, f.name)[part.rows] for w, part in zip(windows, parts)]) for f in fields(JointMotion)))
+    warm = all(w.temperature_c is not None for w in windows)
+    temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
+    per_block = np.concatenate([part.per_block for part in parts])
+    number = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
+    count = np.concatenate([part.count for part in parts])
+    common = {'starts': np.cumsum(np.append(0, per_block[:-1])), 'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
+              'window': number, 'locked': attempt.locked[number]}
+    references = References(attempt.recording.model, table, motion, temperature_c=temperature)
+    found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
+    for sensor, residual in _residuals(windows, table, attempt).items():
+        mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
+        floor = explained.floor.noise[sensor]
+        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind)[number] / count[:, None]
+        found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, floor.bias_processes)
+    return found
+
+
+def _busier(windows, sensor, floor, kinds):
+    """
+    Return by how much each window's white noise exceeds that at rest, shape (k, 3): by kind, from second differences, in which a cause that goes
+    with the motion hardly shows; at most what its misfit allows.
+    """
+    place = SENSORS.index(sensor)
+    found = np.ones((len(windows), 3))
+    own = np.array([window.noise_sd[place]**2 if len(window) > 8 else np.full(3, np.nan) for window in windows])
+    still = np.nanmedian(own[kinds == 'static'], axis=0) if np.any(kinds == 'static') else floor.white_variance
+    for kind in np.unique(kinds[kinds != 'static']):
+        most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
+        found[kinds == kind] = np.clip(np.nanmedian(own[kinds == kind], axis=0) / still, 1.0, most)
+    return found
+
+
+def _residuals(windows, table, attempt):
+    """Return sensor -> residual of every sample at the values of the reduction, shape (n, 3): rows within blocks would be too coarse for it."""
+    motion, temperature, rows = all_samples(windows)
+    model, values = attempt.recording.model, attempt.recording.values
+    predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
+    outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
+    return {sensor: output - made[rows] for sensor, output, made in zip(SENSORS, outputs, predicted)}
+
+
+def _of_sensor(sensor, attempt, references, table, residual, common, variance, processes):
+    recording, space = attempt.recording, attempt.space
+    ref = references.at(sensor)
+    taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=references.temperature_c, references=references),
+             *(entry.columns(ref) for entry in recording.bank[sensor])]
+    blocks = RestBlocks(sensor, ref, **common, design=(), index=(), variance=variance, processes=processes)
+    rows = np.concatenate([blocks.means(np.concatenate(taken, axis=1)), residual], axis=1)
+    design = tuple(rows @ join for join in space.join[sensor])
+    return RestBlocks(sensor, ref, **common, design=design, index=tuple(space.index[sensor]), variance=variance, processes=processes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """A window cut into blocks."""
+
+    edges: np.ndarray
+    """First sample of each block, and the number of samples."""
+    rows: np.ndarray
+    """Rows of the motion that are taken."""
+    per_block: np.ndarray
+    """Number of them in each block."""
+
+    @property
+    def count(self):
+        return np.diff(self.edges).astype(float)
+
+    def means(self, samples):
+        return np.add.reduceat(samples, self.edges[:-1], axis=0) / self.count.reshape(-1, *[1] * (samples.ndim - 1))
+
+    def of_rows(self, samples):
+        return samples[self.rows] if len(self.rows) > 1 else samples.mean(keepdims=True)
+
+
+def _cut(window, length):
+    size = len(window)
+    if len(window.motion) == 1:
+        return _Cut(np.array([0, size]), np.array([0]), np.array([1]))
+    edges = np.unique(np.linspace(0, size, max(1, round((window.time[-1] - window.time[0]) / length)) + 1).round().astype(int))
+    rows = [np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int)) for a, b in zip(edges, edges[1:])]
+    return _Cut(edges, np.concatenate(rows), np.array([len(part) for part in rows]))

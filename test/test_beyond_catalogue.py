@@ -1,0 +1,147 @@
+"""Causes that no catalogue holds: where the rest sits, the formula that it follows, and the way of that formula into a model."""
+
+import json
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from imu_calibration import files
+from imu_calibration.cli.main import main
+from imu_calibration.diagnosis.beyond import proposals
+from imu_calibration.diagnosis.beyond.blocks import rest_blocks
+from imu_calibration.diagnosis.beyond.fitting import BlockFits, share_interval, share_removed
+from imu_calibration.diagnosis.beyond.grammar import grammar
+from imu_calibration.diagnosis.beyond.proposals import propose
+from imu_calibration.diagnosis.beyond.regimes import find_regimes
+from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.workflow import diagnosis_lines
+from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.selection.investigation import investigate
+
+from worlds import physics
+from worlds.beyond_catalogue import row_of
+from worlds.hiding import record
+from worlds.physics_beyond import Beyond
+
+
+@lru_cache(maxsize=None)
+def looked(kind=None, seed=5):
+    """Return (investigation, sensor -> blocks, cause) of a session."""
+    cause = Beyond(kind, seed) if kind else None
+    recording = record(seed, None, through_bag=False, **({'cause': cause} if cause else {}))
+    found = investigate(recording.windows, recording.table, recording.model)
+    return found, rest_blocks(found.used, recording.table, found.attempt, found.explained), cause
+
+
+def fits_of(found, blocks):
+    space, used = found.attempt.space, found.attempt.search.used(found.named)
+    return BlockFits(blocks, space.prior_sd, space.prior_mean, used)
+
+
+def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
+    formulas = grammar(3, True, 300.0)
+    assert sum(len(formula.columns) for formula in formulas) > 1000 and len(set(formulas)) == len(formulas)
+    by_text = {formula.columns[0]: formula for formula in formulas}
+    assert by_text['f_x * w_y'].unit('rad/s') == 'rad/s/(m/s^2)/(rad/s)' and by_text['w_x ** 3'].unit('rad/s') == 'rad/s/(rad/s)^3'
+    assert by_text['(temperature_c - temperature_ref_c) * f_z'].unit('m/s^2') == 'm/s^2/K/(m/s^2)'
+    assert by_text['(temperature_c - temperature_ref_c) * f_z'].family == {'temperature', 'force'}
+    assert by_text['sign(f_x)'].unit('m/s^2') == by_text['cos(3 * angle_2)'].unit('m/s^2') == 'm/s^2'
+    assert {f.columns[0] for f in formulas if f.smooth} >= {'(temperature_c - temperature_ref_c) ** 2'} and not by_text['w_x'].smooth
+    for formula in formulas:
+        for column in formula.columns:
+            assert ColumnGroup('c', (column,) if isinstance(column, str) else column).names, 'reads and speaks of something'
+
+
+def test_blocks_of_a_recording_that_hides_nothing_are_noise():
+    found, blocks, _ = looked()
+    for sensor in blocks:
+        plain = fits_of(found, blocks[sensor]).fit()
+        assert abs(plain.excess) < 5 * np.sqrt(2 * plain.rest.size)
+
+
+@pytest.mark.parametrize('kind, text', [('anisoelasticity', 'f_'), ('gyro_cubic', '** 3'), ('stray_field_accel', 'sin(')])
+def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
+    found, blocks, cause = looked(kind)
+    proposal = propose(blocks[cause.kind.sensor], found.attempt, fits_of(found, blocks[cause.kind.sensor]))
+    assert text in proposal.columns[0] and proposal.family == cause.kind.family and set(proposal.axes) == cause.axes
+    assert proposal.share > 0.95 and proposal.ci95[0] > 0.9 and proposal.reduction > 0.8
+    assert proposal.nearest[1] < 0.5 and 'none of the catalogue' in proposal.sentence
+    size = sum(proposal.sizes)
+    assert size == pytest.approx(np.sqrt((cause.signal**2).sum(axis=1).mean()), rel=0.6), 'as large as what was hidden'
+
+
+def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
+    found, blocks, _ = looked()
+    for sensor in blocks:
+        assert propose(blocks[sensor], found.attempt, fits_of(found, blocks[sensor])) is None
+        assert not find_regimes(blocks[sensor], found.attempt, found.attempt.search.used([]), ('outer', 'middle', 'inner'))
+
+
+def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch):
+    found, blocks, cause = looked('anisoelasticity')
+    fits = fits_of(found, blocks['gyroscope'])
+    monkeypatch.setattr(proposals, 'share_removed', lambda before, after: 0.5)
+    assert propose(blocks['gyroscope'], found.attempt, fits) is None
+
+
+def test_halves_that_disagree_make_no_formula(monkeypatch):
+    found, blocks, cause = looked('anisoelasticity')
+    sensor = blocks['gyroscope']
+    late = sensor.time > np.median(sensor.time)
+    turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
+    upset = type(sensor)(**{**sensor.__dict__, 'design': turned})
+    told = propose(upset, found.attempt, fits_of(found, upset))
+    assert told is None or 'f_x * f_z' not in told.columns
+
+
+def test_shares_are_of_the_locked_windows():
+    found, blocks, cause = looked('gyro_cubic')
+    fits = fits_of(found, blocks['gyroscope'])
+    before = fits.fit()
+    true = np.stack([np.interp(blocks['gyroscope'].time, cause.time, cause.signal[:, axis]) for axis in range(3)], axis=1)[:, None]
+    after = fits.fit(true)
+    assert len(before.window) == blocks['gyroscope'].locked.sum() and set(before.window) == set(np.flatnonzero(found.attempt.locked))
+    low, high = share_interval(before, after, np.random.default_rng(0))
+    assert low <= share_removed(before, after) <= high
+
+
+@pytest.mark.parametrize('kind', ['knock', 'cable_in_an_arc', 'sticks_when_warm'])
+def test_the_place_is_found(kind):
+    row = row_of(6, kind)
+    assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['named'], row
+
+
+def test_it_is_said_and_written():
+    cause = Beyond('anisoelasticity', 5)
+    recording = record(5, None, through_bag=False, cause=cause)
+    found = diagnose(recording.windows, recording.table, recording.model)
+    lines = '\n'.join(diagnosis_lines(found))
+    assert all(part in lines for part in ('formula: ', 'on windows held out', 'f_x * f_z', 'to confirm it:', f'axis {min(cause.axes)}'))
+
+
+@pytest.mark.slow
+def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(tmp_path, capsys):
+    session = physics.make_session(5, None, 'white', cause=Beyond('anisoelasticity', 5))
+    physics.write_bag(session, tmp_path / 'bag')
+    from imu_calibration import documents
+    (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))
+    table = ['--table', str(tmp_path / 'table.yaml')]
+    assert main(['diagnose', str(tmp_path / 'bag'), *table, '--output', str(tmp_path / 'out')]) in (0, 3)
+    told = capsys.readouterr().out
+    assert 'extended.yaml with the proposed formula' in told and 'formula:' in told
+    extended = tmp_path / 'out' / 'extended.yaml'
+    entry = json.loads((tmp_path / 'out' / 'diagnosis.json').read_text())['unexplained']['gyroscope']['proposals'][0]
+    name = entry['terms'][0]['name']
+    known = files.read_calibration(extended)
+    np.testing.assert_allclose(known.value('gyroscope', name), entry['terms'][0]['value'], atol=5 * np.max(entry['terms'][0]['sd']))
+    assert 'none of the catalogue' in (tmp_path / 'out' / 'report.html').read_text()
+    model = ['--effects', str(extended), '--gyroscope-model', f'bias+matrix+{name}']
+    assert main(['diagnose', str(tmp_path / 'bag'), *table, *model, '--output', str(tmp_path / 'again')]) in (0, 3)
+    again = json.loads((tmp_path / 'again' / 'diagnosis.json').read_text())
+    assert not again['unexplained']['gyroscope']['significant'] and not again['findings']
+    assert main(['diagnose', str(tmp_path / 'bag'), *table, '--effects', str(extended), '--output', str(tmp_path / 'named')]) in (0, 3)
+    assert [f['effect'] for f in json.loads((tmp_path / 'named' / 'diagnosis.json').read_text())['findings']] == [name]
+    assert main(['simulate', '--calibration', str(extended), *table, '--profile', 'quick', '--output', str(tmp_path / 'bag2')]) == 0
+    assert main(['check', str(tmp_path / 'bag2'), '--calibration', str(extended), *table]) in (0, 3)
+    assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(extended), '--anyway', '--output', str(tmp_path / 'bag3')]) in (0, 3)
