@@ -114,8 +114,9 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, expla
 
 def _busier(windows, sensor, floor, kinds):
     """
-    Return by how much each window's white noise exceeds that at rest, shape (k, 3): by kind, from second differences, in which a cause that goes
-    with the motion hardly shows; at most what its misfit allows.
+    Return by how much each window's white noise exceeds that at rest, shape (k, 3).
+
+    By kind, from second differences, in which a cause that goes with the motion hardly shows; at most what its misfit allows.
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))

@@ -139,7 +139,7 @@ def _told(blocks, attempt, fits, plain, choices):
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
     share = share_removed(plain, after)
-    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], after.sd[number], _taken(attempt))
+    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(attempt))
                     for number, (_, text, formula) in enumerate(terms))
     seen = np.abs(after.amplitudes) > SEEN * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
@@ -186,7 +186,7 @@ def _taken(attempt):
     return {name for _, name in attempt.baseline.catalogue.effects(attempt.baseline.joint_names)}
 
 
-def _effect(sensor, number, text, formula, values, sd, taken):
+def _effect(sensor, number, text, formula, values, taken):
     unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
     largest = float(np.abs(values).max())
     names = (f'{SHORT[sensor]}_proposed_{k}' for k in range(1, 100))

@@ -216,7 +216,7 @@ def _variables(blocks, joint_names):
         if np.ptp(angles[:, k]) > 0.5:
             found.append(_cyclic(f'angle of {name}', angles[:, k] / DEG))
         found += _ranged(f'rate of {name}', rates[:, k] / DEG, 'deg/s')
-        found += _before_rest(blocks, name, rates[:, k])
+        found += _before_rest(name, rates[:, k])
     speed, force = np.linalg.norm(blocks.means(ref.rate_s), axis=1), np.linalg.norm(blocks.means(ref.force_s), axis=1)
     found += _ranged('speed', speed / DEG, 'deg/s') + _ranged('specific force', force, 'm/s^2', least=0.5)
     for k, axis in enumerate(AXES):
@@ -234,7 +234,7 @@ def _variables(blocks, joint_names):
     return found + _ranged('time since motion', np.where(np.isfinite(last), np.minimum(blocks.time - last, 1e3), 1e3), 's')
 
 
-def _before_rest(blocks, name, rate):
+def _before_rest(name, rate):
     """Return whether a joint came to a rest from one side or the other."""
     moving = np.abs(rate) > 0.5 * DEG
     side = np.where(moving, np.sign(rate), 0.0)
