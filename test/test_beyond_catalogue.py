@@ -31,12 +31,12 @@ def looked(kind=None, seed=5):
     cause = Beyond(kind, seed) if kind else None
     recording = record(seed, None, through_bag=False, **({'cause': cause} if cause else {}))
     found = investigate(recording.windows, recording.table, recording.model)
-    return found, rest_blocks(found.used, recording.table, found.attempt, found.explained), cause
+    return found, rest_blocks(found.used, recording.table, found.attempt, explained=found.explained), cause
 
 
 def fits_of(found, blocks):
     space, used = found.attempt.space, found.attempt.search.used(found.named)
-    return BlockFits(blocks, space.prior_sd, space.prior_mean, used)
+    return BlockFits(blocks, used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
 
 
 def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
@@ -75,7 +75,7 @@ def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
     found, blocks, _ = looked()
     for sensor in blocks:
         assert propose(blocks[sensor], found.attempt, fits_of(found, blocks[sensor])) is None
-        assert not find_regimes(blocks[sensor], found.attempt, found.attempt.search.used([]), ('outer', 'middle', 'inner'))
+        assert not find_regimes(blocks[sensor], found.attempt, found.attempt.search.used([]), joint_names=('outer', 'middle', 'inner'))
 
 
 def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch):

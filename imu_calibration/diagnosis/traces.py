@@ -83,16 +83,17 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
                   {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
 
 
-def all_samples(windows):
+def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
     """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
     motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
                            for w, s, n in zip(windows, starts, lengths)])
-    if any(w.temperature_c is None for w in windows):
+    known = [(w.temperature_c, n) for w, n in zip(windows, lengths) if w.temperature_c is not None]
+    if len(known) < len(windows):
         return motion, None, rows
-    parts = [w.temperature_c if n == len(w.time) else np.full(n, w.temperature_c.mean()) for w, n in zip(windows, lengths)]
+    parts = [warm if n == len(warm) else np.full(n, warm.mean()) for warm, n in known]
     return motion, np.concatenate(parts), rows
 
 

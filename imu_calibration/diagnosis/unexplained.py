@@ -47,7 +47,7 @@ class Unexplained:
     axes: tuple = ()
     """Axes of the sensor that carry it, the strongest first."""
     regimes: tuple = ()
-    """Conditions under which it appears (`beyond.regimes.Regime`), at most one for each axis."""
+    """Conditions under which it appears (`beyond.regimes.RestRegime`), at most one for each axis."""
     proposal: Any = None
     """Formula that it follows (`beyond.proposals.Proposal`), or None."""
 

@@ -50,8 +50,8 @@ def _beyond(diagnosis):
     """Return where rests sit and what formulas they follow, and what may be done with these."""
     lines = [line[0].upper() + line[1:] + '.' for sensor, rest in diagnosis.unexplained.items() for line in beyond_lines(sensor, rest)]
     if proposed_effects(diagnosis):
-        lines.append('extended.yaml holds the model with the formula in it; take it where another recording confirms it: imu_calibration '
-                     'check, or diagnose with --effects extended.yaml.')
+        lines.append('extended.yaml holds the model with the formula in it; take it where another recording confirms it: check it '
+                     'there, or give it to another diagnosis as the file of effects.')
     return lines
 
 

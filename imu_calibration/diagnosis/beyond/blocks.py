@@ -55,12 +55,12 @@ class RestBlocks:
         counts = np.diff(np.append(self.starts, len(rows)))
         return np.add.reduceat(rows, self.starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
-    def whitener(self, select: np.ndarray) -> 'Whitener':
+    def whitener(self, select: np.ndarray) -> 'BlockWhitener':
         """Return what makes the blocks `select` (mask) independent, of unit variance."""
-        return Whitener(self, select)
+        return BlockWhitener(self, select)
 
 
-class Whitener:
+class BlockWhitener:
     """Makes rows of some blocks independent: white noise of each block and a bias that moves."""
 
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
@@ -77,7 +77,7 @@ class Whitener:
         return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
 
 
-def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, explained: Explained) -> dict[str, RestBlocks]:
+def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: Explained) -> dict[str, RestBlocks]:
     """
     Return sensor -> RestBlocks of the windows that an attempt reduced.
 

@@ -17,7 +17,7 @@ LEAST_OF_AXIS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BlockFit:
     """A model and further columns, fitted to the windows that choose."""
 
     amplitudes: np.ndarray
@@ -38,15 +38,15 @@ class Fit:
 class BlockFits:
     """Fits of the blocks of one sensor, whitened once."""
 
-    def __init__(self, blocks: RestBlocks, prior_sd: np.ndarray, prior_mean: np.ndarray, used: Sequence[int]):
+    def __init__(self, blocks: RestBlocks, used: Sequence[int], *, prior_sd: np.ndarray, prior_mean: np.ndarray):
         self.blocks, self.used, self._prior = blocks, frozenset(used), (prior_sd, prior_mean)
         self._white = [blocks.whitener(~blocks.locked), blocks.whitener(blocks.locked)]
         self._design = [[white(part) / white.scale[axis] for axis, part in enumerate(blocks.design)] for white in self._white]
         self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
-    def fit(self, columns: np.ndarray | None = None, *, more: Sequence[int] = (), half: int | None = None) -> Fit:
+    def fit(self, columns: np.ndarray | None = None, *, more: Sequence[int] = (), half: int | None = None) -> BlockFit:
         """
-        Return the Fit of the model with further columns.
+        Return the BlockFit of the model with further columns.
 
         Parameters
         ----------
@@ -73,7 +73,7 @@ class BlockFits:
             misfit = max(float(left @ left) / max(len(left) - len(values), 1), 1.0)
             amplitudes[:, axis], sds[:, axis] = values[len(at):], np.sqrt(misfit * np.diag(covariance)[len(at):])
             rests.append(locked[:, -1] - locked[:, :-1] @ values)
-        return Fit(amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked])
+        return BlockFit(amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked])
 
     def axes(self) -> tuple[str, ...]:
         """Return the axes that carry what the model leaves, the strongest first: in the windows that choose, in plain squares."""
@@ -102,12 +102,12 @@ class BlockFits:
         return np.concatenate([design[:, at], *further, design[:, -1:]], axis=1)
 
 
-def share_removed(before: Fit, after: Fit) -> float:
+def share_removed(before: BlockFit, after: BlockFit) -> float:
     """Return the share of the locked blocks' excess that a fit removes."""
     return 1.0 - max(after.excess, 0.0) / before.excess if before.excess > 0 else 0.0
 
 
-def share_interval(before: Fit, after: Fit, rng: np.random.Generator) -> tuple[float, float]:
+def share_interval(before: BlockFit, after: BlockFit, rng: np.random.Generator) -> tuple[float, float]:
     """Return the 95 % interval of `share_removed`, by resampling locked windows."""
     windows = np.unique(before.window)
     sums = np.array([[(fit.rest[before.window == w]**2 - 1.0).sum() for w in windows] for fit in (before, after)])

@@ -21,7 +21,7 @@ CHUNK = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class FormulaChoice:
     """One formula with what speaks for it."""
 
     formula: Formula
@@ -89,7 +89,7 @@ class FormulaSearch:
         dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
         return max(sum(float(rest @ rest) for rest in self._rest) / dof, 1.0)
 
-    def best(self) -> Choice | None:
+    def best(self) -> FormulaChoice | None:
         """Return the simplest of the likeliest formulas, or None where none is significant."""
         gains, counts = self._gains()
         price = 2.0 * counts
@@ -102,14 +102,14 @@ class FormulaSearch:
         left = max((sum(float(rest @ rest) for rest in self._rest) - gains[likeliest]) / dof, 1.0)
         near = [k for k in order[:200] if (gains - price)[likeliest] - (gains - price)[k] < 2 * TIE * left and counts[k]]
         chosen = min(near, key=lambda k: (self.formulas[k].complexity, price[k] - gains[k]))
-        return Choice(self.formulas[chosen], self.columns_of(self.formulas[chosen]), p_value,
+        return FormulaChoice(self.formulas[chosen], self.columns_of(self.formulas[chosen]), p_value,
                       tuple(self.formulas[k] for k in near if k != chosen))
 
     def columns_of(self, formula: Formula) -> np.ndarray:
         """Return the means of a formula's columns, shape (b, k, 3)."""
         return np.stack([self.means[:, self._at(column)] for column in formula.columns], axis=1)
 
-    def take(self, choice: Choice) -> None:
+    def take(self, choice: FormulaChoice) -> None:
         """Project a choice out, so that the next is asked beside it."""
         for axis in range(3):
             columns = self._free[axis][:, [self._at(column)[axis] for column in choice.formula.columns]]

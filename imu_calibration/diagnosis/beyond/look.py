@@ -29,14 +29,14 @@ def look_beyond(found: Investigation, table: Table, rests: dict[str, Unexplained
         Sensor -> Unexplained.
 
     """
-    blocks, used = rest_blocks(found.used, table, found.attempt, found.explained), found.attempt.search.used(found.named)
+    blocks, used = rest_blocks(found.used, table, found.attempt, explained=found.explained), found.attempt.search.used(found.named)
     looked = dict(rests)
     for sensor, rest in rests.items():
-        fits = BlockFits(blocks[sensor], found.attempt.space.prior_sd, found.attempt.space.prior_mean, used)
+        fits = BlockFits(blocks[sensor], used, prior_sd=found.attempt.space.prior_sd, prior_mean=found.attempt.space.prior_mean)
         # What changes within moving windows passes for their noise; a formula that takes it away shows that it is none.
         proposal = propose(blocks[sensor], found.attempt, fits) if rest.significant or fits.sigma > CLEAR else None
         if rest.significant or proposal is not None:
-            regimes = find_regimes(blocks[sensor], found.attempt, used, table.joint_names)
+            regimes = find_regimes(blocks[sensor], found.attempt, used, joint_names=table.joint_names)
             first = [next((regime for regime in regimes if regime.axis == axis), None) for axis in AXES]
             looked[sensor] = replace(rest, regimes=tuple(regime for regime in first if regime is not None), proposal=proposal,
                                      axes=fits.axes() if proposal is None else proposal.axes)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.diagnosis.beyond.blocks import RestBlocks
-from imu_calibration.diagnosis.beyond.fitting import BlockFits, Fit, share_interval, share_removed
-from imu_calibration.diagnosis.beyond.formulas import Choice, FormulaSearch
+from imu_calibration.diagnosis.beyond.fitting import BlockFit, BlockFits, share_interval, share_removed
+from imu_calibration.diagnosis.beyond.formulas import FormulaChoice, FormulaSearch
 from imu_calibration.diagnosis.beyond.grammar import Formula, grammar
 from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
 from imu_calibration.effects.term import term
@@ -99,7 +99,7 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
     plain = fits.fit()
     if plain.excess <= 0:
         return None
-    choices: list[Choice] = []
+    choices: list[FormulaChoice] = []
     share = 0.0
     while len(choices) < MOST_TERMS:
         found = search.best()
@@ -224,7 +224,7 @@ def _motion(effects):
     return '; '.join(dict.fromkeys(texts[name] for effect in effects for name in effect.motion[:1] if name in texts))
 
 
-def _nearest(fits: BlockFits, plain: Fit, attempt: Attempt) -> tuple[str, float] | None:
+def _nearest(fits: BlockFits, plain: BlockFit, attempt: Attempt) -> tuple[str, float] | None:
     """Return (effect, share removed) of what comes nearest in the catalogue."""
     best: tuple[str, float] | None = None
     for question in attempt.questions:

@@ -25,7 +25,7 @@ TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Regime:
+class RestRegime:
     """One condition under which the rest of one axis appears."""
 
     sensor: str
@@ -72,7 +72,7 @@ class _Variable:
         return int(self.bins.max()) + 1
 
 
-def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], joint_names: Sequence[str]) -> list[Regime]:
+def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str]) -> list[RestRegime]:
     """
     Return the regimes of a sensor's axes, the clearest of each axis first.
 
@@ -108,7 +108,7 @@ def _of_variable(blocks, axis, rows, prior, variable, white):
 
 
 def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
-    """Return the Regime of a range of bins, tested on the windows that it was not found on, or None where it is too much or too little of them."""
+    """Return the RestRegime of a range of bins, tested on the windows that it was not found on, or None where it is too much or too little of them."""
     training, chosen = blocks.window % 2 == 0, np.isin(variable.bins, best)
     inside, outside = ~training & chosen, ~training & ~chosen
     windows = [len(np.unique(blocks.window[part])) for part in (inside, outside)]
@@ -124,7 +124,7 @@ def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
         share, p_value = _tested_scatter(left, inside, outside, windows)
         cost = sum(_cost(float((left[part]**2).sum()), part.sum()) for part in (inside, outside))
     bounds = None if variable.edges is None else (float(variable.edges[best[0]]), float(variable.edges[best[-1] + 1]))
-    return Regime(blocks.sensor, AXES[axis], variable.name, variable.words(best) + (', by another offset' if offset else ''), share, p_value, chosen,
+    return RestRegime(blocks.sensor, AXES[axis], variable.name, variable.words(best) + (', by another offset' if offset else ''), share, p_value, chosen,
                   blocks.time, offset, float(cost), bounds)
 
 
