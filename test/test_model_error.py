@@ -11,7 +11,7 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.model_error import LEAST_BLOCKS
+from imu_calibration.estimation.model_error import LEAST_BLOCKS, NO_BIAS
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.reference.table import Table
@@ -148,3 +148,12 @@ def test_accumulators_of_one_recording_share_its_memory(windows, monkeypatch):
     assert len(shared.rows) <= 5
     assert shared.copy().share == restrict(shared, MODEL, MODEL).share == 8
     assert sum(shared.windows.values()) == len(windows)
+
+
+def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fast_to_be_one():
+    """A flexible mount is even in the attitude: the mean of what it adds is as large as its scatter, which the noise takes for a process of 6 s here."""
+    found = calibrated(make_pair('flexible_mount', 9313).first)
+    noise, part = found.solution.noise['accelerometer'], found.solution.model.slices['accelerometer', 'bias']
+    assert any(process.time < NO_BIAS and process.sd > 2 * noise.offset_sd for process in noise.bias_processes)
+    error = (found.solution.values[part] - found.truth['accelerometer'].bias) / found.solution.sd[part]
+    assert np.abs(error).max() < 2.0

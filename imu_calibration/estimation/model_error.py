@@ -28,6 +28,8 @@ CHANCE = 0.01
 """Chance of a drift for each sensor, and of misfit for each, in a recording without."""
 UNSEEN = 1.5
 """Misfit in excess of noise is taken larger by this factor: what repeats in every block shows in none."""
+NO_BIAS = 30.0
+"""Biases wander with longer correlation times than this, s."""
 SEEN = 1e-6
 """Share of a parameter's variance that must come from the recording."""
 
@@ -72,8 +74,13 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     found, misfits = errors_of_waves(waves, len(values), groups={sensor: [system.model.slices[e.key] for e in system.model.effects if e.sensor == sensor]
                                                                 for sensor in sensors})
     if 'accelerometer' in misfits:   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
-        found.added_variance[system.model.part('accelerometer', Role.OFFSET)] += noises['accelerometer'].offset_sd**2
+        found.added_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN**2 * _scatter_of_means(noises['accelerometer'])
     return found
+
+
+def _scatter_of_means(noise):
+    """Return the variance by which means of windows differ, as offsets or as a bias too fast to be one."""
+    return noise.offset_sd**2 + sum(process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS)
 
 
 def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[slice]]) -> tuple[ModelError, set[str]]:
