@@ -1,8 +1,12 @@
 """Several recordings of one IMU in one system: a bias of its own for each when the data ask for it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+import imu_calibration
+from imu_calibration.calibration.by_evidence import _named_elsewhere
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
@@ -16,6 +20,9 @@ from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+
+from worlds.misfit_worlds import make_pair
+from worlds.physics import make_session
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
                                        {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -101,3 +108,23 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     biases = np.concatenate([np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS])
     assert 0.6 < square[:, biases].mean() < 1.5
     assert 0.85 < np.delete(square, biases, axis=1).mean() < 1.15
+
+
+@pytest.mark.slow
+def test_what_a_smaller_recording_shows_is_taken_in():
+    """Long rests show no delay; two minutes of motion with the same IMU and a driver that is 12 ms late do."""
+    pair = make_pair('driver_lag', 31)
+    resting = make_session(63, noise='realistic', grade='industrial', profile='static_only', unit=31)
+    table = Table.from_mapping(pair.table)
+    found = imu_calibration.calibrate([pair.first.block, resting.block], table)
+    assert 'time_offset' in found.calibration.statistics['added']
+    assert float(found.calibration.value('reference', 'time_offset')) == pytest.approx(0.012, abs=1e-3)
+    sizes = [sum(found.result.gathered.accumulator.samples[kind] for kind in kinds) for kinds in (('static',), ('spin', 'dynamic'))]
+    assert sizes[0] > sizes[1], 'the recording of rests is the largest'
+
+
+def test_what_other_recordings_name_comes_once_and_beside_what_the_largest_names():
+    def found(*named):
+        return SimpleNamespace(named=[SimpleNamespace(effect=SimpleNamespace(key=('gyroscope', name))) for name in named])
+    more = _named_elsewhere(found('a'), [found('a', 'b'), found('b', 'c')])
+    assert [question.effect.key[1] for question in more] == ['b', 'c']

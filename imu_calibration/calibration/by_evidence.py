@@ -57,19 +57,25 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         As `calibrate`.
 
     """
-    first = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names, keep_windows=True)
+    first = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names,
+                             keep_windows=not options.as_asked)
     solution, gathered, model = first
-    windows = gathered.spread.windows
-    if len(windows) < LEAST_WINDOWS:
+    parts = [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= LEAST_WINDOWS]
+    if not parts:
         return EvidentResult(conclude(*first, table=table, options=options, provenance=provenance), None)
-    found = investigate(windows, table, baseline_model(options, table, solution.model), progress=asking,
-                        bias_processes=options.bias_processes)
-    found = _without_faint(found, solution)
-    while added := _beyond(found, first[2]):
-        extended = replace(options, added=tuple((question.sensor, question.name) for question in added), point=_point(found))
+    baseline = baseline_model(options, table, solution.model)
+    found, *others = (investigate(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
+    found, more = _without_faint(found, solution), _named_elsewhere(found, others)
+    while added := _beyond((*found.named, *more), first[2]):
+        point = {name: value for each in (*others, found) for name, value in _point(each).items()}
+        extended = replace(options, added=tuple(question.effect.key for question in added), point=point)
         solution, gathered, model = solve_recordings(sources, table, extended, progress=progress, mapper=mapper, names=names)
+        sure = [question for question in more if not _is_faint(solution, question)]
+        if len(sure) < len(more):   # what may be a rival of what the largest names goes first
+            more = sure
+            continue
         found = _without_faint(found, solution)
-        if len(_beyond(found, first[2])) == len(added):
+        if len(_beyond((*found.named, *more), first[2])) == len(added):
             options = extended
             break
     else:
@@ -83,15 +89,28 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
 
 
-def _beyond(found, model):
+def _beyond(named, model):
     """Return the findings that a model lacks."""
-    return [question for question in found.named if (question.sensor, question.name) not in model.slices]
+    return [question for question in named if question.effect.key not in model.slices]
+
+
+def _is_faint(solution, question):
+    """Return whether an effect is in a solution and does not stand out there."""
+    return question.effect.key in solution.model.slices and not stands_out(solution, question)
 
 
 def _without_faint(found, solution):
     """Return the Investigation without findings that are in a solution and do not stand out there."""
-    faint = [question for question in found.named if (question.sensor, question.name) in solution.model.slices and not stands_out(solution, question)]
+    faint = [question for question in found.named if _is_faint(solution, question)]
     return replace(found, named=[question for question in found.named if question not in faint], denied=[*found.denied, *faint]) if faint else found
+
+
+def _named_elsewhere(found, others):
+    """Return what the search names in other recordings only, those of larger ones first."""
+    more = {}
+    for question in (question for other in others for question in other.named):
+        more.setdefault(question.effect.key, question)
+    return [question for key, question in more.items() if key not in {known.effect.key for known in found.named}]
 
 
 def stands_out(solution: Solution, question: Question) -> bool:

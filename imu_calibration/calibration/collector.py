@@ -78,7 +78,7 @@ class Collector:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
         self._store(window, reduced)
         if self.spread:
-            found.spread.add(window)
+            found.spreads[0].add(window)
         return reduced
 
     def _columns(self, _window):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, exit_code
@@ -70,7 +70,7 @@ class FleetStep:
 
     def _calibrated(self, unit):
         provenance = unit.provenance() if unit.provenance is not None else None
-        result = calibrate(unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None)
+        result = calibrate_by_evidence(unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None).result
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         if self.report is not None:
             texts['report.html'] = self.report(result)

@@ -13,6 +13,8 @@ from imu_calibration.estimation.window_statistics import WindowStatistics
 
 KEPT_SAMPLES = 200_000
 """Samples of moving windows kept for plots and for the autocorrelation of residuals."""
+MOST_ASKED = 4
+"""Recordings of which windows are kept to ask for effects."""
 KEPT_POSES = 2000
 """Static windows whose joint positions are kept."""
 
@@ -27,8 +29,8 @@ class Gathered:
     """The same windows dealt out, so that each part can be predicted from the others."""
     kept: list = field(default_factory=list)
     """Windows with all samples, as far as KEPT_SAMPLES reaches."""
-    spread: SpreadWindows = field(default_factory=SpreadWindows)
-    """Windows to ask for effects, of the recording with most samples; none where nobody asks."""
+    spreads: list[SpreadWindows] = field(default_factory=lambda: [SpreadWindows()])
+    """Windows to ask for effects, of each of the recordings with most samples, the largest first; none where nobody asks."""
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
     counts: dict = field(default_factory=dict)
@@ -74,7 +76,7 @@ def merge(parts: Iterable[Gathered]) -> Gathered:
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
         total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
-        total.spread = max(total.spread, part.spread, key=lambda spread: spread.n_samples)
+        total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[:MOST_ASKED]
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)

@@ -86,9 +86,9 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
         return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,
                 source in numbered]
     report = _percent(progress) if progress else None
-    calibrated = calibrate_by_evidence([source], table, options, provenance=provenance, asking=report, mapper=read)
+    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, asking=report, mapper=read)
     if calibrated.found is None:
-        raise too_few_windows(len(calibrated.result.gathered.spread.windows))
+        raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
     result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated=calibrated.result.solution)
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
     if report:

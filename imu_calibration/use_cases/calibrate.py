@@ -11,7 +11,6 @@ from typing import Unpack
 from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.calibrate import calibrate as calibrate_on_table
 from imu_calibration.calibration.check import check_on_table
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code
@@ -138,9 +137,8 @@ def _beside(result, proof):
 def _side_by_side(sources, table, options, recordings, jobs):
     """Calibrate with the table, recordings side by side; with several processes one bar counts the recordings."""
     names = [name_of(recording) for recording in recordings]
-    names = [name if names.count(name) == 1 else str(Path(recording)) for name, recording in zip(names, recordings, strict=True)]
+    names = [name if names.count(name) == 1 else f'recording {number}' if isinstance(recording, SampleBlock) else str(Path(recording))
+             for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)]
     with progress_bar('recordings', len(recordings) if jobs > 1 else 0, 'recordings') as advance:
         mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-        if options.as_asked:
-            return calibrate_on_table(sources, table, options, mapper=mapper, names=names)
         return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
