@@ -156,3 +156,14 @@ def test_a_slow_random_table_still_gets_a_plan():
     table = random_table(np.random.default_rng(5), 2, 1.0)
     plan = make_planner(table, noise=NOISE).plan(with_bound=False)
     assert plan.motions and np.all(np.diff(plan.ends) > 0)
+
+
+def test_by_hand_the_steps_are_planned_in_words_and_pictures(capsys, tmp_path):
+    out = tmp_path / 'out'
+    assert main(['plan', '--by-hand', '--output', str(out)]) == 0
+    document = yaml.safe_load((out / 'plan.yaml').read_text())
+    kinds = [motion['kind'] for motion in document['motions']]
+    # nine parameters of the norm of gravity want nine poses, nine of the gyroscope's matrix three turns at least
+    assert kinds.count('pose') >= 9 and kinds.count('turn') >= 3
+    assert document['missing'] == [] and '<svg' in (out / 'report.html').read_text()
+    assert 'hold it still' in capsys.readouterr().out

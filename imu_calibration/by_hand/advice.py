@@ -1,7 +1,8 @@
 """What to do next when a calibration by hand leaves a parameter weak: the pose or turn that would help most."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,6 +10,20 @@ from imu_calibration.by_hand.model import GYRO_MATRIX, HandModel, unpack
 from imu_calibration.calibration.coverage import DIRECTIONS
 from imu_calibration.effects.base import AXES
 from imu_calibration.reference.reference_motion import skew
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A pose or a turn that a person can do."""
+
+    rows: np.ndarray
+    """Equations that it adds, in standard deviations, shape (k, n_params)."""
+    words: str
+    """What to do."""
+    up: np.ndarray
+    """Direction of the sensor that points up, before a turn, unit vector."""
+    turn: str | None = None
+    """Axis of the sensor about which it is turned by half a turn; None: it is held still."""
 
 
 def missing_motion(model: HandModel, factor: np.ndarray, values: np.ndarray, *, statuses: Sequence[str], tolerances: np.ndarray,
@@ -37,14 +52,14 @@ def missing_motion(model: HandModel, factor: np.ndarray, values: np.ndarray, *, 
 
     """
     advice = []
-    groups = ((model.index_of('accelerometer'), _pose_candidates(model, values, pose_sd)),
-              (model.index_of('gyroscope'), _turn_candidates(model, turn_sd)))
+    groups = ((model.index_of('accelerometer'), pose_steps(model, values, pose_sd)),
+              (model.index_of('gyroscope'), turn_steps(model, turn_sd)))
     for index, candidates in groups:
         lacking = [k for k in index if statuses[k] != 'determined']
         if not lacking:
             continue
         before = _predicted(factor, model.priors, tolerances)
-        scores = [(_score(_predicted(np.vstack([factor, rows]), model.priors, tolerances)[lacking]), needs) for rows, needs in candidates]
+        scores = [(_score(_predicted(np.vstack([factor, step.rows]), model.priors, tolerances)[lacking]), step.words) for step in candidates]
         best = min(scores, key=lambda s: s[0])
         advice.append({'parameters': {model.param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
     return tuple(advice)
@@ -60,12 +75,13 @@ def _predicted(rows, priors, tolerances):
     return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
 
 
-def _pose_candidates(model, values, sd):
+def pose_steps(model: HandModel, values: np.ndarray, sd: float) -> Iterator[Step]:
+    """Yield the standard poses, each known to `sd` (m/s^2)."""
     bias, matrix, *_ = unpack(values)
     for up in DIRECTIONS:
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], time=np.zeros(1), temperature_c=np.full(1, model.model.temperature_ref_c))[1]
-        yield rows / sd, f'hold it still with {direction_words(up)} up'
+        yield Step(rows / sd, f'hold it still with {direction_words(up)} up', up)
 
 
 def direction_words(up: np.ndarray) -> str:
@@ -73,16 +89,16 @@ def direction_words(up: np.ndarray) -> str:
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
-def _turn_candidates(model, sd):
-    """Half turns about each axis held level, gravity first along either of the other two."""
+def turn_steps(model: HandModel, sd: float) -> Iterator[Step]:
+    """Yield half turns about each axis held level, gravity first along either of the other two, each known to `sd` (rad)."""
     for axis, first in itertools.permutations(range(3), 2):
         about, up = np.eye(3)[axis], np.eye(3)[first]
         carried = -up  # after half a turn about a level axis
         across = np.array([about, np.cross(about, up)])
         rows = np.zeros((2, model.size))
         rows[:, GYRO_MATRIX] = (across @ skew(carried) @ rotation_slopes(about)).reshape(2, 9)
-        yield rows / sd, (f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
-                          'still before and after')
+        yield Step(rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
+                   'still before and after', up, AXES[axis])
 
 
 def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:

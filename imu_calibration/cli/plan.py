@@ -7,7 +7,7 @@ from imu_calibration import files
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
 from imu_calibration.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.plan import plan, summary
+from imu_calibration.use_cases.plan import by_hand, hand_summary, plan, summary
 from imu_calibration.use_cases.progress import progress_bar
 from msg_adapters.storages import identifiers
 
@@ -23,6 +23,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--output', metavar='DIR', required=True,
                         help='folder for plan.yaml, trajectory.yaml, the bag trajectory and report.html')
     add_stand_arguments(parser, 'with limits: range, speed, acceleration')
+    parser.add_argument('--by-hand', action='store_true', help='without a table: poses and turns in words and pictures')
     parser.add_argument('--motion', choices=('any', 'yaw-only'), default='any',
                         help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
     parser.add_argument('--calibration', metavar='FILE', help='what is known already')
@@ -46,6 +47,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(options: Namespace) -> int:
     """Plan into a folder that can be written, print what it promises, return the exit code."""
+    if options.by_hand and options.motion == 'any':
+        return _run_by_hand(options)
     stand = _stand(options)
     with files.output_folder(options.output) as folder, progress_bar('planning', 100, 'percent') as advance:
         told = 0.0
@@ -59,6 +62,18 @@ def run(options: Namespace) -> int:
                     diagnosis=options.diagnosis, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made.plan, folder)
+    return made.exit_code
+
+
+def _run_by_hand(options):
+    with files.output_folder(options.output) as folder:
+        made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})
+        made.save(folder, report=not options.no_report)
+    for number, step in enumerate(made.plan.steps, start=1):
+        print(fill(f'{number:3d}  {step.words}', 96, subsequent_indent='     '))
+    for line in hand_summary(made.plan):
+        print(fill(line, 96, subsequent_indent='    '))
+    print(f'written: plan.yaml in {folder}')
     return made.exit_code
 
 

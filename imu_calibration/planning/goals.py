@@ -22,8 +22,8 @@ class Goal(Protocol):
     words: str
     """The causes to be told apart, if that is what is wanted."""
 
-    def left(self, covariance: np.ndarray) -> np.ndarray:
-        """Return how far covariances, shape (k, n, n), are from the goal, shape (k,); zero when it is reached."""
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """Return how far covariances, shape (k, n, n), their roots taken larger by `margin`, are from the goal, shape (k,); zero there."""
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the names of what is missing with one covariance, shape (n, n)."""
@@ -42,9 +42,9 @@ class WithinTolerances:
         asked = self.coordinates.asked
         return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
 
-    def left(self, covariance: np.ndarray) -> np.ndarray:
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """Return the sum of logarithms of what is in excess."""
-        return np.maximum(np.log(self.excess(covariance)), 0.0).sum(axis=1)
+        return np.maximum(np.log(margin * self.excess(covariance)), 0.0).sum(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the parameters outside their tolerance."""
@@ -102,9 +102,9 @@ class ToldApart:
             found[:, number] = np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
         return np.maximum(found, 1e-12)
 
-    def left(self, covariance: np.ndarray) -> np.ndarray:
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """Return half the sum of logarithms of what is lacking, the worst pair three times."""
-        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)), 0.0)
+        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance) / margin**2), 0.0)
         return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:

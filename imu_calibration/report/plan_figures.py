@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imu_calibration.by_hand.hand_plan import HandPlan
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
@@ -48,25 +49,35 @@ def _motion(figure, plan):
     axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
 
 
+def draw_steps_progress(plan: HandPlan) -> str:
+    """Return the same for the steps of a plan by hand."""
+    def paint(figure):
+        _fall(figure.subplots(), np.arange(len(plan.history)), plan.history, plan.param_names, label='poses and turns')
+    return draw('plan-progress', (8.6, 4.2), paint, label='Predicted standard deviations against steps')
+
+
 def _progress(figure, plan):
     axes = figure.subplots()
-    time = np.concatenate([[0.0], plan.ends])
     names = [name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted]
-    shown = set()
-    for name, values in zip(names, plan.history.T, strict=True):
-        sensor = name.split('.')[0]
-        colour = AXIS['x'] if sensor == SENSORS[0] else AXIS['z']
-        axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=None if sensor in shown else sensor)
-        shown.add(sensor)
-    worst = plan.history.max(axis=1) if plan.history.shape[1] else np.ones(len(time))
-    axes.plot(time, worst, color=GREY, lw=2.2, label='worst of all')
-    axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
-    axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
-    log_axis(axes.yaxis)
+    _fall(axes, np.concatenate([[0.0], plan.ends]), plan.history, names, label='time, s')
     if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
         axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
         axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
                       fontsize=8)
-    axes.set_xlabel('time, s')
+
+
+def _fall(axes, time, history, names, *, label):
+    """Draw a line for each parameter, the worst of all, and the tolerance."""
+    shown = set()
+    for name, values in zip(names, history.T, strict=True):
+        sensor = name.split('.')[0]
+        colour = AXIS['x'] if sensor == SENSORS[0] else AXIS['z']
+        axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=None if sensor in shown else sensor)
+        shown.add(sensor)
+    axes.plot(time, history.max(axis=1), color=GREY, lw=2.2, label='worst of all')
+    axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
+    axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
+    log_axis(axes.yaxis)
+    axes.set_xlabel(label)
     axes.set_ylabel('sd / tolerance')
     axes.legend(loc='upper right')

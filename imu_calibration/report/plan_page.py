@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.by_hand.hand_plan import HandPlan
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
+from imu_calibration.report.hand_plan_figure import draw_steps
 from imu_calibration.report.numbers import text
 from imu_calibration.report.page import render
-from imu_calibration.report.plan_figures import draw_motion, draw_progress
+from imu_calibration.report.plan_figures import draw_motion, draw_progress, draw_steps_progress
 from imu_calibration.units import for_people
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
@@ -20,17 +23,57 @@ SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: '
 
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one HTML page that needs nothing else; the same input gives the same bytes."""
-    count = int(plan.wanted.sum())
-    met = count - len(plan.missing)
-    bound = plan.lower_bound_seconds
-    tiles = [{'what': 'time', 'number': text(plan.seconds), 'unit': 's', 'before': '', 'note': f'{len(plan.motions)} motions'},
-             {'what': 'least time', 'number': text(bound) if np.isfinite(bound) else 'not worked out',
-              'unit': 's' if np.isfinite(bound) else '', 'before': '', 'note': 'no plan of these motions takes less'},
-             {'what': 'within tolerance', 'number': f'{met} of {count}', 'unit': '', 'before': '', 'note': 'parameters'}]
-    return render('plan.html', title='Plan of a calibration', word='good' if not plan.missing else 'weak',
-                  headline=f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', missing=plan.missing, tiles=tiles,
-                  facts=[(str(what).replace('_', ' '), value) for what, value in provenance.items()], kinds=_kinds(plan),
-                  motion=draw_motion(plan), progress=draw_progress(plan), rows=_rows(plan), groups=_groups(plan))
+    count, bound = int(plan.wanted.sum()), plan.lower_bound_seconds
+    met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
+    tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} motions'),
+             _tile('least time', text(bound), 's', 'no plan of these motions takes less') if np.isfinite(bound) else
+             _tile('least time', 'not worked out', '', ''),
+             _tile('within tolerance', f'{met} of {count}', '', 'parameters')]
+    sense = _kinds(plan)
+    if plan.missing:
+        sense = f'whatever these joints do within their limits, this stays out of reach: {", ".join(plan.missing)}'
+    return _page(plan.model, {name: k for k, name in enumerate(plan.model.param_names) if plan.wanted[k]}, plan.sd, plan.tolerances,
+                 word='good' if not plan.missing else 'weak', sense=sense, tiles=tiles, facts=_facts(provenance), motion=draw_motion(plan),
+                 headline=f'{plan.told_apart} told apart after {text(plan.seconds)} s' if plan.told_apart and not plan.missing else
+                 f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', caption=CAPTION, reading=READING,
+                 count='until, s', progress=draw_progress(plan), rows=_rows(plan))
+
+
+def hand_plan_report(plan: HandPlan, model: SensorModel, provenance: dict[str, Any]) -> str:
+    """Return the report of a plan for hands, in words and pictures."""
+    count, met = len(plan.param_names), len(plan.param_names) - len(plan.missing)
+    rows = [{'until': f'{number}', 'kind': 'turn' if step.turn else 'pose', 'words': step.words}
+            for number, step in enumerate(plan.steps, start=1)]
+    sense = f'no pose and no turn by hand brings these within their tolerance: {", ".join(plan.missing)}' if plan.missing else \
+        'do the steps in this order; between any two of them move as you like'
+    return _page(model, {name: k for k, name in enumerate(plan.param_names)}, plan.sd, plan.tolerances,
+                 word='good' if not plan.missing else 'weak', sense=sense, facts=_facts(provenance),
+                 tiles=[_tile('time', text(plan.seconds), 's', f'{len(plan.steps)} poses and turns'),
+                        _tile('within tolerance', f'{met} of {count}', '', 'parameters')],
+                 headline=f'{met} of {count} parameters within tolerance after {len(plan.steps)} poses and turns',
+                 motion=draw_steps(plan.steps), reading=READING[:1], count='step',
+                 caption='The IMU as a box, x its longest side, z its thinnest; a turn starts from what is drawn.',
+                 progress=draw_steps_progress(plan), rows=rows)
+
+
+CAPTION = ('Positions of the joints; the band above tells the kind of motion. Angles of joints without end are drawn within one turn.')
+READING = ('The standard deviations are those that a calibration of this motion will report, from the same columns, windows and noise. The '
+           'biases wander as the grade or the noise file says: that is why long rests are rare and returns are not.',
+           'The least time is a lower bound: information is counted as if every window were free of what the others say of the biases, and '
+           'motions as if they could be done a fraction of a time and in any place without going there. No plan made of the same motions '
+           'is shorter.')
+
+
+def _page(model, places, sd, tolerances, **content):
+    return render('plan.html', title='Plan of a calibration', groups=_groups(model, places, sd, tolerances), **content)
+
+
+def _tile(what, number, unit, note):
+    return {'what': what, 'number': number, 'unit': unit, 'before': '', 'note': note}
+
+
+def _facts(provenance):
+    return [(str(what).replace('_', ' '), value) for what, value in provenance.items()]
 
 
 def _kinds(plan):
@@ -43,16 +86,16 @@ def _rows(plan):
             for motion, end in zip(plan.motions, plan.ends, strict=True)]
 
 
-def _groups(plan):
+def _groups(model, places, sd, tolerances):
     """Return for each effect what is predicted of its parameters, in units that people read."""
     groups = []
-    for effect in plan.model.effects:
-        part = plan.model.slices[effect.key]
-        if plan.wanted[part].any():
-            factor, unit = for_people(effect.unit)
-            rows = [{'name': name, 'component': name.split('.')[-1], 'sd': text(factor * sd), 'tolerance': text(factor * tolerance),
-                     'share': text(sd / tolerance, 2), 'bar': min(100, round(100 * float(sd / tolerance))),
-                     'status': 'determined' if sd <= tolerance * (1 + 1e-6) else 'weak'}
-                    for name, sd, tolerance in zip(plan.model.param_names[part], plan.sd[part], plan.tolerances[part], strict=True)]
+    for effect in model.effects:
+        names = [name for name in effect.param_names() if name in places]
+        factor, unit = for_people(effect.unit)
+        rows = [{'name': name, 'component': name.split('.')[-1], 'sd': text(factor * sd[places[name]]),
+                 'tolerance': text(factor * tolerances[places[name]]), 'share': text(sd[places[name]] / tolerances[places[name]], 2),
+                 'bar': min(100, round(100 * float(sd[places[name]] / tolerances[places[name]]))),
+                 'status': 'determined' if sd[places[name]] <= tolerances[places[name]] * (1 + 1e-6) else 'weak'} for name in names]
+        if rows:
             groups.append({'title': f'{effect.sensor}: {effect.name}', 'unit': unit, 'rows': rows})
     return groups

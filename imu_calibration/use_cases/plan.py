@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 
 from imu_calibration import documents, files
+from imu_calibration.by_hand.hand_plan import HandPlan, hand_plan_to_mapping, plan_by_hand
+from imu_calibration.by_hand.model import HandModel
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.named_models import parse_effects
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.noise import noise_of_figures, noise_of_grade
@@ -72,12 +78,13 @@ class Planned:
         from msg_adapters.write import write_trajectories
         place = files.make_folder(folder)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
+        page = self.report if report else ''
+        if self.plan.motions and bag:  # first, since it refuses where there is one already
+            write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
-            files.write_text(place / 'report.html', self.report)
+            files.write_text(place / 'report.html', page)
         if self.plan.motions:
             files.write_text(place / 'trajectory.yaml', documents.to_text(trajectory_to_mapping(self.plan.points)))
-            if bag:
-                write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         files.write_text(place / 'plan.yaml', text)
 
     def _messages(self):
@@ -126,9 +133,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
 
     """
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
-    if grade not in GRADES:
-        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
-    noise = noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
+    noise = _noise(options, grade, imu_rate)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     causes = tuple(separate) or (files.read_mapping(diagnosis, 'diagnosis', class_in) if diagnosis else ())
     if causes:
@@ -144,6 +149,77 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
     return Planned(planner.plan(progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedByHand:
+    """Poses and turns of a hand: prints what they promise, saves plan.yaml and report.html."""
+
+    plan: HandPlan
+    """Steps, predicted standard deviations, time."""
+    model: HandModel
+    """What is to be determined."""
+    provenance: dict[str, Any]
+    """Options that it was made with."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 when every parameter comes within its tolerance, else 3."""
+        return 3 if self.plan.missing else 0
+
+    @cached_property
+    def report(self) -> str:
+        """The report as one HTML page."""
+        from imu_calibration.report.plan_page import hand_plan_report
+        return hand_plan_report(self.plan, self.model.model, self.provenance)
+
+    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
+        """Write plan.yaml and, when wanted, report.html."""
+        place = files.make_folder(folder)
+        if report:
+            files.write_text(place / 'report.html', self.report)
+        files.write_text(place / 'plan.yaml', documents.to_text(hand_plan_to_mapping(self.plan, self.provenance)))
+
+    def __str__(self):
+        return '\n'.join(hand_summary(self.plan))
+
+
+def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: Any) -> PlannedByHand:
+    """
+    Plan the poses and turns of a calibration without a table.
+
+    Parameters
+    ----------
+    grade : str
+        Grade of the IMU, where no noise is given.
+    imu_rate : float
+        Samples of the IMU per second.
+    choices
+        tolerances, noise, accelerometer_model, gyroscope_model, catalogue, gravity: see `Choices`.
+
+    """
+    options = calibration_options(choices)
+    chosen = {sensor: parse_effects(sensor, getattr(options, f'{sensor}_model') or 'bias+matrix', catalogue=options.catalogue)
+              for sensor in SENSORS}
+    model = HandModel(SensorModel(**chosen, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
+    found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=_noise(options, grade, imu_rate), rate=imu_rate)
+    return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
+                                         'reference': 'gravity, by hand'})
+
+
+def hand_summary(made: HandPlan) -> list[str]:
+    """Return what a plan by hand promises, a line each."""
+    count = len(made.param_names)
+    lines = [f'{len(made.steps)} poses and turns, about {made.seconds:.0f} s; {count - len(made.missing)} of {count} parameters come '
+             'within their tolerance']
+    return lines + ([f'out of reach by hand: {", ".join(made.missing)}'] if made.missing else [])
+
+
+def _noise(options, grade, imu_rate):
+    """Return the noise that was given, or that of a grade."""
+    if grade not in GRADES:
+        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
+    return noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
 
 
 def class_in(document: Mapping[str, Any]) -> tuple[str, ...]:
