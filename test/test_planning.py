@@ -8,18 +8,24 @@ import pytest
 import yaml
 
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.cli.main import main
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.planning.belief import exact_information
+from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import DONE, make_planner
 from imu_calibration.planning.separation import make_separator
+from imu_calibration.planning.windows import WindowPredictor
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.motion_builder import Profile
+from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.use_cases.calibrate import calibrate
@@ -167,3 +173,19 @@ def test_by_hand_the_steps_are_planned_in_words_and_pictures(capsys, tmp_path):
     assert kinds.count('pose') >= 9 and kinds.count('turn') >= 3
     assert document['missing'] == [] and '<svg' in (out / 'report.html').read_text()
     assert 'hold it still' in capsys.readouterr().out
+
+
+def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
+    profile = make_profile('zhang_m')
+    table = Table.from_mapping({**profile.table, 'joints': [{**joint, 'speed_deg_s': 200.0 * 1.03, 'acceleration_deg_s2': 1000.0}
+                                                             for joint in profile.table['joints']]})
+    model = choose_model(CalibrationOptions(), table)
+    predictor = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0)
+    windows = predictor.predict([profile.segments])[0]
+    information = exact_information(windows, np.array([window.middle for window in windows]), NOISE)
+    sd = predictor.coordinates.sd(np.linalg.inv(predictor.coordinates.prior_information + information))
+    worst = {}
+    for effect in model.effects:
+        worst.setdefault(effect.sensor, {})[effect.name] = float(sd[model.slices[effect.key]].max())
+    plan = make_planner(table, noise=NOISE, tolerances=worst).plan(with_bound=False)
+    assert plan.missing == () and plan.seconds <= profile.duration

@@ -199,9 +199,9 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 
     """
     options = calibration_options(choices)
-    chosen = {sensor: parse_effects(sensor, getattr(options, f'{sensor}_model') or 'bias+matrix', catalogue=options.catalogue)
-              for sensor in SENSORS}
-    model = HandModel(SensorModel(**chosen, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
+    asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
+    accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or 'bias+matrix', catalogue=options.catalogue) for sensor in SENSORS)
+    model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
     found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=_noise(options, grade, imu_rate), rate=imu_rate)
     return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                                          'reference': 'gravity, by hand'})
