@@ -28,7 +28,7 @@ from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.goals import WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.search import LEAST_GAIN, Offers, exchanged, greedy
+from imu_calibration.planning.search import Offers, exchanged, greedy
 from imu_calibration.planning.situation import Situation
 from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
@@ -142,7 +142,7 @@ class Planner:
         place = self.situation.place_near(position)
         choice = Offers(self.situation, self._belief, place)
         number = choice.best if self._visited or self.known is not None else self.situation.first_rest(place)
-        if self._visited and choice.gain[number] < LEAST_GAIN and choice.left[number] > 0:
+        if self._visited and choice.hopeless(number):
             return NextMotion(None, STUCK, missing=missing)
         self._belief.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)

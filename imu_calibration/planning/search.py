@@ -14,7 +14,7 @@ MOST_MOTIONS = 400
 FURTHER = 1.02
 """Factor on standard deviations when the belief thinks itself at the goal and the exact weights do not."""
 LEAST_GAIN = 2e-3
-"""A motion must lower the sum of logarithms of excess over tolerance by so much to be worth its while."""
+"""A motion must lower the sum of logarithms of excess over tolerance by so much to be worth it, near the goal by this share of it."""
 
 
 class Offers:
@@ -30,6 +30,11 @@ class Offers:
         before = situation.goal.left(belief.known[None], margin)[0]
         self.left = situation.goal.left(after[:, :size, :size], margin)
         self.gain = np.where(self.possible, before - self.left, 0.0)
+        self.least = LEAST_GAIN * min(1.0, float(before))
+
+    def hopeless(self, number: int) -> bool:
+        """Return whether a motion brings next to nothing, and does not reach the goal either."""
+        return bool(self.gain[number] < self.least and self.left[number] > 0)
 
     @property
     def best(self) -> int:
@@ -63,7 +68,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         choice = Offers(situation, belief, place, margin=margin)
         must = len(chosen) < len(first)
         number = first[len(chosen)] if must else choice.best
-        if not must and choice.gain[number] < LEAST_GAIN and choice.left[number] > 0:
+        if not must and choice.hopeless(number):
             break
         belief.take(choice.information[number], float(choice.seconds[number]))
         chosen.append(number)
