@@ -13,7 +13,7 @@ from imu_calibration.reference.reference_motion import skew
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class HandStep:
     """A pose or a turn that a person can do."""
 
     rows: np.ndarray
@@ -75,13 +75,13 @@ def _predicted(rows, priors, tolerances):
     return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
 
 
-def pose_steps(model: HandModel, values: np.ndarray, sd: float) -> Iterator[Step]:
+def pose_steps(model: HandModel, values: np.ndarray, sd: float) -> Iterator[HandStep]:
     """Yield the standard poses, each known to `sd` (m/s^2)."""
     bias, matrix, *_ = unpack(values)
     for up in DIRECTIONS:
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], time=np.zeros(1), temperature_c=np.full(1, model.model.temperature_ref_c))[1]
-        yield Step(rows / sd, f'hold it still with {direction_words(up)} up', up)
+        yield HandStep(rows / sd, f'hold it still with {direction_words(up)} up', up)
 
 
 def direction_words(up: np.ndarray) -> str:
@@ -89,7 +89,7 @@ def direction_words(up: np.ndarray) -> str:
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
-def turn_steps(model: HandModel, sd: float) -> Iterator[Step]:
+def turn_steps(model: HandModel, sd: float) -> Iterator[HandStep]:
     """Yield half turns about each axis held level, gravity first along either of the other two, each known to `sd` (rad)."""
     for axis, first in itertools.permutations(range(3), 2):
         about, up = np.eye(3)[axis], np.eye(3)[first]
@@ -97,7 +97,7 @@ def turn_steps(model: HandModel, sd: float) -> Iterator[Step]:
         across = np.array([about, np.cross(about, up)])
         rows = np.zeros((2, model.size))
         rows[:, GYRO_MATRIX] = (across @ skew(carried) @ rotation_slopes(about)).reshape(2, 9)
-        yield Step(rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
+        yield HandStep(rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
                    'still before and after', up, AXES[axis])
 
 

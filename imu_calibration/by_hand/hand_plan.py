@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.by_hand.advice import Step, pose_steps, turn_steps
+from imu_calibration.by_hand.advice import HandStep, pose_steps, turn_steps
 from imu_calibration.by_hand.model import GYRO_BIAS, HandModel
 from imu_calibration.estimation.noise_model import NoiseModel
 
@@ -27,7 +27,7 @@ LEAST_GAIN = 5e-3
 class HandPlan:
     """Poses and turns one after the other, and what they promise."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[HandStep, ...]
     """In the order of time."""
     seconds: float
     """Time that a person takes, s."""
@@ -78,14 +78,14 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
     return HandPlan(tuple(chosen), total, model.param_names, history[-1] * tolerances, tolerances, np.array(history))
 
 
-def _candidates(model, noise, rate) -> Iterator[tuple[Step, float]]:
+def _candidates(model, noise, rate) -> Iterator[tuple[HandStep, float]]:
     samples = STILL * rate
     force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / samples + sum(p.sd**2 for p in noise[s].bias_processes)))
                          for s in ('accelerometer', 'gyroscope'))
     resting = np.zeros((3, model.size))
     resting[:, GYRO_BIAS] = np.eye(3) / rate_sd
     for step in pose_steps(model, model.nominal, force_sd):
-        yield Step(np.concatenate([step.rows, resting]), step.words, step.up), POSE_SECONDS
+        yield HandStep(np.concatenate([step.rows, resting]), step.words, step.up), POSE_SECONDS
     angle_sd = float(np.hypot(LEVEL_SD / np.sqrt(2), np.sqrt(noise['gyroscope'].low_variance.mean() * TURN_SECONDS / rate)))
     for step in turn_steps(model, angle_sd):
         yield step, TURN_SECONDS

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.by_hand.advice import Step
+from imu_calibration.by_hand.advice import HandStep
 from imu_calibration.reference.rotations import align
 from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, draw
 
@@ -18,7 +18,7 @@ VIEW = np.array([[-np.sqrt(0.5), np.sqrt(0.5), 0.0], [-0.35, -0.35, 0.87]])
 COLUMNS, MOST = 6, 36
 
 
-def draw_steps(steps: Sequence[Step]) -> str:
+def draw_steps(steps: Sequence[HandStep]) -> str:
     """Return the steps as SVG, numbered in the order of time."""
     shown = list(steps)[:MOST]
     rows = max(1, -(-len(shown) // COLUMNS))
