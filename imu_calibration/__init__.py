@@ -57,6 +57,7 @@ From the ground up; each package imports only what stands above it. The words ar
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
 `planning`        which motion next: the gain of motions per second, and the least time that any plan takes
+`driving`         motions one after the other, safely: what to send, whether the joints follow, when to stop and why
 `by_hand`         calibration without a table; the arm between two IMUs
 `exports`         a calibration in the words of other programs, and back; what each of them loses
 `diagnosis`       what the model gets wrong, and why

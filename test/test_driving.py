@@ -8,14 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.driving.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
 from imu_calibration.driving.path_watch import at_rest
+from imu_calibration.driving.separating import separator_of, with_suspect
 from imu_calibration.errors import InputError
+from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.reference.motion_limits import MotionLimits
+from imu_calibration.reference.table import Table
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
+from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 
 STEP = 0.01
@@ -286,3 +293,26 @@ def test_a_campaign_ends_when_the_time_is_over_or_motions_bring_nothing_any_more
     vain = carried_out(Campaign(OldHand(100, floor=8.0)))   # misfit, say, that no motion takes away
     assert vain[:PATIENCE + 1] == ['move'] * (PATIENCE + 1) and vain[-2] == 'diagnose' and vain[-1].startswith(IN_VAIN)
     assert carried_out(Campaign(OldHand(30)))[-1] == 'all within tolerance'   # what goes on halving is worth its while
+
+
+def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
+    table = Table.from_mapping({'joints': [{'name': name, 'axis': axis} for name, axis in (('outer', [0, 0, 1]), ('middle', [0, 1, 0]), ('inner', [1, 0, 0]))],
+                                'up': [0, 0, 1], 'gravity': 9.81})
+    model = choose_model(CalibrationOptions(), table)
+    values, sd = model.prior()
+    known = Calibration(model.at(values), values, np.diag((0.01 * sd)**2), (DETERMINED,) * len(values), 'imu_link', {}, provenance={})
+    sizes = {f'gyroscope.gyro_scale_asymmetry.{axis}': size for axis, size in zip('xyz', (2e-3, -2e-3, 2e-3), strict=True)}
+    wider = with_suspect(known, ('gyroscope', 'gyro_scale_asymmetry'), sizes)
+    part = wider.model.slices['gyroscope', 'gyro_scale_asymmetry']
+    np.testing.assert_array_equal(wider.values[part], [2e-3, -2e-3, 2e-3])
+    places = [wider.param_names.index(name) for name in known.param_names]
+    np.testing.assert_array_equal(wider.covariance[np.ix_(places, places)], known.covariance)
+    noise = noise_of_grade(GRADES['industrial'].noise, 100.0)
+    suspect = Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes)
+    separator, motions, position = separator_of(table, known, suspect, noise=noise), [], np.zeros(3)
+    while (step := separator.next_motion(position)).motion is not None and len(motions) < 40:
+        motions.append(step.motion)
+        position = step.motion.points(position).position[-1]
+    assert 0 < len(motions) < 40   # and it ends by itself
+    with pytest.raises(InputError, match="a cause must be an effect of the catalogue, got 'gremlins'"):
+        separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)

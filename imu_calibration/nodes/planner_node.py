@@ -26,8 +26,9 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
-from imu_calibration.driving.campaign import Campaign, CampaignSettings, Suspect
+from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
+from imu_calibration.driving.separating import separator_of
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
@@ -120,7 +121,13 @@ class PlannerNode(Node):
         noise = noise_of_grade(GRADES[self.settings.grade].noise, self.settings.imu_rate)
         planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate, options=self._options,
                                calibration=self._latest())
-        return Campaign(planner, self._campaign_settings)
+        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise))
+
+    def _make_separator(self, suspect: Suspect, noise: dict) -> MotionPlanner:
+        calibration = self._latest()
+        if calibration is None:
+            raise InputError('a calibration must be known before causes are told apart, none came; publish imu/calibration')
+        return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options)
 
     # What arrives.
 
