@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,6 +170,12 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
     question = found.named[0]
     assert stands_out(solution, question) and not stands_out(replace(solution, covariance=1e9 * solution.covariance), question)
+    part = solution.model.slices[question.sensor, question.name]
+    doubled = SimpleNamespace(model=SimpleNamespace(slices={(question.sensor, question.name): slice(0, 2)}), held=np.zeros(2, bool),
+                              values=np.full(2, solution.values[part.start]), covariance=np.full((2, 2), 1e-12))
+    monkeypatch.setattr(by_evidence, 'make_prior', lambda model: SimpleNamespace(mean=np.zeros(2)))
+    assert stands_out(doubled, question)   # a convention makes covariances of whole effects singular
+    monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     faint = imu.calibrate(late[0].block, late[1]).calibration
     assert 'time_offset' in faint.statistics['denied'] and 'added' not in faint.statistics and OFFSET not in faint.param_names

@@ -20,6 +20,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.extended_model import extended_solution
@@ -121,7 +122,9 @@ def stands_out(solution: Solution, question: Question) -> bool:
     if not len(at):
         return False
     far = (solution.values - make_prior(solution.model).mean)[at]
-    return bool(chi2.sf(far @ np.linalg.solve(solution.covariance[np.ix_(at, at)], far), len(at)) < FAMILY_WISE)
+    sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
+    known = sizes > SURE * sizes[-1]   # arms of three sensors add up to nothing by convention
+    return bool(chi2.sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
