@@ -60,13 +60,13 @@ def test_blocks_of_a_recording_that_hides_nothing_are_noise():
         assert abs(plain.excess) < 5 * np.sqrt(2 * plain.rest.size)
 
 
-@pytest.mark.parametrize('kind, text', [('anisoelasticity', 'f_'), ('gyro_cubic', '** 3'), ('stray_field_accel', 'sin(')])
+@pytest.mark.parametrize('kind, text', [('scale_under_load', 'f_'), ('gyro_cubic', '** 3'), ('stray_field_accel', 'sin(')])
 def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
     found, blocks, cause = looked(kind)
     proposal = propose(blocks[cause.kind.sensor], found.attempt, fits_of(found, blocks[cause.kind.sensor]))
     assert text in proposal.columns[0] and proposal.family == cause.kind.family and set(proposal.axes) == cause.axes
     assert proposal.share > 0.95 and proposal.ci95[0] > 0.9 and proposal.reduction > 0.8
-    assert proposal.nearest[1] < 0.5 and 'none of the catalogue' in proposal.sentence
+    assert (proposal.nearest[1] < 0.5 or 'speak against it' in proposal.sentence) and 'none of the catalogue' in proposal.sentence
     size = sum(proposal.sizes)
     assert size == pytest.approx(np.sqrt((cause.signal**2).sum(axis=1).mean()), rel=0.6), 'as large as what was hidden'
 
@@ -79,20 +79,20 @@ def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
 
 
 def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch):
-    found, blocks, cause = looked('anisoelasticity')
+    found, blocks, cause = looked('scale_under_load')
     fits = fits_of(found, blocks['gyroscope'])
     monkeypatch.setattr(proposals, 'share_removed', lambda before, after: 0.5)
     assert propose(blocks['gyroscope'], found.attempt, fits) is None
 
 
 def test_halves_that_disagree_make_no_formula(monkeypatch):
-    found, blocks, cause = looked('anisoelasticity')
+    found, blocks, cause = looked('scale_under_load')
     sensor = blocks['gyroscope']
     late = sensor.time > np.median(sensor.time)
     turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
     upset = type(sensor)(**{**sensor.__dict__, 'design': turned})
     told = propose(upset, found.attempt, fits_of(found, upset))
-    assert told is None or 'f_x * f_z' not in told.columns
+    assert told is None or 'f_z * w' not in str(told.columns)
 
 
 def test_shares_are_of_the_locked_windows():
@@ -113,16 +113,31 @@ def test_the_place_is_found(kind):
 
 
 def test_it_is_said_and_written():
-    cause = Beyond('anisoelasticity', 5)
+    cause = Beyond('scale_under_load', 5)
     recording = record(5, None, through_bag=False, cause=cause)
     found = diagnose(recording.windows, recording.table, recording.model)
     lines = '\n'.join(diagnosis_lines(found))
-    assert all(part in lines for part in ('formula: ', 'on windows held out', 'f_x * f_z', 'to confirm it:', f'axis {min(cause.axes)}'))
+    assert all(part in lines for part in ('formula: ', 'on windows held out', 'f_z * w', 'to confirm it:', f'axis {min(cause.axes)}'))
+
+
+@pytest.mark.parametrize('arcmin_per_g, seed', [(2.0, 1), (0.5, 3)])
+def test_a_mount_that_bends_is_named_in_both_sensors(arcmin_per_g, seed):
+    recording = record(seed, {'load_compliance': arcmin_per_g * 2.97e-5 * np.random.default_rng(seed).normal(size=(3, 3))}, through_bag=False)
+    found = diagnose(recording.windows, recording.table, recording.model)
+    assert [finding.effect for finding in found.findings] == ['load_compliance']
+    assert not any(rest.significant for rest in found.unexplained.values())
+
+
+def test_a_cause_of_the_table_that_spoils_the_other_sensor_is_no_cause(monkeypatch):
+    found, blocks, cause = looked('scale_under_load', 6)
+    search = found.attempt.search
+    question = next(q for q in found.attempt.questions if q.name == 'load_compliance')
+    assert not search.shows_alike([question], question) and not found.named
 
 
 @pytest.mark.slow
 def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(tmp_path, capsys):
-    session = physics.make_session(5, None, 'white', cause=Beyond('anisoelasticity', 5))
+    session = physics.make_session(5, None, 'white', cause=Beyond('scale_under_load', 5))
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration import documents
     (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))

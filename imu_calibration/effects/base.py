@@ -90,6 +90,8 @@ class Effect:
     """Its place in the sensor's equation."""
     groups: tuple = ()
     """The ColumnGroups that its coefficients multiply."""
+    group_sensors: tuple = ()
+    """Sensor that each of the groups belongs to, where they differ; empty: all sensors that it acts on."""
     coefficients: Callable | None = None
     """``coefficients(values, point) -> {group name: (n_columns, 3)}`` with `values` a dict effect name -> array of the sensor."""
     warp: Callable | None = None
@@ -151,6 +153,10 @@ class Effect:
     def section(self) -> str:
         """Section of the document that lists it."""
         return 'reference' if self.in_reference else self.sensor
+
+    def groups_of(self, sensor: str) -> tuple:
+        """Return the groups that belong to a sensor."""
+        return tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor) if self.group_sensors else self.groups
 
     @property
     def relinearised(self) -> bool:

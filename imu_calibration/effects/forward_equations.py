@@ -31,7 +31,8 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
             total[layout.rows[WARP_LEVER + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
     elif effect.coefficients is not None:
         for group, block in effect.coefficients(of_sensor, layout.point).items():
-            total[layout.rows[group]] += block
+            if group in layout.rows:   # an effect on both sensors has groups of each
+                total[layout.rows[group]] += block
 
 
 def all_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, SHORT, Effect, Role
-from imu_calibration.effects.regressors import ATTITUDE
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import MATRIX, SENSORS, SHORT, Effect, Role
+from imu_calibration.effects.regressors import ATTITUDE, LOAD, PAIRS
 from imu_calibration.reference.axis_angles import with_axis_angles, with_axis_places
 from imu_calibration.reference.encoder import with_encoder_harmonics
 from imu_calibration.reference.joint import JointNames
@@ -15,6 +16,9 @@ from imu_calibration.reference.levelling import tilt
 
 LAGUERRE = np.polynomial.laguerre.laggauss(5)
 """Nodes and weights that turn an exponential lag into a weighted mean of delays: int e^-x f(t - tau x) dx."""
+EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
+"""Axes i, j, k of a cross product with their sign."""
+_PAIR = {pair: place for place, pair in enumerate(PAIRS)}
 ORDERS = (1, 2)
 """Harmonics per revolution of the encoder error."""
 
@@ -87,6 +91,22 @@ def _earth_known(table):
     return 'the reference holds the rotation of the Earth already, from latitude and azimuth', 'leave the azimuth out of the table description'
 
 
+def _bent(values, point):
+    """
+    Coefficients of a mount that turns by theta = K f with the force that it carries, to first order.
+
+    The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta / dt`` with df/dt = f x w where gravity is the load.
+    """
+    matrix, turn = values['matrix'].reshape(3, 3), values['load_compliance'].reshape(3, 3)
+    force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
+    for i, j, k, sign in EVEN_AND_ODD:
+        for m in range(3):
+            force[_PAIR[min(j, m), max(j, m)], i] += sign * turn[k, m]   # (f x theta)_i = f_j theta_k
+            rate[3 * m + j, i] += sign * turn[k, m]                       # (w x theta)_i = w_j theta_k
+            rate[3 * j + k, m] += sign * turn[m, i]                       # K (f x w): (f x w)_i = f_j w_k
+    return {LOAD['accelerometer'].name: force @ matrix.T, LOAD['gyroscope'].name: rate @ matrix.T}
+
+
 def _places_taken(table):
     """Return why the places of axes cannot be asked about: the axes of a turntable meet well enough."""
     if table.joint_error_m is not None:
@@ -136,9 +156,15 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         Effect(
             **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ORDERS), 2),
             components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
-            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
+            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc), or the axis sags with the weight, which no turn of this joint tells apart.',
             tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),),
             motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
+        Effect(
+            **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance', components=MATRIX, shape=(3, 3),
+            explanation='The mount bends with the load: the sensor turns a little with the force that it carries, which both sensors see.',
+            tolerance_reason='0.1 mrad at 1 g', prior_sd=1e-3 / STANDARD_GRAVITY,
+            plausible=(('bench', 3e-3 / STANDARD_GRAVITY, '10 arcmin per g of a slender bracket'),),
+            motion=('static_dense', 'two_axis'), groups=tuple(LOAD.values()), group_sensors=tuple(LOAD), coefficients=_bent, needs=('joints',)),
         Effect(
             name='time_offset', sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
             explanation='The IMU stamps are late against the joint stamps.',

@@ -25,12 +25,16 @@ SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
 THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({WARMTH})' for vi in v])
 TEMPERATURE = ColumnGroup('temperature', (WARMTH,))
+TEMPERATURE_SQUARED = ColumnGroup('temperature_squared', (f'({WARMTH}) ** 2',))
 LEVER = ColumnGroup('lever', (
     '-(w_y * w_y + w_z * w_z)', 'w_x * w_y - alpha_z', 'w_x * w_z + alpha_y',
     'w_x * w_y + alpha_z', '-(w_x * w_x + w_z * w_z)', 'w_y * w_z - alpha_x',
     'w_x * w_z - alpha_y', 'w_y * w_z + alpha_x', '-(w_x * w_x + w_y * w_y)'))
 """Entries of ``[alpha x] + [omega x]^2`` by rows (Zhang 2017, eq. 11)."""
 ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
+LOAD = {'accelerometer': ColumnGroup('load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PAIRS)),
+        'gyroscope': ColumnGroup('load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES))}
+"""What a mount that bends with load changes: force and rate are seen in a frame that turned with the force."""
 WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in SHORT.items()}
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.constants import DEG, MILLI_G, STANDARD_GRAVITY
 from imu_calibration.effects import regressors
-from imu_calibration.effects.base import MATRIX, PRODUCTS, SHORT, VECTOR, Effect, Role
+from imu_calibration.effects.base import AXES, MATRIX, PRODUCTS, SHORT, VECTOR, Effect, Role
 from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, Products
 
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
@@ -55,6 +55,14 @@ def _pair(sensor):
             plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
             groups=(regressors.TEMPERATURE,), coefficients=Amplitudes(f'{short}_thermal_bias', 'temperature')),
+        Effect(
+            name=f'{short}_thermal_bias_2', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K^2', against=('temperature',), smooth=True,
+            title=f'{short} thermal bias, second order',
+            explanation=f'The {sensor} bias bends with the temperature: it follows its square too.',
+            tolerance=0.01 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=small,
+            plausible=(('consumer', 0.1 * MILLI_G if accel else 2.5e-3 * DEG, 'as much as the first order over 20 K'),),
+            motion=('warm_up',), compensation='exact', needs=('temperature',),
+            groups=(regressors.TEMPERATURE_SQUARED,), coefficients=Amplitudes(f'{short}_thermal_bias_2', 'temperature_squared')),
         Effect(
             name=f'{short}_thermal_scale', sensor=sensor, components=VECTOR, shape=(3,), unit='1/K', against=('temperature',),
             explanation=f'The {sensor} scale factor follows the temperature.',
@@ -116,6 +124,13 @@ GYROSCOPE = _pair('gyroscope') + (
         tolerance=0.01 * DEG / STANDARD_GRAVITY, tolerance_reason='0.01 deg/s at 1 g', prior_sd=1.0 * DEG / STANDARD_GRAVITY,
         plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),), motion=('static_poses',),
         compensation='exact', groups=(regressors.TRUE_INPUT['accelerometer'],), coefficients=Amplitudes('gyro_g_sensitivity', 'force')),
+    Effect(
+        name='gyro_force_squared', sensor='gyroscope', components=tuple(f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')),
+        shape=(3, 6), unit='(rad/s)/(m/s^2)^2', against=('force',), title='response to the square of specific force',
+        explanation='The gyroscopes respond to squares and products of specific force: their elements yield more along one axis than along another.',
+        tolerance=0.01 * DEG / STANDARD_GRAVITY**2, tolerance_reason='0.01 deg/s at 1 g', prior_sd=0.2 * DEG / STANDARD_GRAVITY**2,
+        plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),), motion=('static_dense', 'centrifuge'),
+        compensation='exact', groups=(regressors.SQUARES['accelerometer'],), coefficients=Amplitudes('gyro_force_squared', 'force_squares')),
     Effect(
         name='gyro_rate_product', sensor='gyroscope', components=PRODUCTS, shape=(3, 3), unit='(rad/s)^-1', against=('rate',),
         explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',

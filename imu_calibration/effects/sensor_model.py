@@ -185,7 +185,7 @@ class SensorModel:
         if sensor not in self._layouts:
             groups, widths = {}, {}
             for effect in self.concerning(sensor):
-                for group in effect.groups:
+                for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
                         raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', which other columns are called; rename it")
                     widths[group.name] = group.width

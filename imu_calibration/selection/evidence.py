@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.scaled_solve import quadratic, solve_normal
+from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal
 from imu_calibration.selection.normal_matrices import mean_matrix, white_means, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
@@ -100,6 +100,12 @@ class WindowEvidence(Evidence):
         self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
         self._parts = [sum(part[s][number] for part in (self._means, self._within) for s in SENSORS) for number in numbers]
         self.total = sum(self._parts)
+
+    def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
+        """Return the covariance that one sensor alone, and what is known before, leave the parameters `used`."""
+        at = np.ix_(used, used)
+        information = sum((*self._means[sensor], *self._within[sensor]))[at] + np.diag(1 / self._prior['prior_sd'][list(used)]**2)
+        return inverse_normal(information)
 
     def normal(self, number: int | None = None) -> np.ndarray:
         """Return the normal matrix of the chosen windows, or of all but fold `number`."""

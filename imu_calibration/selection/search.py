@@ -5,6 +5,7 @@ from typing import Sequence
 
 import numpy as np
 
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 
@@ -88,8 +89,22 @@ class Search:
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
         if question.effect.unit == 'rad' and np.all(np.abs(value) < 0.5 * self.encoder_step):
             return False
+        if not self.shows_alike(chosen, question):
+            return False
         largest = question.effect.largest * (1.0 if question.effect.known_size else ABSURD)
         return bool(np.all(np.abs(value) - 3 * sd < largest))
+
+    def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether no sensor on which an effect acts is predicted worse with it.
+
+        A cause of the table that explains one sensor and spoils the other is a story of the one.
+        """
+        if question.sensor in SENSORS or len(question.effect.acts_on) < 2:
+            return True
+        rest = [q for q in chosen if q is not question]
+        before, after = (self.evidence.heldout_parts(self.used(some)) for some in (rest, chosen))
+        return all(sum(after[sensor]) - sum(before[sensor]) < 2 * LEAST_GAIN for sensor in question.effect.acts_on)
 
     def run(self) -> Sequence[Question]:
         """Return the chosen questions in the order in which they were found."""

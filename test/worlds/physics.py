@@ -10,6 +10,7 @@ import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
@@ -188,6 +189,8 @@ def _sense(world, triads, temperature_c, values, events, cause):
     accel, gyro = triads
     plate = [world.to_sensor(vector) for vector in (world.force_n, world.rate_n, world.alpha_n)]
     force_s, rate_s = cause.carried(world.time, *plate)
+    if 'load_compliance' in values:
+        force_s, rate_s = bent(world.time, force_s, rate_s, values['load_compliance'])
     same = not np.any(accel.arms)
     forces = [force_s] * 3 if same else [world.force_at(arm) + force_s - plate[0] for arm in accel.arms]
     rates = [rate_s] * 3
@@ -205,6 +208,13 @@ def _sense(world, triads, temperature_c, values, events, cause):
         outputs[0] -= values['second_warm_up'] * np.outer(np.expm1(-since / events['second_constant']), events['direction'])
     outputs = [out + more for out, more in zip(outputs, cause.added(world, temperature_c, force_s, rate_s, plate[2]))]
     return cause.delivered(world.time, outputs, rate_s)
+
+
+def bent(time, force_s, rate_s, compliance):
+    """Return force and rate in a sensor whose mount turns by the rotation vector ``compliance @ force``, exactly."""
+    turn = force_s @ np.asarray(compliance).T
+    back = Rotation.from_rotvec(turn).inv()
+    return back.apply(force_s), back.apply(rate_s) + np.gradient(turn, time, axis=0)
 
 
 def _set_limits(triads, outputs, values):

@@ -28,7 +28,8 @@ class Kind:
 class Scene:
     """What a cause may go by."""
 
-    def __init__(self, world, temperature_c, force_s, rate_s, alpha_s):
+    def __init__(self, world, temperature_c, force_s, rate_s, alpha_s, other):
+        self.other = other   # an axis that is not the one the cause acts on
         self.time, self.angle, self.world = world.time, world.joints, world
         self.force, self.rate, self.alpha = force_s, rate_s, alpha_s
         self.turn = np.gradient(world.joints, world.time, axis=0)
@@ -64,12 +65,6 @@ def _fast(scene, rng):
     return np.maximum(speed - np.quantile(speed, 0.85), 0.0)
 
 
-def _pair(scene, rng):
-    """Return the product of two components of force: the elements bend sideways under it."""
-    first = _axis(rng)
-    return scene.force[:, first] * scene.force[:, (first + 1) % 3]
-
-
 def _cogging(scene, rng):
     joint = int(rng.integers(scene.angle.shape[1]))
     return scene.turn[:, joint] * np.sin(int(rng.integers(3, 8)) * scene.angle[:, joint] + rng.uniform(0, 6))
@@ -90,16 +85,15 @@ def _of(*names):
 
 def _magnet(scene, rng):
     """Return the component along one axis of a field that stays with the room."""
-    field = rng.normal(size=3)
+    field = np.append(rng.normal(size=2), 0.0)   # along the vertical it would be a response to gravity
     return scene.world.to_sensor(np.broadcast_to(field, scene.force.shape))
 
 
 KINDS = {
-    'warm_cross_axis_force': Kind('accelerometer', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, _axis(r)]),
-    'warm_cross_axis_rate': Kind('gyroscope', _of('rate', 'temperature'), lambda s, r: s.warm * s.rate[:, _axis(r)]),
+    'warm_cross_axis_force': Kind('accelerometer', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, s.other]),
+    'warm_cross_axis_rate': Kind('gyroscope', _of('rate', 'temperature'), lambda s, r: s.warm * s.rate[:, s.other]),
     'warm_g_sensitivity': Kind('gyroscope', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, _axis(r)]),
-    'anisoelasticity': Kind('gyroscope', _of('force'), _pair),
-    'force_squared_in_gyro': Kind('gyroscope', _of('force'), _power('force', 2)),
+    'force_cubed_in_gyro': Kind('gyroscope', _of('force'), _power('force', 3)),
     'gyro_cubic': Kind('gyroscope', _of('rate'), _power('rate', 3)),
     'angular_acceleration_in_gyro': Kind('gyroscope', _of('angular acceleration'), _power('alpha', 1)),
     'scale_under_load': Kind('gyroscope', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]),
@@ -132,7 +126,8 @@ class Beyond(Cause):
 
     def added(self, world, temperature_c, force_s, rate_s, alpha_s):
         """Return the cause on the axes of its sensor; it remembers itself."""
-        signal = self.kind.signal(Scene(world, temperature_c, force_s, rate_s, alpha_s), np.random.default_rng([self.seed, 78]))
+        scene = Scene(world, temperature_c, force_s, rate_s, alpha_s, (self.axis + 1) % 3)
+        signal = self.kind.signal(scene, np.random.default_rng([self.seed, 78]))
         if signal.ndim == 1:
             signal = signal[:, None] * np.eye(3)[self.axis]
         self.signal = self.size * SIZE[self.kind.sensor] * signal / np.sqrt((signal**2).sum(axis=1).mean())

@@ -17,6 +17,8 @@ EFFECTS = {
     'accel_cross_product': (1e-3 / G, (3, 3)), 'accel_size_effect': (8e-3, (3, 3)), 'lever_arm': (10e-3, (3,)),
     'accel_thermal_bias': (0.3 * MG, (3,)), 'accel_thermal_scale': (3e-4, (3,)), 'accel_bias_drift': (2 * MG, None),
     'accel_saturation': (0.02, None), 'accel_bandwidth': (4e-3, None),
+    'accel_thermal_bias_2': (0.05 * MG, (3,)), 'gyro_thermal_bias_2': (2e-3 * DEG, (3,)), 'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
+    'load_compliance': (1 * ARCMIN / G, (3, 3)),
     'gyro_g_sensitivity': (0.02 * DEG / G, (3, 3)), 'gyro_rate_product': (1e-3, (3, 3)), 'gyro_quadratic': (1e-3, (3,)),
     'gyro_scale_asymmetry': (1e-3, (3,)), 'gyro_thermal_bias': (0.01 * DEG, (3,)), 'gyro_thermal_scale': (5e-4, (3,)),
     'gyro_bias_drift': (0.05 * DEG, None), 'gyro_saturation': (0.02, None), 'gyro_bandwidth': (4e-3, None),
@@ -71,13 +73,14 @@ def draw_imu(grade, values, arms, rng):
         triad.quadratic = values.get(short + '_quadratic', 0.0)
         triad.asymmetry = values.get(short + '_scale_asymmetry', 0.0)
         triad.thermal_bias = values.get(short + '_thermal_bias', 0.0)
+        triad.thermal_bend = values.get(short + '_thermal_bias_2', 0.0)
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
         triad.low_pass = float(values.get(short + '_bandwidth', 0.0))
         if short + '_bias_drift' in values:
             triad.drift, triad.drift_constant = values[short + '_bias_drift'][:3], values[short + '_bias_drift'][3]
     accel.cubic = values.get('accel_cubic', 0.0)
     accel.products, gyro.products = values.get('accel_cross_product'), values.get('gyro_rate_product')
-    gyro.to_force = values.get('gyro_g_sensitivity')
+    gyro.to_force, gyro.to_force_squared = values.get('gyro_g_sensitivity'), values.get('gyro_force_squared')
     return accel, gyro
 
 

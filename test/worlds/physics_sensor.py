@@ -26,7 +26,11 @@ class Triad:
     """Response of element i to the products xy, yz, xz of the input, shape (3, 3)."""
     to_force: np.ndarray | None = None
     """Response of gyroscope i to specific force, shape (3, 3)."""
+    to_force_squared: np.ndarray | None = None
+    """Response of gyroscope i to xx, yy, zz, xy, yz, xz of specific force, shape (3, 6): its elements yield unlike."""
     thermal_bias: np.ndarray | float = 0.0
+    thermal_bend: np.ndarray | float = 0.0
+    """Bias by the square of the temperature."""
     thermal_scale: np.ndarray | float = 0.0
     drift: np.ndarray | float = 0.0
     drift_constant: float = 1.0
@@ -55,12 +59,15 @@ class Triad:
             along = inputs[i] @ (self.matrix[i] / scale)
             output[:, i] = (_of(self.bias, i) + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
                             + _of(self.quadratic, i) * along**2 + _of(self.cubic, i) * along**3 + _of(self.asymmetry, i) * np.abs(along)
-                            + _of(self.thermal_bias, i) * warm - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
+                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
             if self.products is not None:
                 x, y, z = inputs[i].T
                 output[:, i] += self.products[i, 0] * x * y + self.products[i, 1] * y * z + self.products[i, 2] * x * z
             if self.to_force is not None:
                 output[:, i] += force_s @ self.to_force[i]
+            if self.to_force_squared is not None:
+                x, y, z = force_s.T
+                output[:, i] += np.stack([x * x, y * y, z * z, x * y, y * z, x * z], axis=1) @ self.to_force_squared[i]
         return output
 
 

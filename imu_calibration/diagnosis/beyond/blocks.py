@@ -93,12 +93,15 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
 
     """
     length = max(BLOCK, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MOST_BLOCKS)
+    which = _some(windows, length)
+    windows = [windows[k] for k in which]
     parts = [_cut(window, length) for window in windows]
     motion = JointMotion(*(np.concatenate([getattr(w.motion, f.name)[part.rows] for w, part in zip(windows, parts)]) for f in fields(JointMotion)))
     warm = all(w.temperature_c is not None for w in windows)
     temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
     per_block = np.concatenate([part.per_block for part in parts])
-    number = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
+    place = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
+    number = which[place]
     count = np.concatenate([part.count for part in parts])
     common = {'starts': np.cumsum(np.append(0, per_block[:-1])), 'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
               'window': number, 'locked': attempt.locked[number]}
@@ -107,9 +110,17 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     for sensor, residual in _residuals(windows, table, attempt).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
-        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind)[number] / count[:, None]
+        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which])[place] / count[:, None]
         found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, floor.bias_processes)
     return found
+
+
+def _some(windows, length):
+    """Return the numbers of the windows that are looked at: all, or of a long recording a part drawn by chance, in order."""
+    blocks = sum(1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length)) for w in windows)
+    if blocks <= 2 * MOST_BLOCKS:
+        return np.arange(len(windows))
+    return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MOST_BLOCKS // blocks])
 
 
 def _busier(windows, sensor, floor, kinds):

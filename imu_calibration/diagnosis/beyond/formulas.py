@@ -41,19 +41,19 @@ def _function(texts):
 
 class FormulaSearch:
     """
-    Formulas on one sensor's blocks, with baseline and catalogue projected out as far as they are plausible.
+    Formulas on one sensor's blocks, with baseline and catalogue taken out as far as they are plausible.
 
     Parameters
     ----------
     blocks : RestBlocks
     formulas : sequence of Formula
-    prior_sd : array, shape (q,)
-        What the catalogue's parameters may plausibly be, all parameters of the space.
+    plausible : array, shape (q, q)
+        Factor of the covariance that the parameters of the space may plausibly have.
     reference_temperature : float
 
     """
 
-    def __init__(self, blocks: RestBlocks, formulas: Sequence[Formula], prior_sd: np.ndarray, *, reference_temperature: float):
+    def __init__(self, blocks: RestBlocks, formulas: Sequence[Formula], plausible: np.ndarray, *, reference_temperature: float):
         self.blocks, self.formulas = blocks, formulas
         self._place = {text: k for k, text in enumerate(dict.fromkeys(t for f in formulas for column in f.columns for t in _three(column)))}
         self.means = self._worked_out(tuple(self._place), reference_temperature)
@@ -63,15 +63,16 @@ class FormulaSearch:
         self._rest, self._free, self.known = [], [], []
         for axis in range(3):
             part = every[:, ends[axis]:ends[axis + 1]] / whiten.scale[axis]
-            left, sizes = svd(part[:, :-1] * prior_sd[blocks.index[axis]], full_matrices=False, lapack_driver='gesdd')[:2]
-            basis = left[:, sizes > 1.0]
+            left, sizes = svd(part[:, :-1] @ plausible[blocks.index[axis]], full_matrices=False, lapack_driver='gesdd')[:2]
+            # What the catalogue could plausibly make counts as noise: a direction keeps what exceeds its plausible size.
+            basis, damped = left, (1.0 - 1.0 / np.sqrt(1.0 + sizes**2))[:, None]
             columns = every[:, ends[3]:] / whiten.scale[axis]
-            self._rest.append(part[:, -1] - basis @ (basis.T @ part[:, -1]))
-            free = columns - basis @ (basis.T @ columns)
+            self._rest.append(part[:, -1] - basis @ (damped[:, 0] * (basis.T @ part[:, -1])))
+            free = columns - basis @ (damped * (basis.T @ columns))
             size = np.einsum('bt,bt->t', columns, columns)
             new = np.einsum('bt,bt->t', free, free) > NEW**2 * np.maximum(size, 1e-300)
             self._free.append(np.where(new, free, 0.0))
-            self.known.append(basis.shape[1])
+            self.known.append(int((sizes > 1.0).sum()))
 
     def _worked_out(self, texts, reference_temperature):
         ref, places = self.blocks.ref, _values(self.blocks.ref, reference_temperature)

@@ -22,6 +22,8 @@ WORTH_A_SECOND = 0.1
 MOST_TERMS = 2
 ONE_SHAPE = 0.9
 """Share of a formula's amplitudes, all axes, that one shape must hold to stand for all of it."""
+OTHER_SENSOR = 3.0
+"""Standard deviations by which a cause of the table may differ from what the other sensor says of it."""
 SHOWN_ALIKE = 3
 """Formulas of a class that are told."""
 SEEN = 4.0
@@ -74,6 +76,7 @@ class Proposal:
                 + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
         if self.nearest is not None:
             text += f'; it is none of the catalogue: {self.nearest[0]}, which comes nearest, would remove {100 * max(self.nearest[1], 0.0):.0f} %'
+            text += ' here, but the other axes or the other sensor speak against it' * (self.nearest[1] > LEAST_SHARE)
         if self.alike:
             text += f'; this recording cannot tell it from {" or ".join(self.alike)}'
         return text + (f'; to confirm it: {self.motion}' if self.motion else '')
@@ -95,7 +98,7 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
     Formulas are chosen on the windows that choose, with everything that the catalogue could plausibly make projected out; the share is
     that of the locked windows beside the model that was found, and both halves of the choosing windows must show the same.
     """
-    search = FormulaSearch(blocks, _grammar(blocks), attempt.space.prior_sd, reference_temperature=attempt.recording.model.temperature_ref_c)
+    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt), reference_temperature=attempt.recording.model.temperature_ref_c)
     plain = fits.fit()
     if plain.excess <= 0:
         return None
@@ -114,6 +117,22 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
     if not choices or share < needed:
         return None
     return _told(blocks, attempt, fits, plain, choices)
+
+
+def _plausible(sensor, attempt):
+    """
+    Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
+
+    What the table does the other sensor sees too: it may explain no more here than it is allowed there.
+    """
+    plausible = np.diag(attempt.space.prior_sd)
+    other = next(each for each in SENSORS if each != sensor)
+    for question in attempt.questions:
+        if question.sensor not in SENSORS and other in question.effect.acts_on and len(question.effect.acts_on) > 1:
+            own = list(question.parameters)
+            known = attempt.evidence.known_from(other, [*attempt.search.baseline, *own])[-len(own):, -len(own):]
+            plausible[np.ix_(own, own)] = OTHER_SENSOR * np.linalg.cholesky(known)
+    return plausible
 
 
 def _grammar(blocks):
