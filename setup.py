@@ -52,7 +52,7 @@ setup(
         'numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11',
         'lz4', 'backports.zstd; python_version < "3.14"', 'urdfdom-py', 'xacro',
     ],
-    extras_require={'dask': ['dask', 'distributed']},
+    extras_require={'dask': ['dask', 'distributed'], 'view': ['foxglove-sdk']},
     zip_safe=False,
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={

@@ -38,7 +38,7 @@ NOBLE = {
     'builtin_interfaces': 'ros-jazzy-builtin-interfaces', 'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
 }
 """Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
-EXTRAS = {'dask'}
+EXTRAS = {'dask', 'foxglove'}
 """Installed by those who ask for the extra of that name; the code goes without."""
 READ_SETUP = '''
 import json, setuptools
@@ -116,7 +116,7 @@ def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
         assert done.returncode == 0 and NOBLE[key] in done.stdout.split(), (key, done.stdout, done.stderr)
 
 
-OPTIONAL = {'dask', 'distributed'}
+OPTIONAL = {'dask', 'distributed', 'foxglove'}
 """Extras of setup.py that only their own option needs."""
 
 

@@ -6,14 +6,8 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Coverage
-
-RADIUS = 0.5
-"""Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger."""
-ARMS_TIMES = 10.0
-"""Arms are millimetres."""
-WANTED, SEEN, DONE, ARROW, NOW, WHITE = ((0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6), (0.9, 0.9, 0.9))
-TINY = 0.03
+from imu_calibration.calibration.coverage import Coverage
+from imu_calibration.calibration.coverage_look import ARMS_TIMES, ARROW, DONE, NOW, RADIUS, SEEN, TINY, WHITE, cells_of, line_of
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
@@ -29,14 +23,6 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     for marker in made:
         marker.header.frame_id, marker.header.stamp = frame, stamp
     return MarkerArray(markers=made)
-
-
-def line_of(coverage: Coverage) -> str:
-    """Return the one line that stands beside the sphere."""
-    if coverage.done:
-        return 'everything is determined: save it'
-    what = coverage.next.text or 'go on'
-    return what + ('' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left')
 
 
 def _marker(name, number, kind, *, color=WHITE, alpha=1.0, scale=(1.0, 1.0, 1.0)):
@@ -57,12 +43,8 @@ def _point(place):
 
 
 def _cells(coverage):
-    most = max(float(coverage.worth.max()), ENOUGH)
-    for k, (direction, worth) in enumerate(zip(DIRECTIONS, coverage.worth, strict=True)):
-        share = 0.0 if coverage.done or worth < ENOUGH else float(worth) / most
-        color = tuple(share * wanted + (1 - share) * done for wanted, done in zip(WANTED, DONE, strict=True))
-        size = 0.06 + 0.1 * share
-        yield _at(_marker('cells', k, Marker.SPHERE, color=color, alpha=0.9, scale=(size,) * 3), RADIUS * direction)
+    for k, (place, color, size) in enumerate(cells_of(coverage)):
+        yield _at(_marker('cells', k, Marker.SPHERE, color=color, alpha=0.9, scale=(size,) * 3), place)
 
 
 def _seen(coverage):

@@ -1,0 +1,46 @@
+"""Amplitude spectral density of what a calibration leaves within moving windows: lines name causes, the floor is the noise."""
+
+import numpy as np
+
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.effects.base import SENSORS
+
+LONGEST = 1024
+"""Samples of a segment, at most: finer lines than a recording of a minute can tell apart say nothing."""
+SHORTEST = 64
+"""Windows with fewer samples are left out."""
+
+
+def residual_spectrum(result: CalibrationResult) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """
+    Return (frequency, sensor -> density) of the residuals of the moving windows that were kept.
+
+    Welch's method [1]: the power of segments of one length, each about its own mean, averaged over all windows.
+
+    Returns
+    -------
+    frequency : ndarray
+        Above zero, Hz, shape (n,); none where no window is long enough, and by hand.
+    dict
+        Sensor -> one-sided amplitude density, (m/s^2)/sqrt(Hz) or (rad/s)/sqrt(Hz), shape (n, 3).
+
+    References
+    ----------
+    .. [1] P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967) 70-73.
+
+    """
+    windows = [window for window in result.gathered.kept if len(window) >= SHORTEST]
+    if not windows:
+        return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
+    from scipy.signal import welch
+    segment = min(LONGEST, int(np.median([len(window) for window in windows])))
+    windows = [window for window in windows if len(window) >= segment]
+    rate = 1 / float(np.median([window.period for window in windows]))
+    weights = np.array([len(window) for window in windows], float)
+    residuals = [result.residuals_of(window) for window in windows]
+    density = {}
+    for sensor in SENSORS:
+        spectra = [welch(own[sensor], rate, nperseg=segment, axis=0) for own in residuals]
+        frequency = spectra[0][0]
+        density[sensor] = np.sqrt(np.average([power for _, power in spectra], axis=0, weights=weights))[1:]
+    return frequency[1:], density

@@ -1,0 +1,144 @@
+"""From a recording or a calibration file to what Foxglove shows of it."""
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from imu_calibration import files
+from imu_calibration.by_hand.next_pose import hand_coverage
+from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.result import HandResult
+from imu_calibration.by_hand.status import NOTHING
+from imu_calibration.calibration.coverage import Coverage, bars_of, table_coverage
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.effect_states import group_states
+from imu_calibration.calibration.residual_spectrum import residual_spectrum
+from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import InputError
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.choices import Choices
+from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SPECTRUM, foxglove_bytes
+from imu_calibration.use_cases.stand import Stand
+
+BAND = 1.959964
+"""Standard deviations on each side of a value that hold 95 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What is shown of a calibration."""
+
+    calibration: Calibration
+    """The calibration."""
+    messages: list[tuple[str, float, dict[str, Any]]]
+    """Topic, seconds since the first sample, content; SI units."""
+    coverage: Coverage | None
+    """The sphere; None where only a file is known."""
+
+    @property
+    def exit_code(self) -> int:
+        """That of the calibration."""
+        return exit_code(self.calibration)
+
+    @property
+    def lacks(self) -> tuple[str, ...]:
+        """What cannot be shown, and why."""
+        if self.coverage is None:
+            return ('a calibration file holds no residuals: the parameters alone are shown; give the recording for the rest',)
+        if not any(topic == SPECTRUM for topic, _, _ in self.messages):
+            return ('no window with motion was long enough for a spectrum, and by hand there is none: it is left out',)
+        return ()
+
+    def save(self, path: str | PathLike) -> None:
+        """
+        Write everything as MCAP, whole or not at all.
+
+        Raises
+        ------
+        InputError
+            When foxglove-sdk is not installed or the place cannot be written.
+
+        """
+        files.write_whole(path, foxglove_bytes(self.messages, self.coverage, self.calibration.frame_id or 'imu_link'))
+
+
+def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
+    """
+    Return what is shown of a recording, which is calibrated, or of a calibration file: of that, the parameters alone.
+
+    Parameters
+    ----------
+    source : path-like or SampleBlock
+        A bag or samples in memory, or a calibration.yaml, or the folder that holds it.
+    table : path-like, Table or Arm, optional
+        The reference of the recording, as for `calibrate`.
+    choices
+        See `Choices`.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When the recording or the file cannot be used.
+
+    """
+    path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
+    if path is None:
+        result = calibrate(source, table, **choices).result
+        messages = [_parameters(result.calibration, result.tolerances), *_residuals(result), *_spectrum(result)]
+        return View(result.calibration, messages, _coverage(result))
+    if table is not None:
+        raise InputError('a table or arm says how a recording moved and must come with a recording, a calibration file came; '
+                         'leave one out')
+    calibration = files.read_calibration(path)
+    return View(calibration, [_parameters(calibration, tolerances_of(calibration.model))], None)
+
+
+def _document_of(path):
+    """Return the calibration file that a path means, None where it means a recording."""
+    path = path / 'calibration.yaml' if (path / 'calibration.yaml').is_file() else path
+    return path if path.suffix in ('.yaml', '.yml') else None
+
+
+def _parameters(calibration, tolerances):
+    """Return the message of the parameters; without bands where nobody knows how certain the values are."""
+    units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
+    rows = [{'name': name, 'value': float(value), 'unit': unit, 'tolerance': float(tolerance), 'status': str(status)}
+            for name, value, unit, tolerance, status in
+            zip(calibration.param_names, calibration.values, units, tolerances, calibration.status, strict=True)]
+    for row, sd in zip(rows, map(float, calibration.sd)):
+        if calibration.uncertainty_known:
+            row.update(sd=sd, low=row['value'] - BAND * sd, high=row['value'] + BAND * sd, ratio=sd / row['tolerance'])
+    return PARAMETERS, 0.0, {'parameters': rows}
+
+
+def _residuals(result):
+    errors = result.window_errors()
+    for k in np.argsort(errors.time, kind='stable'):
+        yield RESIDUAL, float(errors.time[k]), {'motion': str(errors.kind[k]), **{
+            which: {sensor: _axes(getattr(errors, which)[sensor][k]) for sensor in SENSORS} for which in ('before', 'after', 'floor')}}
+
+
+def _spectrum(result):
+    frequency, density = residual_spectrum(result)
+    if len(frequency):
+        yield SPECTRUM, 0.0, {'lines': [{'frequency': float(f), **{sensor: _axes(density[sensor][k]) for sensor in SENSORS}}
+                                        for k, f in enumerate(frequency)]}
+
+
+def _axes(vector):
+    """Return the components by axis; those that nobody knows are left out, for JSON has no NaN."""
+    return {axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)}
+
+
+def _coverage(result: CalibrationResult) -> Coverage:
+    if isinstance(result, HandResult):
+        found = hand_coverage(replace(NOTHING, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
+    else:
+        found = table_coverage(result)
+    return replace(found, bars=bars_of(group_states(result)))
