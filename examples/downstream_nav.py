@@ -109,7 +109,7 @@ class Navigator:
         self.node = rclpy.create_node(f'navigate_by_{imu_topic.replace("/", "_")}')
         self._reckoning, self._stream, self._message = DeadReckoning(), ImuStream(), Odometry
         self.publisher = self.node.create_publisher(Odometry, odometry_topic, 10)
-        self.input, self.path, self.last = BatchInput(self.node, Imu, imu_topic, self._take, depth=DEPTH), [], time.monotonic()
+        self.input, self.path, self.last = BatchInput(self.node, Imu, imu_topic, add=self._take, depth=DEPTH), [], time.monotonic()
 
     def _take(self, data, _):
         if not self._stream.heads(data):

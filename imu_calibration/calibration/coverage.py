@@ -9,6 +9,7 @@ import numpy as np
 from imu_calibration.calibration.effect_states import GroupState
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
@@ -137,7 +138,7 @@ def _next_on_table(result):
 
 def _arms(result):
     """Return the sensitive points, None while one of them is not determined."""
-    effect = next((e for e in result.model.effects if e.name == 'accel_size_effect'), None)
+    effect = result.model.find('accelerometer', Role.ARMS)
     if effect is None:
         return None
     part = result.model.slices[effect.key]

@@ -17,7 +17,7 @@ from imu_calibration.by_hand.model import HandModel
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.named_models import parse_effects
+from imu_calibration.effects.named_models import BASE, parse_effects
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
@@ -200,7 +200,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     """
     options = calibration_options(choices)
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or 'bias+matrix', catalogue=options.catalogue) for sensor in SENSORS)
+    accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue) for sensor in SENSORS)
     model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
     found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=_noise(options, grade, imu_rate), rate=imu_rate)
     return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
