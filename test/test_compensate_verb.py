@@ -56,7 +56,7 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
     calibration = write_case(tmp_path, effects)
     assert compensate(tmp_path) == 0
     assert '/imu/data_corrected (3000 samples)' in capsys.readouterr().out
-    stamps, force, rate, _, _ = true_motion()
+    stamps, force, rate, _, temperature = true_motion()
     with open_recording(tmp_path / 'out', '/imu/data_corrected', want_joints=False) as recording:
         imu = ImuSamples.concatenate([block.imu for block in recording.blocks() if block.imu is not None])
     np.testing.assert_array_equal(imu.stamp_ns, stamps)
@@ -67,7 +67,9 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
     assert np.abs(imu.rate_s - rate)[100:-100].max() < (1e-3 * late * 10 if effects == 'all' else 1e-12)
     message = parse_imu(raw_messages(tmp_path / 'out', '/imu/data_corrected')[0][1])
     cov = np.array(message.doubles[FIELDS['rate_cov']]).reshape(3, 3)
-    expected = Uncertainty(calibration).at().covariances(*Uncertainty(calibration).noise)[1]
+    # a block of readings has the covariance of its last one
+    dt = float(temperature[-1]) - calibration.model.temperature_ref_c
+    expected = Uncertainty(calibration).at(force[-1], rate[-1], dt=dt).covariances(*Uncertainty(calibration).noise)[1]
     assert np.diag(cov) == pytest.approx(np.diag(expected), rel=0.05)   # was unknown, so it is the calibration's noise
 
 

@@ -19,9 +19,12 @@ from msg_adapters.live import LiveGatherer
 
 TYPE = 'sensor_msgs/msg/Imu'
 SECONDS = 3.0
-"""How long topics are listened to."""
+"""How long topics are listened to, up to `PATIENCE` times where less than `ENOUGH` came."""
 DISCOVERY = 2.0
-"""Seconds in which the nodes of the system are found."""
+"""Seconds in which the nodes of the system are found, up to `PATIENCE` times where no Imu topic was."""
+PATIENCE = 3
+ENOUGH = 100
+"""Messages that tell what a topic is like."""
 NAMES = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
 """Endings of topics that carry Imu messages by convention (REP 145)."""
 NOT_MEASURED = ('/imu/residual',)
@@ -42,7 +45,7 @@ class StreamFindings:
 
 def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     """
-    Listen to every Imu topic for `SECONDS` and return what was found, by name.
+    Listen to every Imu topic for some seconds and return what was found, by name.
 
     Parameters
     ----------
@@ -52,15 +55,25 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
         Lets the node work once; called with the node and ``timeout_sec=``.
 
     """
-    _spin(node, spin_once, DISCOVERY)
-    topics = {name: types for name, types in sorted(node.get_topic_names_and_types())
-              if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)}
+    for _ in range(PATIENCE):
+        _spin(node, spin_once, DISCOVERY)
+        if topics := _imu_topics(node):
+            break
     streams = [_Stream(node, name) for name in topics]
     _spin(node, spin_once, 0.2)
     for stream in streams:
         stream.input.look()   # asks for what the publishers offer
-    _spin(node, spin_once, SECONDS)
+    for _ in range(PATIENCE):
+        _spin(node, spin_once, SECONDS)
+        if all(stream.count >= ENOUGH for stream in streams):
+            break
     return [stream.findings() for stream in streams]
+
+
+def _imu_topics(node):
+    """Return the topics that carry Imu messages, or should by their names, and that somebody publishes."""
+    return [name for name, types in sorted(node.get_topic_names_and_types())
+            if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
 
 
 def _spin(node, spin_once, seconds):
@@ -73,13 +86,14 @@ class _Stream:
     """One topic that is listened to."""
 
     def __init__(self, node, topic):
-        self.node, self.topic, self.heads, self.gatherer = node, topic, ImuHeads(), LiveGatherer()
+        self.node, self.topic, self.heads, self.gatherer, self.count = node, topic, ImuHeads(), LiveGatherer(), 0
         self.by_wall_clock = not node.count_publishers('/clock')   # else stamps belong to the time that is played
         self.input = BatchInput(node, Imu, topic, add=self._add)
 
     def _add(self, data, sent_ns):
         self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)
         self.gatherer.add_imu(data, sent_ns)
+        self.count += 1
 
     def findings(self):
         """Return the StreamFindings."""
@@ -98,7 +112,7 @@ class _Stream:
             yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): what they '
                                'send mixes; stop all but one, or rename their topics')
         if names and not self.heads.evidence().frame_ids:
-            yield CheckFinding('silence', WARNING, f'messages must come, none came in {SECONDS:g} s; look at the driver')
+            yield CheckFinding('silence', WARNING, f'messages must come, none came in {PATIENCE * SECONDS:g} s; look at the driver')
 
     def _listeners(self):
         wrong = 0
