@@ -1,5 +1,6 @@
 """By hand: which attitude to hold next, and how long it will take until everything is determined, foretold from information alone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,12 +57,17 @@ class HandKnowledge:
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         count = len(ups)
-        rows = np.zeros((count, 6, self.model.size))
-        rows[:, 0] = self.model.norm_rows(self.values, forces, time=np.zeros(count),
-                                          temperature_c=np.full(count, self.model.model.temperature_ref_c))[1] / self.pose_sd
-        rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
-        rows[:, 4:6, GYRO_MATRIX] = [_turn_rows(self.up, to) / self.turn_sd for to in ups]
+        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=np.full(count, self.model.model.temperature_ref_c))[1]
+        rows = self.rows(norms, [_turn_rows(self.up, to) for to in ups])
         return self.information + np.einsum('kri,krj->kij', rows, rows)
+
+    def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray]) -> np.ndarray:
+        """Return what poses say of the parameters, in standard deviations, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        rows = np.zeros((len(norms), 6, self.model.size))
+        rows[:, 0] = norms / self.pose_sd
+        rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
+        rows[:, 4:6, GYRO_MATRIX] = np.array(turns) / self.turn_sd
+        return rows
 
     def missing(self, information: np.ndarray) -> np.ndarray:
         """Return the `excess` that stays with some information; leading axes are kept."""
@@ -113,7 +119,7 @@ def knowledge_of(found: Findings, result: HandResult | None, options: HandOption
     Before the first solution only the poses count, at nominal values and with the scatter of the settings. After it the information is that of
     the solution, less what its standard deviations have grown by beyond noise.
     """
-    last = np.array([0.0, 0.0, 1.0]) if found.poses is None else found.poses.force[-1] / np.linalg.norm(found.poses.force[-1])
+    last = np.array([0.0, 0.0, 1.0]) if found.poses is None else _ups(found.poses)[-1]
     if result is None:
         return _at_first(found.poses, options, last)
     hand = result.hand
@@ -138,18 +144,20 @@ def _at_first(poses: Poses | None, options: HandOptions, last: np.ndarray) -> Ha
                               float(np.hypot(settings.pose_scatter, TREMBLING)), float(np.hypot(settings.drift_scatter, CREEPING)), settings.turn_scatter, last)
     if poses is None:
         return knowledge
-    ups = poses.force / np.linalg.norm(poses.force, axis=1, keepdims=True)
-    rows = np.zeros((len(ups), 6, model.size))
-    rows[:, 0] = model.norm_rows(model.nominal, poses.force)[1] / knowledge.pose_sd
-    rows[:, 1:4, GYRO_BIAS] = np.eye(3) / knowledge.drift_sd
-    rows[1:, 4:6, GYRO_MATRIX] = [_turn_rows(start, end) / settings.turn_scatter for start, end in zip(ups[:-1], ups[1:], strict=True)] or 0.0
-    information = np.einsum('kri,krj->ij', rows, rows)
-    return replace(knowledge, information=information)
+    ups = _ups(poses)
+    turns = [_turn_rows(start, end) for start, end in zip(ups[:-1], ups[1:], strict=True)]
+    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], [np.zeros((2, 9)), *turns])   # nothing leads to the first pose
+    return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows))
+
+
+def _ups(poses: Poses | None) -> np.ndarray:
+    """Return the directions that were up, unit vectors, shape (k, 3)."""
+    return np.zeros((0, 3)) if poses is None else poses.force / np.linalg.norm(poses.force, axis=1, keepdims=True)
 
 
 def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
     """Return the Coverage of a session by hand: the cells, the next pose with the turn that leads to it, and the seconds that are left."""
-    seen = np.zeros((0, 3)) if found.poses is None else found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
+    seen = _ups(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)
     steps = [] if result is not None and set(result.hand.statuses) == {DETERMINED} else foretold(knowledge)

@@ -1,7 +1,7 @@
 """The rest of one sensor in short blocks, beside the columns of everything that was asked: what regimes and formulas are judged on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -156,7 +156,7 @@ def _of_sensor(sensor, attempt, references, table, residual, common, variance, p
     blocks = RestBlocks(sensor, ref, **common, design=(), index=(), variance=variance, processes=processes)
     rows = np.concatenate([blocks.means(np.concatenate(taken, axis=1)), residual], axis=1)
     design = tuple(rows @ join for join in space.join[sensor])
-    return RestBlocks(sensor, ref, **common, design=design, index=tuple(space.index[sensor]), variance=variance, processes=processes)
+    return replace(blocks, design=design, index=tuple(space.index[sensor]))
 
 
 @dataclass(frozen=True, eq=False)
