@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.cli.main import main
@@ -33,6 +34,7 @@ from imu_calibration.use_cases.plan import class_in
 from imu_calibration.use_cases.stand import table_of
 from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 
+from worlds.live_sessions import TABLE, make_session
 from worlds.random_tables import random_table
 
 NOISE = noise_of_grade(GRADES['industrial'].noise, 100.0)
@@ -189,3 +191,30 @@ def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
         worst.setdefault(effect.sensor, {})[effect.name] = float(sd[model.slices[effect.key]].max())
     plan = make_planner(table, noise=NOISE, tolerances=worst).plan(with_bound=False)
     assert plan.missing == () and plan.seconds <= profile.duration
+
+
+def test_what_a_live_session_saved_is_known_as_well_as_its_calibration(capsys, tmp_path):
+    live = LiveCalibration(TABLE, CalibrationOptions())
+    live.push(SampleBlock(*make_session(seconds=50.0)[:2]))
+    (tmp_path / 'mine.accumulator.npz').write_bytes(live.saved(pending=True))
+    (tmp_path / 'mine.yaml').write_text(calibration_to_text(live.solve(pending=True).calibration))
+    documents = []
+    for known in ('mine.accumulator.npz', 'mine.yaml'):
+        assert main(['plan', '--table', str(config_file('table_three_axis.yaml')), '--known', str(tmp_path / known), '--tolerances',
+                     str(tight(tmp_path)), '--output', str(tmp_path / 'out'), '--no-bound', '--no-report']) == 0
+        documents.append(yaml.safe_load((tmp_path / 'out/plan.yaml').read_text()) | {'provenance': None})
+        (tmp_path / 'out').rename(tmp_path / f'plan of {known}')
+    assert documents[0] == documents[1]
+    nothing = make_planner(TABLE, noise=NOISE, tolerances=TIGHT).plan(with_bound=False)
+    assert documents[0]['seconds'] < 0.8 * nothing.seconds
+    capsys.readouterr()
+    (tmp_path / 'mine.accumulator.npz').write_bytes(b'half')
+    assert main(['plan', '--table', str(config_file('table_three_axis.yaml')), '--known', str(tmp_path / 'mine.accumulator.npz'), '--output',
+                 str(tmp_path / 'no')]) == 1
+    assert 'mine.accumulator.npz: a saved accumulator must be a whole file' in capsys.readouterr().err
+
+
+def tight(folder):
+    """Return a file with the tolerances TIGHT."""
+    (folder / 'tight.yaml').write_text(yaml.safe_dump(TIGHT))
+    return folder / 'tight.yaml'

@@ -3,7 +3,9 @@
 
 from collections.abc import Callable, Sequence
 
+from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import document, motions_needed
 from imu_calibration.calibration.gathered import Gathered, join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
@@ -14,7 +16,7 @@ from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
+from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.shrinkage import shrunk
 from imu_calibration.estimation.solution import Solution
@@ -101,6 +103,26 @@ def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationO
         smaller = narrow.without_arms()
         solution = solve(restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes)
     return shrunk(solution, _by_default(solution.model, options))
+
+
+def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
+    """
+    Return the calibration of what a live session saved (`accumulator_state`), of the model whose columns it gathered.
+
+    Raises
+    ------
+    DocumentError
+        When it is damaged, or was gathered on other joints.
+    NotObservableError
+        When nothing is determined.
+
+    """
+    model = accumulator_state.saved_model(data)
+    if model.joint_names != table.joint_names:
+        raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, this is of {', '.join(model.joint_names) or 'none'}; "
+                            'give the table or the arm that it was gathered on', key='table')
+    gathered = accumulator_state.from_bytes(data, model)
+    return conclude(solve_gathered(gathered, model, options), gathered, model, table=table, options=options).calibration
 
 
 def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,

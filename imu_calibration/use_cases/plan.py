@@ -14,12 +14,13 @@ import numpy as np
 from imu_calibration import documents, files
 from imu_calibration.by_hand.hand_plan import HandPlan, hand_plan_to_mapping, plan_by_hand
 from imu_calibration.by_hand.model import HandModel
+from imu_calibration.calibration.calibrate import calibration_of_saved
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.named_models import BASE, parse_effects
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
+from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.noise import noise_of_figures, noise_of_grade
 from imu_calibration.planning.planner import Plan, make_planner
@@ -32,6 +33,8 @@ from imu_calibration.use_cases.stand import Stand, table_of
 
 LONGEST_SEPARATION = 180.0
 """Time that a plan takes at most to tell effects apart, s."""
+ACCUMULATOR = '.npz'
+"""Ending of what a live session saves beside its calibration."""
 START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
@@ -108,7 +111,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     stand : path-like, Table or Arm
         What moves, with its limits.
     calibration : path-like or Calibration, optional
-        What is known already.
+        What is known already: a calibration, or the accumulator (.npz) that a live session on the same joints saved.
     grade : str
         Grade of the IMU, where no noise is given.
     imu_rate : float
@@ -134,7 +137,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     """
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
     noise = _noise(options, grade, imu_rate)
-    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    known = _known(calibration, table, options)
     causes = tuple(separate) or (files.read_mapping(diagnosis, 'diagnosis', class_in) if diagnosis else ())
     if causes:
         if known is None:
@@ -149,6 +152,18 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
     return Planned(planner.plan(progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+
+
+def _known(calibration, table, options):
+    """Return what is known already as a Calibration, None for nothing."""
+    if not isinstance(calibration, (str, PathLike)):
+        return calibration
+    if Path(calibration).suffix != ACCUMULATOR:
+        return files.read_calibration(calibration)
+    try:
+        return calibration_of_saved(files.read_bytes(calibration, 'accumulator'), table, options)
+    except DocumentError as error:
+        raise error.named(str(calibration)) from error
 
 
 @dataclass(frozen=True, eq=False)

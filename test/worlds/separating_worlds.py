@@ -1,0 +1,148 @@
+"""
+Does the motion that is planned to tell causes apart leave the right name? ``python -m worlds.separating_worlds`` in test/.
+
+A physical cause is hidden in a unit on a table, and a short round is driven by habit: the faces, one spin about each axis, a swing. Where the diagnosis
+of that names a class of effects that it cannot tell apart, the planner makes at most three minutes of motion for the same unit, and the diagnosis is asked
+again about both together. It is right when it then names what was hidden, with nothing that would do as well.
+"""
+
+from __future__ import annotations
+
+import time
+from argparse import ArgumentParser
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count, islice
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
+from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
+from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
+from imu_calibration.use_cases.diagnose import Diagnosed, diagnose
+from imu_calibration.use_cases.plan import class_in, plan
+
+from worlds.hiding import Recording, Sizes
+from worlds.physics import Session, make_session
+from worlds.physics_draw import generator, to_ns
+
+HIDDEN = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'gyro_quadratic', 'gyro_scale_asymmetry', 'gyro_rate_product', 'accel_bandwidth',
+          'gyro_bandwidth', 'time_offset', 'lever_arm', 'accel_size_effect', 'table_tilt', 'axis_non_orthogonality', 'encoder_zero', 'load_compliance')
+"""What shows with motion and has relatives."""
+FACTORS = (3.0, 2.0, 5.0)
+"""Sizes, as multiples of what is just detectable in the first round; the larger, the more seldom a class is left."""
+PAUSE = 30.0
+"""Seconds between the first recording and the second."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One hidden cause, and the motion of the first recording."""
+
+    seed: int
+    effect: str
+    factor: float
+    noise: str = 'realistic'
+
+    def round(self) -> Profile:
+        """Return the first motion: the six faces, a spin in one sense and at one speed about each axis, a swing."""
+        rng, builder = generator(self.seed, 'round'), MotionBuilder(3)
+        builder.rest(5.0)
+        tasks = [(pose, (up + rng.normal(0.0, 0.03, 3), rng.uniform(-180, 180)), {'dwell': 2.6}) for up in FACES]
+        speed = rng.choice([-1.0, 1.0]) * rng.uniform(60, 180)
+        tasks += [(_spin_one_way, (up, speed), {}) for up in np.eye(3)]
+        tasks += [(swing, (int(rng.integers(3)), 15.0), {'frequency': rng.uniform(0.5, 1.0), 'duration': 4.0})]
+        for place in rng.permutation(len(tasks)):
+            task, arguments, named = tasks[place]
+            task(builder, *arguments, **named)
+        builder.move([0.0, 0.0, 0.0])
+        builder.rest(4.0)
+        return Profile('round', tuple(builder.segments), ('outer', 'middle', 'inner'))
+
+    def hidden(self) -> dict:
+        """Return what is hidden: effect -> value."""
+        empty = make_session(self.seed, noise=self.noise, profile=self.round())
+        table = Table.from_mapping(empty.table)
+        gatherer = MotionGatherer(table)
+        sizes = Sizes(Recording(table, [*gatherer.push(empty.block), *gatherer.finish()], {}))
+        return {self.effect: sizes.hidden(self.effect, self.seed, self.factor)}
+
+    def session(self, number: int, motion: Profile, hidden: dict) -> Session:
+        """Return one of the recordings: of the same unit, with other noise."""
+        return make_session(self.seed + 100_000 * number, hidden, self.noise, profile=motion, unit=self.seed)
+
+
+def _spin_one_way(builder, up, speed):
+    builder.move(pose_deg(up, np.nan))
+    builder.spin([speed, 0.0, 0.0], 2.5)
+
+
+def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
+    """Return two recordings as one, the second some time after the first."""
+    shift = first.imu.stamp_ns[-1] + to_ns(PAUSE) - second.imu.stamp_ns[0]
+    later = [replace(part, stamp_ns=part.stamp_ns + shift) for part in (second.imu, second.joints, second.temperature)]
+    return SampleBlock(*(type(b).concatenate([a, b]) for a, b in zip((first.imu, first.joints, first.temperature), later, strict=True)))
+
+
+def run(world: World) -> dict:
+    """Return one row: what was hidden, the class, the planned motion, what was named in the end."""
+    hidden, start = world.hidden(), time.process_time()
+    first = world.session(0, world.round(), hidden)
+    table = Table.from_mapping(first.table)
+    row = {'seed': world.seed, 'hidden': world.effect, 'factor': world.factor}
+    before = diagnose(first.block, table)
+    row['before'] = names(before)
+    if not any(mates for _, mates in row['before']):
+        return row
+    separate = class_in(before.document)
+    try:
+        made = plan(table, calibration=before.calibration, separate=separate, with_bound=False).plan
+    except ImuCalibrationError as error:
+        return row | {'refused': str(error), 'right': False}
+    motion = Profile('separating', tuple(segment for one in made.segments for segment in one), first.truth['profile'].joint_names)
+    second = world.session(1, motion, hidden)
+    row['after'] = names(diagnose(appended(first.block, second.block), table))
+    return row | {'seconds': made.seconds, 'motions': len(made.motions), 'missing': made.missing, 'right': row['after'] == [(world.effect, ())],
+                  'processor': time.process_time() - start}
+
+
+def names(diagnosed: Diagnosed) -> list:
+    """Return (effect, mates) of each finding."""
+    return [(finding.effect, tuple(finding.indistinguishable_from)) for finding in diagnosed.findings]
+
+
+def worlds(first_seed: int, effects: Sequence[str] = HIDDEN) -> Iterator[World]:
+    """Yield worlds without end: the effects by turns, in either size."""
+    for number in count():
+        yield World(first_seed + number, effects[number % len(effects)], FACTORS[number // len(effects) % len(FACTORS)])
+
+
+def main() -> None:
+    """Go on until so many worlds were ambiguous, print a row for each."""
+    parser = ArgumentParser(description=__doc__.split('\n', maxsplit=1)[0])
+    parser.add_argument('--worlds', type=int, default=60, help='worlds in which the first recording leaves a class')
+    parser.add_argument('--first-seed', type=int, default=0)
+    parser.add_argument('--effects', type=lambda text: text.split(','), default=HIDDEN)
+    parser.add_argument('--most', type=int, default=400, help='worlds that are tried at most')
+    options = parser.parse_args()
+    rows, tried = [], 0
+    for world in islice(worlds(options.first_seed, options.effects), options.most):
+        row = run(world)
+        tried += 1
+        if 'right' not in row:
+            continue
+        rows.append(row)
+        print(f"{row['seed']:6d} {row['hidden']:<24} x{row['factor']:<4g} {row['before']} -> {row.get('after', row.get('refused'))} "
+              f"{row.get('seconds', 0.0):.0f} s {'right' if row['right'] else 'WRONG'} {row.get('missing') or ''}", flush=True)
+        if len(rows) == options.worlds:
+            break
+    seconds = [row['seconds'] for row in rows if 'seconds' in row]
+    print(f"{tried} worlds, {len(rows)} with a class; a single, right name in {sum(row['right'] for row in rows)}; "
+          f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s')
+
+
+if __name__ == '__main__':
+    main()
