@@ -314,5 +314,11 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
         motions.append(step.motion)
         position = step.motion.points(position).position[-1]
     assert 0 < len(motions) < 40   # and it ends by itself
+    mate = {f'gyroscope.gyro_quadratic.{axis}': size for axis, size in zip('xyz', (1e-3, -1e-3, 1e-3), strict=True)}
+    told = separator_of(table, known, Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes | mate), noise=noise).situation
+    imitating = separator.situation.goal.causes[1]
+    quadratic = told.goal.causes[1].size * told.coordinates.units[told.coordinates.model.slices['gyroscope', 'gyro_quadratic']]
+    np.testing.assert_allclose(quadratic, [1e-3, -1e-3, 1e-3])   # as the diagnosis says, not as a usual session would have it
+    assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)
     with pytest.raises(InputError, match="a cause must be an effect of the catalogue, got 'gremlins'"):
         separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)

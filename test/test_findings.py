@@ -35,6 +35,16 @@ class Search:
     def class_mates(self, chosen, question):
         return {FIRST: [(MATE, 3.0)], SECOND: [(MATE, 1.0), (OTHER, 7.0)]}[question]
 
+    def used(self, chosen):
+        return tuple(k for question in chosen for k in question.parameters)
+
+    @property
+    def evidence(self):
+        return self
+
+    def fit(self, used):
+        return 10.0 * np.array(used) + sum(used), None
+
 
 @pytest.fixture(scope='module')
 def solution():
@@ -64,6 +74,8 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
     assert [f.indistinguishable_from for f in made] == [(MATE.name,), (MATE.name, OTHER.name)]
     assert asked == [(FIRST, MATE), (SECOND, MATE)]
     assert made[1].heldout_gain == 30.0 and made[1].separating_motion == 'turn it over'
+    # MATE is parameter 2 beside SECOND (1) in the place of FIRST, and beside FIRST (0) in that of SECOND
+    assert [f.sizes_of_mates[MATE.name] for f in made] == [{'accelerometer.accel_scale_asymmetry.x': (size, '1')} for size in (23.0, 22.0)]
     assert set(made[1].parameters) == {f'accelerometer.accel_cubic.{axis}' for axis in 'xyz'}
 
 

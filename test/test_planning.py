@@ -154,8 +154,9 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
 
 
 def test_a_class_is_taken_from_a_diagnosis_or_refused():
-    findings = [{'effect': 'a', 'indistinguishable_from': []}, {'effect': 'b', 'indistinguishable_from': ['c', 'd']}]
-    assert class_in(json.loads(json.dumps({'findings': findings}))) == ('b', 'c', 'd')
+    findings = [{'effect': 'a', 'indistinguishable_from': []},
+                {'effect': 'b', 'indistinguishable_from': ['c', 'd'], 'sizes_of_mates': {'c': {'c.x': {'value': 2.0, 'unit': '1'}}}}]
+    assert class_in(json.loads(json.dumps({'findings': findings}))) == (('b', 'c', 'd'), {'c.x': 2.0})
     with pytest.raises(InputError, match='nothing is left'):
         class_in({'findings': findings[:1]})
 

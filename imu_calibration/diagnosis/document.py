@@ -42,6 +42,8 @@ def _finding(finding):
             'parameters': {name: {'value': value, 'sd': sd, 'unit': unit} for name, (value, sd, unit) in finding.parameters.items()},
             'p_value': finding.p_value, 'heldout_log_likelihood_gain': finding.heldout_gain, 'share_of_unexplained': finding.share,
             'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from),
+            'sizes_of_mates': {mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
+                               for mate, sizes in finding.sizes_of_mates.items()},
             'separating_motion': finding.separating_motion}
 
 

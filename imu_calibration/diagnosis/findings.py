@@ -42,4 +42,12 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
                         if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
     return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
                    share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '',
-                   question.effect.against)
+                   question.effect.against, {mate.name: _in_its_place(search, named, place, mate) for mate in mates})
+
+
+def _in_its_place(search, named, place, mate):
+    """Return parameter name -> (value, unit) of an effect that stands in the place of a finding."""
+    used = search.used([*named[:place], mate, *named[place + 1:]])
+    values = search.evidence.fit(used)[0]
+    return {name: (float(values[used.index(k)]), mate.effect.unit_of(number))
+            for number, (name, k) in enumerate(zip(mate.effect.param_names(), mate.parameters))}

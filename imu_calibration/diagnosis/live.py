@@ -162,5 +162,6 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
               'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]), **values}
     for finding in diagnosis.findings:
         values[MATES + finding.effect] = ' '.join(finding.indistinguishable_from)
-        values |= {f'{SIZE}{finding.effect}.{name}': repr(float(value)) for name, (value, _, _) in finding.parameters.items()}
+        sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
+        values |= {f'{SIZE}{effect}.{name}': repr(float(value)) for effect, sizes in sized.items() for name, (value, *_) in sizes.items()}
     return DiagnosisState(FOUND, message, values)

@@ -1,6 +1,6 @@
 """What a diagnosis hands back."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Finding:
     """Which motion would tell them apart; empty when there is nothing to tell apart."""
     against: tuple = ()
     """What its residual is drawn against, as in ``Effect.against``."""
+    sizes_of_mates: dict = field(default_factory=dict)
+    """Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: how large this recording would have it in the place of the finding."""
 
 
 @dataclass(frozen=True, eq=False)

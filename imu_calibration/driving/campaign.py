@@ -54,7 +54,7 @@ class Suspect:
     mates: tuple[str, ...] = ()
     """Effects that cannot be told from it."""
     sizes: dict[str, float] = field(default_factory=dict)
-    """Parameter -> value, SI."""
+    """Parameter -> value, SI, of the effect and of each mate in its place."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,8 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
         if name not in sensors:
             raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has")
     causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
-    return make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options)
+    return make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
+                          sizes=suspect.sizes)
 
 
 def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]) -> Calibration:

@@ -265,8 +265,8 @@ def findings_from(told: dict[str, str]) -> list[Suspect]:
     if told.get('outcome') != FOUND:
         return []
     found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]
-    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{effect}.'): float(value) for key, value in told.items()
-                                           if key.startswith(f'{SIZE}{effect}.')}) for effect, mates in found]
+    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{each}.'): float(value) for each in (effect, *mates)
+                                           for key, value in told.items() if key.startswith(f'{SIZE}{each}.')}) for effect, mates in found]
 
 
 def main(arguments: list[str] | None = None) -> int:

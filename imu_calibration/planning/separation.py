@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,7 @@ SESSION = 'quick'
 
 
 def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
-                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions()) -> Planner:
+                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(), sizes: Mapping[str, float] | None = None) -> Planner:
     """
     Return a planner whose goal is to tell causes apart.
 
@@ -44,6 +45,9 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
         Samples of the IMU per second.
     options : CalibrationOptions
         Its tolerances and catalogue.
+    sizes : mapping, optional
+        Parameter -> value, SI, of the others as the diagnosis would have them in the place of the first; where it does not say, as
+        large as they must be to pass for it on a usual session.
 
     Raises
     ------
@@ -65,31 +69,42 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
     situation = Situation(Repertoire(table, limits_of(table)), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
-    situation.goal = ToldApart(coordinates, suspected(situation, causes, table), questions)
+    situation.goal = ToldApart(coordinates, suspected(situation, causes, table, sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
     return Planner(situation, coordinates.information_from(names, calibration.covariance))
 
 
-def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table) -> list[Cause]:
+def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table, sizes: Mapping[str, float]) -> list[Cause]:
     """
     Return the causes with their sizes: the first as it was found, the mates as large as they would have to be to pass for it.
 
-    ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the information of a usual session, r the baseline.
+    Where `sizes` has nothing of a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the information of
+    a usual session, r the baseline.
     """
     coordinates = situation.coordinates
+    found = []
+    for key in causes:
+        places, names = _indices(coordinates.model, key), coordinates.model.param_names
+        known = coordinates.values[places] if not found else [sizes.get(names[k], np.nan) for k in places]
+        found.append(Cause(key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]))
+    unknown = [cause for cause in found if np.isnan(cause.size).any()]
+    passing = _imitating(situation, found, unknown, table) if unknown else {}
+    return [replace(cause, size=passing.get(cause.key, cause.size)) for cause in found]
+
+
+def _imitating(situation, causes, unknown, table):
+    """Return the sizes that causes must have to pass for the first one on a usual session, by key."""
     windows = situation.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
     times = np.array([window.middle for window in windows])
-    information = coordinates.prior_information + exact_information(windows, times, situation.noise)
-    places = [_places(coordinates, key) for key in causes]
-    rest = np.setdiff1d(np.arange(coordinates.size), np.concatenate(places))
+    information = situation.coordinates.prior_information + exact_information(windows, times, situation.noise)
+    first, found = causes[0], {}
+    rest = np.setdiff1d(np.arange(len(information)), np.concatenate([cause.places for cause in causes]))
     inner = np.linalg.inv(information[np.ix_(rest, rest)])
-    start = coordinates.values[_indices(coordinates.model, causes[0])] / coordinates.units[_indices(coordinates.model, causes[0])]
-    found = [Cause(causes[0], places[0], start)]
-    for key, own in zip(causes[1:], places[1:], strict=True):
-        across = information[np.ix_(own, rest)] @ inner
-        bb = information[np.ix_(own, own)] - across @ information[np.ix_(rest, own)]
-        ba = information[np.ix_(own, places[0])] - across @ information[np.ix_(rest, places[0])]
-        found.append(Cause(key, own, np.linalg.solve(bb, ba @ start)))
+    for cause in unknown:
+        across = information[np.ix_(cause.places, rest)] @ inner
+        bb = information[np.ix_(cause.places, cause.places)] - across @ information[np.ix_(rest, cause.places)]
+        ba = information[np.ix_(cause.places, first.places)] - across @ information[np.ix_(rest, first.places)]
+        found[cause.key] = np.linalg.solve(bb, ba @ first.size)
     return found
 
 

@@ -101,8 +101,8 @@ class Planned:
 
 
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
-         separate: Sequence[str] = (), diagnosis: str | PathLike | None = None, longest: float = LONGEST_SEPARATION,
-         progress: Callable[[float], None] | None = None, with_bound: bool = True, **choices: Any) -> Planned:
+         separate: Sequence[str] = (), diagnosis: str | PathLike | Mapping[str, Any] | None = None,
+         longest: float = LONGEST_SEPARATION, progress: Callable[[float], None] | None = None, with_bound: bool = True, **choices: Any) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
 
@@ -118,8 +118,8 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         Samples of the IMU per second.
     separate : sequence of str
         Effects to be told apart, the one that `calibration` contains first: the plan is for that instead of the tolerances.
-    diagnosis : path-like, optional
-        diagnosis.json, of which the first finding with others that would do as well is taken.
+    diagnosis : path-like or mapping, optional
+        diagnosis.json or its content, of which the first finding with others that would do as well is taken.
     longest : float
         Time that telling apart may take, s.
     progress : callable, optional
@@ -138,13 +138,13 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
     noise = _noise(options, grade, imu_rate)
     known = _known(calibration, table, options)
-    causes = tuple(separate) or (files.read_mapping(diagnosis, 'diagnosis', class_in) if diagnosis else ())
+    causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
     if causes:
         if known is None:
             raise InputError('effects are told apart beside the calibration of the diagnosis that found the first, none was given; give it',
                              key='calibration')
         owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
-        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options)
+        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options, sizes=sizes)
     else:
         planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
     provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
@@ -237,9 +237,13 @@ def _noise(options, grade, imu_rate):
     return noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
 
 
-def class_in(document: Mapping[str, Any]) -> tuple[str, ...]:
+def _class_of(diagnosis):
+    return class_in(diagnosis) if isinstance(diagnosis, Mapping) else files.read_mapping(diagnosis, 'diagnosis', class_in)
+
+
+def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
     """
-    Return the first class of effects that a diagnosis did not tell apart, the named one first.
+    Return the first class of effects that a diagnosis did not tell apart, the named one first, and parameter -> value (SI) of the others in its place.
 
     Raises
     ------
@@ -249,7 +253,8 @@ def class_in(document: Mapping[str, Any]) -> tuple[str, ...]:
     """
     for finding in document.get('findings') or ():
         if finding.get('indistinguishable_from'):
-            return (finding['effect'], *finding['indistinguishable_from'])
+            sizes = {name: float(size['value']) for mate in finding.get('sizes_of_mates', {}).values() for name, size in mate.items()}
+            return (finding['effect'], *finding['indistinguishable_from']), sizes
     raise InputError('the diagnosis must have a finding with others that would do as well, it has none; nothing is left to be told apart')
 
 

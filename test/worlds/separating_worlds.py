@@ -23,7 +23,7 @@ from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
 from imu_calibration.use_cases.diagnose import Diagnosed, diagnose
-from imu_calibration.use_cases.plan import class_in, plan
+from imu_calibration.use_cases.plan import plan
 
 from worlds.hiding import Recording, Sizes
 from worlds.physics import Session, make_session
@@ -97,9 +97,8 @@ def run(world: World) -> dict:
     row['before'] = names(before)
     if not any(mates for _, mates in row['before']):
         return row
-    separate = class_in(before.document)
     try:
-        made = plan(table, calibration=before.calibration, separate=separate, with_bound=False).plan
+        made = plan(table, calibration=before.calibration, diagnosis=before.document, with_bound=False).plan
     except ImuCalibrationError as error:
         return row | {'refused': str(error), 'right': False}
     motion = Profile('separating', tuple(segment for one in made.segments for segment in one), first.truth['profile'].joint_names)
