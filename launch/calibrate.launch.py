@@ -3,6 +3,8 @@ Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
 
+    ros2 launch imu_calibration calibrate.launch.py table:=none urdf:=topic imu:=/imu/data_raw      # on the arm of robot_description
+
     ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand, without a table
 
 Several IMUs: one launch each with its own `namespace` and `save_file`.
@@ -24,6 +26,9 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description, YAML; none: no table, by hand'),
+        DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf or .xacro), path; or topic: '
+                              'robot_description; with table:=none, or one that says where the arm stands'),
+        DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
                               description='parameters of the node, YAML'),
         DeclareLaunchArgument('save_file', default_value='',
@@ -38,6 +43,8 @@ def generate_launch_description():
             package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'), {
                 'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+                'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
+                'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
                 'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str),
                 'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
                 'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],

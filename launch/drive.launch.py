@@ -3,6 +3,8 @@ Let a table or an arm move by itself until the IMU on it is calibrated; nothing 
 
     ros2 launch imu_calibration drive.launch.py table:=/path/to/table.yaml joint_trajectory:=/joint_trajectory_controller/joint_trajectory
 
+    ros2 launch imu_calibration drive.launch.py table:=none urdf:=topic joint_trajectory:=/joint_trajectory_controller/joint_trajectory
+
     ros2 service call /planner_node/start std_srvs/srv/Trigger
 """
 
@@ -20,6 +22,8 @@ CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 def generate_launch_description():
     """Describe calibration_node and planner_node, for the same table."""
     table = {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+             'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
+             'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
              'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
     save = {'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str)}
     topics = [('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
@@ -27,6 +31,9 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description with the limits of its joints, YAML'),
+        DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf or .xacro), path; or topic: '
+                              'robot_description; with table:=none, or one that says where the arm stands'),
+        DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('save_file', default_value='',
                               description='where ~/save of calibration_node writes; empty: calibration.yaml in the working directory'),
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),

@@ -26,8 +26,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--by-hand', action='store_true', help='without a table: poses and turns in words and pictures')
     parser.add_argument('--motion', choices=('any', 'yaw-only'), default='any',
                         help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
-    parser.add_argument('--calibration', '--known', metavar='FILE', help='what is known already: calibration.yaml, or the .accumulator.npz that '
-                        'calibration_node saved')
+    parser.add_argument('--calibration', '--known', metavar='FILE', help='what is known already: calibration.yaml, or the '
+                        '.accumulator.npz that calibration_node saved')
     parser.add_argument('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
                         '--calibration contains; at most three minutes')
     parser.add_argument('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')

@@ -36,6 +36,7 @@ from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.robot_stand import RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.session_reference import reference_of
 from imu_calibration.resources import config_file
@@ -98,7 +99,9 @@ class CalibrationNode(Node):
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
         self._hand_settings = declare_parameters(self, LiveByHandSettings)
-        self._reference = reference_of(self.settings.table_file)
+        robot = declare_parameters(self, RobotSettings)
+        self._reference = reference_of(chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id),
+                                       words_of(robot, self.settings.table_file))
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
         self._gatherer = LiveGatherer(self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
@@ -205,7 +208,7 @@ class CalibrationNode(Node):
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
         silent = [] if state.streams is None else [self._inputs[name].silence(state.streams.unusable.get(name, '')) for name in state.streams.silent]
         if 'joints' not in self._inputs and self.count_publishers(self.resolve_topic_name('joint_states')):
-            about_topics.append("joint states are published and not listened to: to calibrate on a table give 'table_file'")
+            about_topics.append("joint states are published and not listened to: to calibrate on a table or an arm give 'table_file' or 'urdf_file'")
         trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
         if time.monotonic() - self._started > PATIENCE:
             self._complaints.now('calibration', about_topics + silent + trouble, state.faults)

@@ -39,7 +39,8 @@ from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker
-from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
+from imu_calibration.planning.noise import expected_noise, require_grade
 from imu_calibration.planning.planner import make_planner
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.resources import config_file
@@ -60,7 +61,7 @@ class PlannerNodeSettings:
     """What is moved, for which parameters, and how it is commanded."""
 
     table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
-                              'config/table_three_axis.yaml', symptom='other joints, or limits that are not theirs', session=True)
+                              'config/table_three_axis.yaml, or with urdf_file nothing', symptom='other joints, or limits that are not theirs', session=True)
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='motions go on for too long, or end too early', session=True)
     accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
@@ -68,6 +69,8 @@ class PlannerNodeSettings:
     reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
     grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
                          symptom='the predicted standard deviations are not those that are reached')
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
+                              symptom='the predicted standard deviations are not those that are reached', session=True)
     imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
                               'the predicted standard deviations are not those that are reached')
     command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
@@ -84,12 +87,13 @@ class PlannerNode(Node):
         self._campaign_settings = declare_parameters(self, CampaignSettings)
         driver_settings = declare_parameters(self, DriverSettings)
         settings = self.settings
-        if settings.grade not in GRADES:
-            raise InputError(f"parameter 'grade' must be one of {', '.join(sorted(GRADES))}, got '{settings.grade}'; choose one")
-        self._table = files.read_table(files.user_path(settings.table_file) if settings.table_file else config_file('table_three_axis.yaml'))
+        require_grade(settings.grade)
+        robot = declare_parameters(self, RobotSettings)
+        self._table = chain_of(self, robot, settings.table_file) or files.read_table(config_file('table_three_axis.yaml'))
         tolerances = files.read_tolerances(files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml'))
         self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
-                                           settings.reference_model or None, tolerances)
+                                           settings.reference_model or None, tolerances,
+                                           noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
         self._lock, self._stamp, self._documents, self._told = threading.RLock(), 0.0, [], {}
         self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
         self._names = tuple(self._table.joint_names)
@@ -118,7 +122,7 @@ class PlannerNode(Node):
         return 'stopped in mid-motion' if was_driving else ''
 
     def _make_campaign(self) -> Campaign:
-        noise = noise_of_grade(GRADES[self.settings.grade].noise, self.settings.imu_rate)
+        noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
         planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate, options=self._options,
                                calibration=self._latest())
         return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise))

@@ -3,16 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from imu_calibration import files
 from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.session import LiveSession
 from imu_calibration.reference.joint import JointNames
-
-NO_TABLE = ('', 'none')
-"""Values of `table_file` that mean: by hand. Launch arguments cannot be empty."""
+from imu_calibration.reference.table import Table
 
 
 @dataclass(frozen=True)
@@ -27,20 +24,10 @@ class SessionReference:
     """Returns a new session, which goes on with what an earlier one saved, if anything."""
 
 
-def reference_of(table_file: str) -> SessionReference:
-    """
-    Return the reference that a path stands for.
-
-    Raises
-    ------
-    InputError
-        When it is no table description.
-
-    """
-    if table_file in NO_TABLE:
-        return SessionReference(None, "by hand, since no 'table_file' was given: hold the IMU still in many attitudes and turn it in between",
+def reference_of(table: Table | None, named: str) -> SessionReference:
+    """Return the reference that a table or an arm with this name is; None: gravity alone."""
+    if table is None:
+        return SessionReference(None, "by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in many attitudes and turn it in between",
                                 lambda options, live, by_hand, saved: LiveByHand(options, live, by_hand, saved=saved))
-    path = files.user_path(table_file)
-    table = files.read_table(path)
-    return SessionReference(table.joint_names, f'on the table {path} with the joints {", ".join(table.joint_names)}',
-                     lambda options, live, by_hand, saved: LiveCalibration(table, options, live, saved=saved))
+    return SessionReference(table.joint_names, f'on {named} with the joints {", ".join(table.joint_names)}',
+                            lambda options, live, by_hand, saved: LiveCalibration(table, options, live, saved=saved))

@@ -31,6 +31,7 @@ from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
@@ -52,7 +53,7 @@ STRETCH = 0.1
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml',
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml, or with urdf_file nothing',
                               symptom='joint names are not those expected', session=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
@@ -128,7 +129,8 @@ class SimulatorNode(Node):
 
     def _make_table(self):
         settings = self.settings
-        table = files.read_table(Path(settings.table_file or config_file('table_three_axis.yaml')).expanduser())
+        robot = declare_parameters(self, RobotSettings)
+        table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id) or files.read_table(config_file('table_three_axis.yaml'))
         profile = None if settings.profile in NO_PROFILE else make_profile(settings.profile, settings.seed, table)
         if profile is not None and profile.table is not None:
             table = Table.from_mapping(profile.table)

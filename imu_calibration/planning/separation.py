@@ -28,7 +28,8 @@ SESSION = 'quick'
 
 
 def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
-                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(), sizes: Mapping[str, float] | None = None) -> Planner:
+                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(),
+                   sizes: Mapping[str, float] | None = None) -> Planner:
     """
     Return a planner whose goal is to tell causes apart.
 
@@ -69,17 +70,18 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
     situation = Situation(Repertoire(table, limits_of(table)), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
-    situation.goal = ToldApart(coordinates, suspected(situation, causes, table, sizes or {}), questions)
+    situation.goal = ToldApart(coordinates, suspected(situation, causes, table, sizes=sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
     return Planner(situation, coordinates.information_from(names, calibration.covariance))
 
 
-def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table, sizes: Mapping[str, float]) -> list[Cause]:
+def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table, *,
+              sizes: Mapping[str, float]) -> list[Cause]:
     """
     Return the causes with their sizes: the first as it was found, the mates as large as they would have to be to pass for it.
 
-    Where `sizes` has nothing of a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the information of
-    a usual session, r the baseline.
+    Where `sizes` has nothing of a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the
+    information of a usual session, r the baseline.
     """
     coordinates = situation.coordinates
     found = []

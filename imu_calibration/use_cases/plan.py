@@ -22,11 +22,10 @@ from imu_calibration.effects.named_models import BASE, parse_effects
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
-from imu_calibration.planning.noise import noise_of_figures, noise_of_grade
+from imu_calibration.planning.noise import expected_noise
 from imu_calibration.planning.planner import Plan, make_planner
 from imu_calibration.planning.separation import make_separator
 from imu_calibration.reference.table import Table
-from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.stand import Stand, table_of
@@ -102,7 +101,8 @@ class Planned:
 
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
          separate: Sequence[str] = (), diagnosis: str | PathLike | Mapping[str, Any] | None = None,
-         longest: float = LONGEST_SEPARATION, progress: Callable[[float], None] | None = None, with_bound: bool = True, **choices: Any) -> Planned:
+         longest: float = LONGEST_SEPARATION, progress: Callable[[float], None] | None = None, with_bound: bool = True,
+         **choices: Any) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
 
@@ -136,7 +136,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
 
     """
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
-    noise = _noise(options, grade, imu_rate)
+    noise = expected_noise(options.noise, grade, imu_rate)
     known = _known(calibration, table, options)
     causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
     if causes:
@@ -217,7 +217,8 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
     accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue) for sensor in SENSORS)
     model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
-    found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=_noise(options, grade, imu_rate), rate=imu_rate)
+    noise = expected_noise(options.noise, grade, imu_rate)
+    found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=noise, rate=imu_rate)
     return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                                          'reference': 'gravity, by hand'})
 
@@ -230,20 +231,13 @@ def hand_summary(made: HandPlan) -> list[str]:
     return lines + ([f'out of reach by hand: {", ".join(made.missing)}'] if made.missing else [])
 
 
-def _noise(options, grade, imu_rate):
-    """Return the noise that was given, or that of a grade."""
-    if grade not in GRADES:
-        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
-    return noise_of_grade(GRADES[grade].noise, imu_rate) if options.noise is None else noise_of_figures(options.noise, imu_rate)
-
-
 def _class_of(diagnosis):
     return class_in(diagnosis) if isinstance(diagnosis, Mapping) else files.read_mapping(diagnosis, 'diagnosis', class_in)
 
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
     """
-    Return the first class of effects that a diagnosis did not tell apart, the named one first, and parameter -> value (SI) of the others in its place.
+    Return the first class of effects that a diagnosis did not tell apart, the named one first, and values (SI) of the others.
 
     Raises
     ------

@@ -1,0 +1,120 @@
+"""An arm in the place of a table for a node: its description from a file or from robot_description, the IMU's link, how its root stands."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Imu
+from std_msgs.msg import String
+
+from imu_calibration import files
+from imu_calibration.nodes.qos import latched_qos
+from imu_calibration.nodes.static_frames import StaticFrames
+from imu_calibration.reference.table import Table
+from imu_calibration.reference.urdf import root_of, table_from_urdf
+from imu_calibration.settings import setting
+
+TOPIC = 'topic'
+"""Value of `urdf_file` that stands for the topic robot_description."""
+NO_TABLE = ('', 'none')
+"""Values of `table_file` that mean: none. Launch arguments cannot be empty."""
+STEP, PATIENCE = 0.1, 5.0
+"""Seconds of one wait; after which it is said what is waited for, and again each time."""
+Found = TypeVar('Found')
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """The arm that carries the IMU."""
+
+    urdf_file: str = setting('', '', f"description (.urdf or .xacro) of the arm that carries the IMU, path; {TOPIC}: what comes on robot_description; empty: "
+                             'table_file alone. Beside an arm table_file says where it stands: up, gravity, latitude, limits of joints by name',
+                             symptom='the node waits, and says for what', session=True, fixed='all motion gathered so far is of that arm')
+    imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',
+                            symptom='another place and attitude of the sensor', session=True, fixed='all motion gathered so far is of that link')
+    world_frame: str = setting('', '', 'frame whose z axis points up and that /tf_static ties to the root of the arm; empty: up is as table_file says, '
+                               "else the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
+                               fixed='all motion gathered so far is of an arm that stands so')
+
+
+def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str = '') -> Table | None:
+    """
+    Return the chain of joints that a node's parameters describe, None for neither table nor arm.
+
+    Waits for the topics that must say it, as long as the node runs: they come when somebody else has been started.
+
+    Parameters
+    ----------
+    node : Node
+        Not spun by anybody yet.
+    robot : RobotSettings
+    table_file : str
+    frame_id : str
+        Frame of the IMU's messages; '': that of the first one that comes.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be used, the description is none, or the link is not on it.
+
+    """
+    place = None if table_file in NO_TABLE else files.user_path(table_file)
+    if not robot.urdf_file:
+        return None if place is None else files.read_table(place)
+    site = {} if place is None else files.read_mapping(place, 'table description')
+    text = _topic_text(node) if robot.urdf_file == TOPIC else files.read_robot_description(files.user_path(robot.urdf_file))
+    link = robot.imu_link or frame_id or _message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id
+    if robot.world_frame:
+        site['up'] = _up(node, robot.world_frame, root_of(text))
+    return table_from_urdf(text, link, site)
+
+
+def words_of(robot: RobotSettings, table_file: str) -> str:
+    """Return what `chain_of` gives, in words."""
+    if not robot.urdf_file:
+        return f'the table {files.user_path(table_file)}'
+    return 'the arm that comes on robot_description' if robot.urdf_file == TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
+
+
+def _topic_text(node):
+    return _message(node, String, 'robot_description', latched_qos()).data
+
+
+def _up(node, world, root):
+    """Return the z axis of a frame in the root of the robot."""
+    frames = StaticFrames(node, lambda: None)
+    _, mat_rw = _waited_for(node, lambda: frames.pose(root, world), lambda: frames.waits_for(root, world))
+    return (mat_rw @ np.array([0.0, 0.0, 1.0])).tolist()
+
+
+def _message(node: Node, kind: type, topic: str, qos: QoSProfile) -> Any:
+    """Return the first message of a topic."""
+    came: list[Any] = []
+    subscription = node.create_subscription(kind, topic, came.append, qos)
+    try:
+        return _waited_for(node, lambda: came[0] if came else None,
+                           lambda: f'a message on {node.resolve_topic_name(topic)} ({kind.__module__.split(".")[0]}/{kind.__name__})')
+    finally:
+        node.destroy_subscription(subscription)
+
+
+def _waited_for(node: Node, look: Callable[[], Found | None], what: Callable[[], str]) -> Found:
+    """Return what `look` gives once it gives anything; raises an ExternalShutdownException when the context ends before."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    said = time.monotonic() - PATIENCE + 1.0
+    try:
+        while (found := look()) is None:
+            executor.spin_once(timeout_sec=STEP)
+            if time.monotonic() - said > PATIENCE:
+                node.get_logger().info(f'waits for {what()}')
+                said = time.monotonic()
+        return found
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()

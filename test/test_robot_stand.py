@@ -1,0 +1,119 @@
+"""Nodes on an arm: its description from a file or from robot_description, its link from the messages, its up from a file or /tf_static."""
+
+import threading
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration import files
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.reference.static_transforms import StaticTransforms
+from imu_calibration.reference.urdf import table_from_urdf
+from imu_calibration.simulation.sensor_noise import GRADES
+
+pytest.importorskip('rclpy')
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from sensor_msgs.msg import Imu  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from imu_calibration.nodes import planner_node, robot_stand  # noqa: E402
+from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
+from imu_calibration.nodes.planner_node import PlannerNode  # noqa: E402
+from imu_calibration.nodes.qos import latched_qos  # noqa: E402
+from imu_calibration.nodes.robot_stand import RobotSettings, chain_of  # noqa: E402
+
+from ros.one_process import OneProcess  # noqa: E402
+from worlds.arms import SIX_AXES  # noqa: E402
+
+pytestmark = pytest.mark.dds
+LINK = 'imu_link'
+
+
+@pytest.fixture(scope='module')
+def bench():
+    """Nodes in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        bench = OneProcess(patch)
+        yield bench
+        bench.close()
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    """Where the arm stands."""
+    path = tmp_path_factory.mktemp('site') / 'site.yaml'
+    path.write_text(yaml.safe_dump({'gravity': 9.81, 'up': [0.0, 1.0, 0.0]}))
+    return str(path)
+
+
+def same(table, other):
+    """Assert that two chains are one."""
+    assert table.joint_names == other.joint_names and table.up == pytest.approx(other.up)
+    assert [(joint.name, joint.xyz, joint.limits) for joint in table.joints] == [(joint.name, joint.xyz, joint.limits) for joint in other.joints]
+    assert table.mount_xyz == other.mount_xyz and table.gravity_value == other.gravity_value
+
+
+class Talking:
+    """Publishes messages of an IMU in a thread while a node is being made."""
+
+    def __init__(self, bench):
+        self._publisher = bench.node.create_publisher(Imu, 'imu/data_raw', qos_profile_sensor_data)
+        self._end, self._thread = threading.Event(), threading.Thread(target=self._talk, daemon=True)
+
+    def _talk(self):
+        message = Imu()
+        message.header.frame_id = LINK
+        while not self._end.wait(0.02):
+            self._publisher.publish(message)
+
+    def __enter__(self):
+        self._thread.start()
+
+    def __exit__(self, *_):
+        self._end.set()
+        self._thread.join()
+
+
+def test_the_description_and_the_link_come_from_topics(bench, site):
+    bench.node.create_publisher(String, 'robot_description', latched_qos()).publish(String(data=SIX_AXES))
+    with Talking(bench):
+        calibrates, moves = (bench.start(node, {'urdf_file': 'topic', 'table_file': site}) for node in (CalibrationNode, PlannerNode))
+    expected = table_from_urdf(SIX_AXES, LINK, files.read_mapping(site, 'site'))
+    same(calibrates.worker.live.table, expected)
+    same(moves._table, expected)
+    assert bench.heard('on the arm that comes on robot_description with the joints pan, lift, elbow') == 1
+
+
+def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_that_of_a_file(bench, tmp_path, monkeypatch):
+    (tmp_path / 'arm.urdf').write_text(SIX_AXES)
+    transforms = StaticTransforms()
+    transforms.add('map', 'base_link', xyz=(0, 0, 1), quaternion=(np.sin(0.3), 0, 0, np.cos(0.3)))
+    asked = []
+
+    class Frames:
+        """Knows the transforms from the second question on."""
+
+        def __init__(self, node, changed):
+            pass
+
+        def pose(self, target, source):
+            asked.append((target, source))
+            return transforms.pose(target, source) if len(asked) > 1 else None
+    monkeypatch.setattr(robot_stand, 'StaticFrames', Frames)
+    robot = RobotSettings(str(tmp_path / 'arm.urdf'), 'tool', 'map')
+    table = chain_of(bench.node, robot, 'none')
+    assert table.up == pytest.approx((0.0, np.sin(0.6), np.cos(0.6))) and asked == [('base_link', 'map')] * 2
+    noise = noise_of_grade(GRADES['tactical'].noise, 100.0)
+    monkeypatch.setattr(planner_node.files, 'read_noise', lambda path: (path, 'figures'))
+    monkeypatch.setattr(planner_node, 'expected_noise', lambda figures, grade, rate: noise if figures == (tmp_path / 'noise.yaml', 'figures') else None)
+    node = bench.start(PlannerNode, {'urdf_file': str(tmp_path / 'arm.urdf'), 'imu_link': 'tool', 'table_file': 'none', 'noise_file': str(tmp_path / 'noise.yaml')})
+    assert node._make_campaign().planner.situation.noise == noise
+
+
+def test_what_cannot_be_used_is_refused_by_name(bench, tmp_path):
+    (tmp_path / 'arm.urdf').write_text(SIX_AXES)
+    with pytest.raises(ImuCalibrationError, match="must hold the link 'nowhere'"):
+        chain_of(bench.node, RobotSettings(str(tmp_path / 'arm.urdf'), 'nowhere'), '')
+    assert chain_of(bench.node, RobotSettings(), 'none') is None
