@@ -17,8 +17,9 @@ from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _from_x, scene_of
+from imu_calibration.use_cases.foxglove_file import _from_x, scene_of
 from imu_calibration.use_cases.view import _coverage, view
+from imu_calibration.use_cases.view_messages import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE
 
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -52,25 +53,31 @@ def written(tmp_path_factory):
     return read(path)
 
 
+def shown_of(written, topic):
+    """Return what a topic shows, at the beginning and at the end alike."""
+    [(start, shown), (end, again)] = written[topic][2]
+    assert start == 0 and end >= 1 and shown == again
+    return shown
+
+
 def test_every_topic_has_its_schema(written):
     assert {topic: (name, encoding) for topic, (name, encoding, _) in written.items()} == {
-        **{topic: (schema['title'], 'json') for topic, schema in SCHEMAS.items()}, SPHERE: ('foxglove.SceneUpdate', 'protobuf')}
+        **{topic: (SCHEMAS[topic]['title'], 'json') for topic in (PARAMETERS, RESIDUAL, SPECTRUM)}, SPHERE: ('foxglove.SceneUpdate', 'protobuf')}
 
 
 def test_residuals_are_those_of_the_windows_at_their_time(written, result):
-    errors, messages = result.window_errors(), written[RESIDUAL][2]
+    errors, windows = result.window_errors(), shown_of(written, RESIDUAL)['windows']
     order = np.argsort(errors.time, kind='stable')
-    assert [time for time, _ in messages] == pytest.approx(errors.time[order])
+    assert [row['time'] for row in windows] == list(errors.time[order]) and written[RESIDUAL][2][1][0] == pytest.approx(errors.time.max())
     for which in ('before', 'after', 'floor'):
         for sensor in SENSORS:
-            shown = np.array([[row[which][sensor][axis] for axis in 'xyz'] for _, row in messages])
+            shown = np.array([[row[which][sensor][axis] for axis in 'xyz'] for row in windows])
             assert np.array_equal(shown, getattr(errors, which)[sensor][order]), (which, sensor)
 
 
 def test_parameters_have_value_band_and_tolerance(written, result):
-    [(time, shown)], calibration = written[PARAMETERS][2], result.calibration
-    rows = shown['parameters']
-    assert time == 0 and [row['name'] for row in rows] == list(calibration.param_names)
+    rows, calibration = shown_of(written, PARAMETERS)['parameters'], result.calibration
+    assert [row['name'] for row in rows] == list(calibration.param_names)
     assert [row['ratio'] for row in rows] == pytest.approx(calibration.sd / result.tolerances)
     for name, wanted in (('value', calibration.values), ('sd', calibration.sd), ('tolerance', result.tolerances),
                          ('low', calibration.values - 1.96 * calibration.sd), ('high', calibration.values + 1.96 * calibration.sd)):
@@ -79,15 +86,15 @@ def test_parameters_have_value_band_and_tolerance(written, result):
 
 
 def test_the_sphere_says_what_is_next_and_shows_every_cell_and_rest(written, result):
-    [(time, scene)], found = written[SPHERE][2], _coverage(result)
+    scene, found = shown_of(written, SPHERE), _coverage(result)
     drawn = str(scene_of(found, 'imu_link'))
-    assert time == 0 and scene == scene_of(found, result.calibration.frame_id).encode() and line_of(found).encode() in scene
+    assert scene == scene_of(found, result.calibration.frame_id).encode() and line_of(found).encode() in scene
     assert drawn.count('SpherePrimitive') == 26 + (result.window_errors().kind == 'static').sum()
 
 
 def test_spectrum_is_that_of_the_residuals(written, result):
-    [(_, shown)] = written[SPECTRUM][2]
-    frequency, density = residual_spectrum(result)
+    shown = shown_of(written, SPECTRUM)
+    frequency, density = residual_spectrum(result, result.gathered.kept)
     assert [line['frequency'] for line in shown['lines']] == list(frequency) and len(frequency) > 30
     assert np.array_equal([[line['gyroscope'][axis] for axis in 'xyz'] for line in shown['lines']], density['gyroscope'])
 
@@ -97,9 +104,8 @@ def test_a_line_stands_at_its_frequency_and_white_noise_at_its_density():
     rng, time = np.random.default_rng(1), np.arange(4096) / 100
     noise = 0.01 * rng.normal(size=(4096, 3))
     tone = noise + np.outer(0.2 * np.sin(2 * np.pi * 12 * time), [1, 0, 0])
-    windows = [type('Long', (), {'period': 0.01, '__len__': lambda self: 4096})() for _ in range(2)]
-    frequency, density = residual_spectrum(SimpleNamespace(gathered=SimpleNamespace(kept=windows),
-                                                           residuals_of=lambda _: {'accelerometer': tone + 3.0, 'gyroscope': noise}))
+    windows = [type('Long', (), {'kind': 'spin', 'period': 0.01, '__len__': lambda self: 4096})() for _ in range(2)]
+    frequency, density = residual_spectrum(SimpleNamespace(residuals_of=lambda _: {'accelerometer': tone + 3.0, 'gyroscope': noise}), windows)
     assert frequency[np.argmax(density['accelerometer'][:, 0])] == pytest.approx(12, abs=0.1) and frequency[0] > 0
     assert np.sqrt(np.mean(density['gyroscope']**2)) == pytest.approx(0.01 * np.sqrt(2 / 100), rel=0.05)
 
@@ -113,14 +119,13 @@ def test_an_arrow_points_where_it_shall(along):
 def test_of_imported_values_no_band_is_shown(tmp_path, result):
     imported = replace(result.calibration, provenance=result.calibration.provenance | {'uncertainty': UNKNOWN})
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(imported))
-    [(_, _, shown)] = view(tmp_path).messages
+    [shown] = view(tmp_path).contents.values()
     assert len(shown['parameters']) == len(imported.values) and not {'sd', 'low', 'high', 'ratio'} & set(shown['parameters'][0])
 
 
 def test_by_hand_there_are_poses_and_a_sphere_but_no_spectrum():
     shown = view(SampleBlock(simulate(3)[0]), gravity=GRAVITY)
-    topics = [topic for topic, _, _ in shown.messages]
-    assert set(topics) == {PARAMETERS, RESIDUAL} and topics.count(RESIDUAL) == len(shown.coverage.seen) >= 9
+    assert set(shown.contents) == {PARAMETERS, RESIDUAL} and len(shown.contents[RESIDUAL]['windows']) == len(shown.coverage.seen) >= 9
     assert 'spectrum' in shown.lacks[0]
 
 
@@ -149,7 +154,7 @@ def test_the_layout_asks_for_what_the_file_holds(written):
     assert {path.partition('.')[0] for path in asked} == set(written)
     for path in asked - {SPHERE}:
         topic, *names = path.replace('[:]', '').split('.')
-        found = written[topic][2][0][1]
+        found = shown_of(written, topic)
         for name in names:
             found = found[name]
             found = found[0] if isinstance(found, list) else found

@@ -1,9 +1,12 @@
 """Amplitude spectral density of what a calibration leaves within moving windows: lines name causes, the floor is the noise."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.segmentation.window import Window
 
 LONGEST = 1024
 """Samples of a segment, at most: finer lines than a recording of a minute can tell apart say nothing."""
@@ -11,16 +14,23 @@ SHORTEST = 64
 """Windows with fewer samples are left out."""
 
 
-def residual_spectrum(result: CalibrationResult) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
-    Return (frequency, sensor -> density) of the residuals of the moving windows that were kept.
+    Return (frequency, sensor -> density) of the residuals of the windows with motion among some.
 
     Welch's method [1]: the power of segments of one length, each about its own mean, averaged over all windows.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        What predicts them.
+    windows : sequence of Window
+        With their samples.
 
     Returns
     -------
     frequency : ndarray
-        Above zero, Hz, shape (n,); none where no window is long enough, and by hand.
+        Above zero, Hz, shape (n,); none where no window is long enough.
     dict
         Sensor -> one-sided amplitude density, (m/s^2)/sqrt(Hz) or (rad/s)/sqrt(Hz), shape (n, 3).
 
@@ -29,7 +39,7 @@ def residual_spectrum(result: CalibrationResult) -> tuple[np.ndarray, dict[str, 
     .. [1] P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967) 70-73.
 
     """
-    windows = [window for window in result.gathered.kept if len(window) >= SHORTEST]
+    windows = [window for window in windows if window.kind != 'static' and len(window) >= SHORTEST]
     if not windows:
         return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
     from scipy.signal import welch

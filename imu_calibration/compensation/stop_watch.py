@@ -1,11 +1,26 @@
 """The tap in a stream of corrected samples: keeps them for a quarter of a second, looks for stops, and takes off what they showed."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
 from imu_calibration.compensation.health import CalibrationHealth
 from imu_calibration.compensation.stops import BLOCK, StopDetector
 
 SIX = tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedStretch:
+    """The samples between two looks."""
+
+    first_ns: int
+    """Where the times of the samples begin, ns."""
+    samples: list[tuple[int, SIX, SIX]]
+    """Time in ns, corrected and measured (rate x, y, z, force x, y, z); the corrected ones before any update of the bias."""
+    offset: tuple[float, float, float]
+    """What was taken off the corrected rate, rad/s."""
 
 
 class StopWatch:
@@ -20,7 +35,9 @@ class StopWatch:
 
     def __init__(self, health: CalibrationHealth):
         self.health, self._detector = health, StopDetector(health.noise_sd)
-        self._waiting: list[tuple[float, ...]] = []
+        self.listener: Callable[[CorrectedStretch], None] | None = None
+        """Called with each CorrectedStretch, in the midst of the stream: it must be quick and must not fail."""
+        self._waiting: list[tuple[int, SIX, SIX]] = []
         self._first_ns = self._look = 0
         self._offset: tuple[float, float, float] | None = None
 
@@ -46,6 +63,8 @@ class StopWatch:
         if stamp_ns < self._first_ns or not self._first_ns:   # the beginning, or a clock set back
             self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
             return
+        if self.listener is not None:
+            self.listener(CorrectedStretch(self._first_ns, self._waiting, self._offset or (0.0, 0.0, 0.0)))
         since, corrected, measured = map(np.array, zip(*self._waiting, strict=True))
         self._waiting, self._look = [], int(since[-1]) + round(1e9 * BLOCK)
         stop = self._detector.push(np.column_stack([since * 1e-9, corrected[:, 3:], corrected[:, :3], measured[:, 3:], measured[:, :3]]))

@@ -27,6 +27,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
+from imu_calibration.nodes.calibration_view import CalibrationView
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, Listeners
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import markers_of
@@ -34,6 +35,7 @@ from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.live_view import FoxgloveSettings
 from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of, words_of
@@ -99,6 +101,7 @@ class CalibrationNode(Node):
         self._live_settings = declare_parameters(self, LiveSettings)
         self._options = self._read_options(declare_parameters(self, WindowSettings))
         self._hand_settings = declare_parameters(self, LiveByHandSettings)
+        view = declare_parameters(self, FoxgloveSettings)
         robot = declare_parameters(self, RobotSettings)
         self._reference = reference_of(chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id),
                                        words_of(robot, self.settings.table_file))
@@ -108,9 +111,10 @@ class CalibrationNode(Node):
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
+        self._view = CalibrationView(self, view)
+        listeners = Listeners(self._publish_document, self._publish_residuals, self._publish_coverage, self._view.take_solution)
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
-                                        listeners=Listeners(self._publish_document, self._publish_residuals, self._publish_coverage),
-                                        hints=HINTS['calibration_node'])
+                                        listeners=listeners, hints=HINTS['calibration_node'])
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
@@ -118,7 +122,8 @@ class CalibrationNode(Node):
         self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
                                        live.observations.removesuffix('s'))
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
-        groups = {'settings': self.settings, 'live': self._live_settings, 'windows': self._options.windows, 'by_hand': self._hand_settings}
+        groups = {'settings': self.settings, 'live': self._live_settings, 'windows': self._options.windows, 'by_hand': self._hand_settings,
+                  'view': view}
         watch_parameters(self, groups, self._change, hints=HINTS['calibration_node'])
         self.worker.start()
 
@@ -133,6 +138,7 @@ class CalibrationNode(Node):
 
     def close(self) -> str:
         """End the worker after what it is doing; return what became of the motion that is in no file."""
+        self._view.close()
         return self.worker.end()
 
     def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
@@ -184,6 +190,8 @@ class CalibrationNode(Node):
         elif name == 'by_hand':
             self._hand_settings = group
             self.worker.ask(lambda: self.worker.change_by_hand(group))
+        elif name == 'view':
+            self._view.change(group)
 
     def _publish_document(self, text: str) -> None:
         self._publish(self._document, String(data=text))
@@ -194,6 +202,7 @@ class CalibrationNode(Node):
 
     def _publish_coverage(self, coverage: Any) -> None:
         self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg()))
+        self._view.take_coverage(coverage)
 
     def _publish(self, publisher: Any, message: Any) -> None:
         try:

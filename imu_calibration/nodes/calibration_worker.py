@@ -20,6 +20,7 @@ from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.preflight.stream_watch import StreamWatch
+from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_settings import WindowSettings
 from msg_adapters.live import LiveGatherer
 
@@ -39,6 +40,8 @@ class Listeners:
     """Called with ImuSamples."""
     coverage: Callable[[Any], None] = lambda coverage: None
     """Called with each new Coverage."""
+    solution: Callable[[CalibrationResult, list[Window]], None] = lambda result, windows: None
+    """Called with each new solution and the windows that are still there with their samples; none by hand."""
 
 
 class CalibrationWorker(threading.Thread):
@@ -193,6 +196,7 @@ class CalibrationWorker(threading.Thread):
         self._note_fault('solution', '')
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
+        self.listeners.solution(result, self._windows.recent.list())
         self._pacer.note(start, time.monotonic())
         return result, text
 

@@ -23,6 +23,7 @@ from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.nodes.compensator_view import CompensatorFoxglove, CompensatorView
 from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
@@ -47,6 +48,8 @@ class CompensatorNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('compensator_node', **options)
         self.settings = declare_parameters(self, CompensatorSettings)
+        view = declare_parameters(self, CompensatorFoxglove)
+        self._view = CompensatorView(self, view)
         self.adopted: Adopted | None = None
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
@@ -68,7 +71,7 @@ class CompensatorNode(Node):
         self.diagnostics = CompensatorDiagnostics(self)
         self.create_service(Trigger, '~/reload', self._on_reload)
         self._start()
-        watch_parameters(self, {'settings': self.settings}, self._change, hints=HINTS['compensator_node'])
+        watch_parameters(self, {'settings': self.settings, 'view': view}, self._change, hints=HINTS['compensator_node'])
         self._timer: Timer | None = None
         self._set_refresh(self.settings.covariance_rate)
 
@@ -90,6 +93,11 @@ class CompensatorNode(Node):
             relay_loop.relay(self, self.imu, self._publisher, convert=self.convert)
         else:
             rclpy.spin(self)
+
+    def close(self) -> str:
+        """End what is shown."""
+        self._view.close()
+        return ''
 
     def convert(self, data: bytes, information: dict) -> bytes | None:
         """Return what to publish for a serialized message, or None."""
@@ -148,6 +156,7 @@ class CompensatorNode(Node):
 
     def _put_in_force(self, adopted: Adopted) -> None:
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
+        self._view.take_calibration(adopted)
         self.awaited = ''
         if self.temperature is None and (adopted.compensation.needs_temperature or adopted.calibration.conditions.get('temperature_range_c')):
             self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10, raw=False)
@@ -198,8 +207,14 @@ class CompensatorNode(Node):
         response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
         return response
 
-    def _change(self, _name: str, settings: CompensatorSettings) -> None:
+    def _change(self, name: str, settings: Any) -> None:
         """Take changed parameters; raises an ImuCalibrationError and stays as it was."""
+        if name == 'view':
+            self._view.change(settings)
+        else:
+            self._change_compensation(settings)
+
+    def _change_compensation(self, settings: CompensatorSettings) -> None:
         old, insists = self.settings, settings.anyway and not self.settings.anyway
         if settings.calibration_file and (settings.calibration_file != old.calibration_file or (insists and not settings.takes_topic)):
             self._load_file(settings)

@@ -1,6 +1,6 @@
-"""MCAP as Foxglove wants it: a schema for every topic, the sphere as a SceneUpdate; nothing else of the project knows foxglove-sdk."""
+"""MCAP as Foxglove wants it: a schema for every topic, the sphere as a SceneUpdate; only foxglove_server knows foxglove-sdk beside it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from io import BytesIO
 from typing import Any
 
@@ -9,24 +9,10 @@ import numpy as np
 from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.coverage_look import ARMS_TIMES, ARROW, RADIUS, SEEN, TINY, WHITE, cells_of, line_of
 from imu_calibration.errors import InputError
+from imu_calibration.use_cases.view_messages import SCHEMAS, SPHERE
 
-PARAMETERS, RESIDUAL, SPECTRUM, SPHERE = '/imu/parameters', '/imu/residual/windows', '/imu/residual/spectrum', '/imu/coverage'
-NUMBER, TEXT = {'type': 'number'}, {'type': 'string'}
-
-
-def _object(**properties):
-    return {'type': 'object', 'properties': properties}
-
-
-AXES = _object(x=NUMBER, y=NUMBER, z=NUMBER)
-SENSOR_AXES = _object(accelerometer=AXES, gyroscope=AXES)
-SCHEMAS = {
-    PARAMETERS: {'title': 'imu_calibration.Parameters', **_object(parameters={'type': 'array', 'items': _object(
-        name=TEXT, value=NUMBER, sd=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, tolerance=NUMBER, ratio=NUMBER, status=TEXT)})},
-    RESIDUAL: {'title': 'imu_calibration.Residual', **_object(motion=TEXT, before=SENSOR_AXES, after=SENSOR_AXES, floor=SENSOR_AXES)},
-    SPECTRUM: {'title': 'imu_calibration.Spectrum', **_object(lines={'type': 'array', 'items': _object(
-        frequency=NUMBER, accelerometer=AXES, gyroscope=AXES)})},
-}
+SHORTEST = 1.0
+"""Seconds of a file at least: a player wants a beginning and an end."""
 
 
 def foxglove() -> Any:
@@ -48,30 +34,39 @@ def foxglove() -> Any:
     return foxglove
 
 
-def foxglove_bytes(messages: Sequence[tuple[str, float, dict[str, Any]]], coverage: Coverage | None, frame_id: str) -> bytes:
+def foxglove_bytes(contents: Mapping[str, dict[str, Any]], coverage: Coverage | None, frame_id: str, *, seconds: float = 0.0) -> bytes:
     """
-    Return an MCAP.
+    Return an MCAP that holds the same at its beginning and at its end: it is there wherever somebody looks.
 
     Parameters
     ----------
-    messages : sequence of (topic, time, content)
-        Topics of `SCHEMAS`; time in s.
+    contents : mapping
+        Topic of `SCHEMAS` -> content.
     coverage : Coverage or None
-        The sphere, at time zero.
+        The sphere.
     frame_id : str
         Frame of the sphere.
+    seconds : float
+        Length of the recording.
 
     """
     sdk, whole = foxglove(), BytesIO()
     context = sdk.Context()
     with sdk.open_mcap(whole, context=context):
-        channels = {topic: sdk.Channel(topic, schema=SCHEMAS[topic], message_encoding='json', context=context) for topic in
-                    dict.fromkeys(topic for topic, _, _ in messages)}
+        shown = [(channel_of(sdk, topic, context), content) for topic, content in contents.items()]
         if coverage is not None:
-            sdk.channels.SceneUpdateChannel(SPHERE, context=context).log(scene_of(coverage, frame_id), log_time=0)
-        for topic, time, content in sorted(messages, key=lambda message: message[1]):
-            channels[topic].log(content, log_time=round(1e9 * time))
+            shown.append((channel_of(sdk, SPHERE, context), scene_of(coverage, frame_id)))
+        for time in (0.0, max(seconds, SHORTEST)):
+            for channel, content in shown:
+                channel.log(content, log_time=round(1e9 * time))
     return whole.getvalue()
+
+
+def channel_of(sdk: Any, topic: str, context: Any) -> Any:
+    """Return a channel of a topic in a context of foxglove-sdk."""
+    if topic == SPHERE:
+        return sdk.channels.SceneUpdateChannel(topic, context=context)
+    return sdk.Channel(topic, schema=SCHEMAS[topic], message_encoding='json', context=context)
 
 
 def scene_of(coverage: Coverage, frame_id: str) -> Any:

@@ -5,8 +5,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Unpack
 
-import numpy as np
-
 from imu_calibration import files
 from imu_calibration.by_hand.next_pose import hand_coverage
 from imu_calibration.by_hand.options import HandOptions
@@ -15,19 +13,15 @@ from imu_calibration.by_hand.status import NOTHING
 from imu_calibration.calibration.coverage import Coverage, bars_of, table_coverage
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import group_states
-from imu_calibration.calibration.residual_spectrum import residual_spectrum
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.status import tolerances_of
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SPECTRUM, foxglove_bytes
+from imu_calibration.use_cases.foxglove_file import foxglove_bytes
 from imu_calibration.use_cases.stand import Stand
-
-BAND = 1.959964
-"""Standard deviations on each side of a value that hold 95 %."""
+from imu_calibration.use_cases.view_messages import PARAMETERS, RESIDUAL, SPECTRUM, parameters, residual, spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +30,12 @@ class View:
 
     calibration: Calibration
     """The calibration."""
-    messages: list[tuple[str, float, dict[str, Any]]]
-    """Topic, seconds since the first sample, content; SI units."""
+    contents: dict[str, dict[str, Any]]
+    """Topic -> content, as `view_messages.SCHEMAS` say."""
     coverage: Coverage | None
     """The sphere; None where only a file is known."""
+    seconds: float = 0.0
+    """Until the middle of the last window."""
 
     @property
     def exit_code(self) -> int:
@@ -51,7 +47,7 @@ class View:
         """What cannot be shown, and why."""
         if self.coverage is None:
             return ('a calibration file holds no residuals: the parameters alone are shown; give the recording for the rest',)
-        if not any(topic == SPECTRUM for topic, _, _ in self.messages):
+        if SPECTRUM not in self.contents:
             return ('no window with motion was long enough for a spectrum, and by hand there is none: it is left out',)
         return ()
 
@@ -65,7 +61,8 @@ class View:
             When foxglove-sdk is not installed or the place cannot be written.
 
         """
-        files.write_whole(path, foxglove_bytes(self.messages, self.coverage, self.calibration.frame_id or 'imu_link'))
+        files.write_whole(path, foxglove_bytes(self.contents, self.coverage, self.calibration.frame_id or 'imu_link',
+                                                seconds=self.seconds))
 
 
 def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
@@ -90,50 +87,22 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
         result = calibrate(source, table, **choices).result
-        messages = [_parameters(result.calibration, result.tolerances), *_residuals(result), *_spectrum(result)]
-        return View(result.calibration, messages, _coverage(result))
+        contents = {PARAMETERS: parameters(result.calibration, result.tolerances), RESIDUAL: residual(result),
+                    SPECTRUM: spectrum(result, result.gathered.kept)}
+        if not contents[SPECTRUM]['lines']:
+            del contents[SPECTRUM]
+        return View(result.calibration, contents, _coverage(result), contents[RESIDUAL]['windows'][-1]['time'])
     if table is not None:
         raise InputError('a table or arm says how a recording moved and must come with a recording, a calibration file came; '
                          'leave one out')
     calibration = files.read_calibration(path)
-    return View(calibration, [_parameters(calibration, tolerances_of(calibration.model))], None)
+    return View(calibration, {PARAMETERS: parameters(calibration, tolerances_of(calibration.model))}, None)
 
 
 def _document_of(path):
     """Return the calibration file that a path means, None where it means a recording."""
     path = path / 'calibration.yaml' if (path / 'calibration.yaml').is_file() else path
     return path if path.suffix in ('.yaml', '.yml') else None
-
-
-def _parameters(calibration, tolerances):
-    """Return the message of the parameters; without bands where nobody knows how certain the values are."""
-    units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
-    rows = [{'name': name, 'value': float(value), 'unit': unit, 'tolerance': float(tolerance), 'status': str(status)}
-            for name, value, unit, tolerance, status in
-            zip(calibration.param_names, calibration.values, units, tolerances, calibration.status, strict=True)]
-    for row, sd in zip(rows, map(float, calibration.sd)):
-        if calibration.uncertainty_known:
-            row.update(sd=sd, low=row['value'] - BAND * sd, high=row['value'] + BAND * sd, ratio=sd / row['tolerance'])
-    return PARAMETERS, 0.0, {'parameters': rows}
-
-
-def _residuals(result):
-    errors = result.window_errors()
-    for k in np.argsort(errors.time, kind='stable'):
-        yield RESIDUAL, float(errors.time[k]), {'motion': str(errors.kind[k]), **{
-            which: {sensor: _axes(getattr(errors, which)[sensor][k]) for sensor in SENSORS} for which in ('before', 'after', 'floor')}}
-
-
-def _spectrum(result):
-    frequency, density = residual_spectrum(result)
-    if len(frequency):
-        yield SPECTRUM, 0.0, {'lines': [{'frequency': float(f), **{sensor: _axes(density[sensor][k]) for sensor in SENSORS}}
-                                        for k, f in enumerate(frequency)]}
-
-
-def _axes(vector):
-    """Return the components by axis; those that nobody knows are left out, for JSON has no NaN."""
-    return {axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)}
 
 
 def _coverage(result: CalibrationResult) -> Coverage:

@@ -1,0 +1,50 @@
+"""What compensator_node shows to Foxglove: readings before and after, and whether the calibration still holds."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.compensation.health import CalibrationHealth
+from imu_calibration.compensation.stop_watch import CorrectedStretch
+from imu_calibration.nodes.adoption import Adopted
+from imu_calibration.nodes.live_view import FoxgloveSettings, LiveView
+from imu_calibration.nodes.message_compensation import LiveCompensation
+from imu_calibration.settings import setting
+from imu_calibration.use_cases.view_messages import HEALTH, PARAMETERS, READINGS, health, parameters, readings
+
+
+@dataclass(frozen=True)
+class CompensatorFoxglove(FoxgloveSettings):
+    """The same beside a calibration_node on the same host."""
+
+    foxglove_port: int = setting(8767, '', 'port to listen on, beside those of foxglove_bridge and calibration_node; 0: any that is free', (0, 65535),
+                                 'another program has it: the node says so and shows nothing', fixed='the port is taken when the server starts')
+
+
+class CompensatorView(LiveView):
+    """Shows what a compensation does: readings before and after with their band, what stops say of it, the parameters."""
+
+    def __init__(self, node: Any, settings: FoxgloveSettings):
+        self._adopted: Adopted | None = None
+        super().__init__(node, (READINGS, HEALTH, PARAMETERS), settings)
+
+    def change(self, settings: FoxgloveSettings) -> None:
+        """Begin or end showing; while it is off the stream of messages knows nothing of it."""
+        super().change(settings)
+        self._listen()
+
+    def take_calibration(self, adopted: Adopted) -> None:
+        """Show what is in force."""
+        self._adopted = adopted
+        self.show(PARAMETERS, partial(parameters, adopted.calibration, tolerances_of(adopted.calibration.model)))
+        self._listen()
+
+    def _listen(self) -> None:
+        compensation = None if self._adopted is None else self._adopted.compensation
+        if compensation is not None and compensation.watch is not None:
+            compensation.watch.listener = partial(self._take, compensation, compensation.watch.health) if self.is_on else None
+
+    def _take(self, compensation: LiveCompensation, holds: CalibrationHealth, stretch: CorrectedStretch) -> None:
+        self.add(READINGS, lambda: readings(stretch, compensation.sd))
+        self.show(HEALTH, lambda: health(holds.state))
