@@ -1,5 +1,11 @@
-"""compensator_node with a target frame and no pose: waits for /tf_static, says what it waits for, then corrects as with the pose in parameters."""
+"""
+compensator_node with a target frame and no pose: waits for /tf_static, says what it waits for, then corrects as with the pose in parameters.
 
+Over DDS with a real tf2_msgs: the installed one, or where no wheel has it one made from its definition. Where that cannot be made either (no
+compiler, no headers), another type holds the place of the subscription, and the node is handed the messages.
+"""
+
+import importlib.util
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -20,8 +26,10 @@ from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes import relay_loop  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
+from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
 
+from ros.message_package import make_package, why_not  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
 
 pytestmark = pytest.mark.dds
@@ -31,17 +39,49 @@ XYZ, RPY = [0.3, -0.1, 0.05], [0.2, -0.4, 1.1]
 MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
 
 
+@pytest.fixture(scope='module')
+def made_messages(tmp_path_factory):
+    """Whether messages on /tf_static are real ones; they can be imported afterwards."""
+    if importlib.util.find_spec('tf2_msgs') is None:
+        if why_not():
+            return False
+        folder = tmp_path_factory.mktemp('messages')
+        make_package(folder, 'tf2_msgs', {'TFMessage': 'geometry_msgs/TransformStamped[] transforms\n'},
+                     ('geometry_msgs', 'std_msgs', 'builtin_interfaces'))
+        sys.path.append(str(folder))
+    return True
+
+
+class Bench(OneProcess):
+    """Nodes in this process, and a broadcaster of static transforms."""
+
+    def __init__(self, monkeypatch, is_real):
+        super().__init__(monkeypatch)
+        self.is_real, self._publisher, self._held = is_real, None, {}
+
+    def broadcast(self, *steps):
+        """Publish (parent, child, xyz, quaternion) steps beside those before, latched, as tf2's StaticTransformBroadcaster does."""
+        self._held |= {one.child_frame_id: one for one in map(stamped, steps)}
+        if not self.is_real:
+            for node in self.nodes:
+                if node._frames._subscription is not None:
+                    node._frames.take(SimpleNamespace(transforms=list(self._held.values())))
+            return
+        from tf2_msgs.msg import TFMessage
+        if self._publisher is None:
+            self._publisher = self.node.create_publisher(TFMessage, TOPIC, latched_qos())
+        self._publisher.publish(TFMessage(transforms=list(self._held.values())))
+
+
 @pytest.fixture
-def bench(monkeypatch):
-    """Nodes in this process; where tf2_msgs has no wheel, another type holds the place of the subscription and `take` gets the messages."""
+def bench(monkeypatch, made_messages):
+    """A Bench."""
     monkeypatch.setattr(relay_loop, 'available', lambda: False)
-    try:
-        import tf2_msgs.msg  # noqa: F401
-    except ImportError:
+    if not made_messages:
         for name in ('tf2_msgs', 'tf2_msgs.msg'):
             monkeypatch.setitem(sys.modules, name, ModuleType(name))
         sys.modules['tf2_msgs.msg'].TFMessage = String
-    made = OneProcess(monkeypatch)
+    made = Bench(monkeypatch, made_messages)
     yield made
     made.close()
 
@@ -54,18 +94,16 @@ def place(tmp_path):
     return str(path)
 
 
-def transforms(*steps):
-    """A message of (parent, child, xyz, quaternion) steps."""
-    made = []
-    for parent, child, xyz, quaternion in steps:
-        one = TransformStamped(child_frame_id=child)
-        one.header.frame_id = parent
-        for name, value in zip('xyz', xyz, strict=True):
-            setattr(one.transform.translation, name, float(value))
-        for name, value in zip('xyzw', quaternion, strict=True):
-            setattr(one.transform.rotation, name, float(value))
-        made.append(one)
-    return SimpleNamespace(transforms=made)
+def stamped(step):
+    """A TransformStamped of a (parent, child, xyz, quaternion) step."""
+    parent, child, xyz, quaternion = step
+    one = TransformStamped(child_frame_id=child)
+    one.header.frame_id = parent
+    for name, value in zip('xyz', xyz, strict=True):
+        setattr(one.transform.translation, name, float(value))
+    for name, value in zip('xyzw', quaternion, strict=True):
+        setattr(one.transform.rotation, name, float(value))
+    return one
 
 
 POSE = ('base_link', 'imu_link', XYZ, Rotation.from_euler('xyz', RPY).as_quat())
@@ -81,15 +119,20 @@ def test_it_waits_and_says_for_what(bench, place):
     bench.until(lambda: STATUS in bench.status, 'diagnostics')
     level, message = bench.lines()[STATUS]
     assert level == WARN and f"waiting for the transform from 'base_link' to 'imu_link' on {TOPIC}: no static transform has come; nothing is published" in message
-    node._frames.take(transforms(('map', 'odom', [0, 0, 0], [0, 0, 0, 1])))
+    bench.broadcast(('map', 'odom', [0, 0, 0], [0, 0, 0, 1]))
     bench.until(lambda: "'base_link' and 'imu_link' are in none that came (frames: map, odom)" in bench.lines()[STATUS][1], 'what came instead')
     assert node.adopted is None and corrected(node) == [None] * len(MESSAGES)
     assert bench.heard('waits for the transform') == 2 and node.get_subscriptions_info_by_topic(TOPIC)
 
 
 def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, place):
+    """It was published before the node started, as the description of a robot is."""
+    if bench.is_real:
+        bench.broadcast(POSE)
     node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
-    node._frames.take(transforms(POSE))
+    if not bench.is_real:
+        bench.broadcast(POSE)
+    bench.until(lambda: node.adopted is not None, 'the transform')
     told = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link', 'target_xyz': XYZ, 'target_rpy': RPY})
     assert node.adopted.line().endswith('taken over') and not node.awaited
     np.testing.assert_allclose(node.compensation.transfer.mat_ts, told.compensation.transfer.mat_ts, atol=1e-12)
@@ -99,11 +142,14 @@ def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, pl
 
 def test_a_transform_that_moves_is_followed_and_one_that_is_repeated_changes_nothing(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
-    node._frames.take(transforms(POSE))
+    bench.broadcast(POSE)
+    bench.until(lambda: node.adopted is not None, 'the transform')
     before = node.compensation
-    node._frames.take(transforms(POSE, ('base_link', 'laser', [1, 0, 0], [0, 0, 0, 1])))
+    bench.broadcast(POSE, ('base_link', 'laser', [1, 0, 0], [0, 0, 0, 1]))
+    bench.until(lambda: node._frames.pose('base_link', 'laser') is not None, 'the other one')
     assert node.compensation is before
-    node._frames.take(transforms((*POSE[:2], [0.5, 0.0, 0.0], POSE[3])))
+    bench.broadcast((*POSE[:2], [0.5, 0.0, 0.0], POSE[3]))
+    bench.until(lambda: node.compensation is not before, 'the new place')
     np.testing.assert_allclose(node.compensation.transfer.arm_t, [0.5, 0.0, 0.0])
     assert bench.heard('has moved', 'warning') == 1
 
