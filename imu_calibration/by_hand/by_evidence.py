@@ -49,20 +49,21 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         return EvidentHand(solve_by_hand(data, options))
     found = investigate_by_hand(data, options, progress)
     asked, names = _asked(data, options), found.names
-    added = tuple(q.name for q in found.named if q.name not in asked[q.sensor])
-    changes = ModelChanges(added, tuple(question.name for question in found.denied))
+    added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
+    changes = ModelChanges(added, tuple(question.name for question in found.denied),
+                           {question.name: found.inquiry.share(found.named, question) for question in found.implausible})
     base = found.baseline.model.model
-    if not found.denied and all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS):
+    if not (found.denied or found.implausible) and all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS):
         return EvidentHand(found.baseline, found, changes)   # it is solved already
     return EvidentHand(extended_by_hand(data, found, options), found, changes)
 
 
 def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
-    """Return the calibration with the model that is asked for and what was found; choices on which the halves disagree widen its covariance."""
+    """Return the calibration with the model that is asked for and what was found; what is denied or implausible widens its covariance."""
     asked, names = _asked(data, options), found.names
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
     covariance = hand.covariance.copy()
-    for question in found.denied:
+    for question in (*found.denied, *found.implausible):
         moved = found.moved_by(question)
         shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
         covariance += np.outer(shift, shift)

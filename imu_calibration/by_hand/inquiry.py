@@ -19,7 +19,7 @@ from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
 from imu_calibration.selection.gain import Gain, reduction_interval
 from imu_calibration.selection.halves import agree
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
-from imu_calibration.selection.search import Search
+from imu_calibration.selection.search import Named, Search
 
 OUTER = 12
 """Times that the whole search is repeated without some of the poses, to measure the gain on them."""
@@ -47,19 +47,28 @@ class Inquiry:
         return [block for block in blocks if block.known.size > 3]
 
     def named(self) -> list[Question]:
-        """Return the findings: chosen, and each explaining most of what was unexplained."""
-        return list(pruned(self.search.run(), self.share))
+        """Return the findings: chosen, and each explaining most of what was unexplained; sizes known of no instrument only for what others leave."""
+        named = list(pruned(self.search.run(), self.share))
+        if self.rest(named):
+            wide = Search(self.evidence, self.search.baseline, self.questions, any_size=True)
+            known, self.search = self.search, wide
+            others = list(pruned(wide.run(), self.share))
+            if self.rest(others) < self.rest(named):
+                return others
+            self.search = known
+        return named
+
+    def rest(self, chosen: Sequence[Question], sensor: str | None = None) -> float:
+        """Return what a choice leaves in excess of noise in held-out poses, where it is significant, of one sensor or of both."""
+        left = self.evidence.heldout_residuals(self.search.used(chosen))
+        excess = [(np.sum(new**2 / block.floor) - new.size, new.size) for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
+        return sum(value for value, size in excess if value > SIGNIFICANT_REST * np.sqrt(2 * size))
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
         after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
-        removed, rest = 0.0, 0.0
-        for block, new, old in zip(self.blocks, after, before):
-            if block.sensor == question.sensor:
-                removed += np.sum((old**2 - new**2) / block.floor)
-                excess = np.sum(new**2 / block.floor) - new.size
-                rest += excess if excess > SIGNIFICANT_REST * np.sqrt(2 * new.size) else 0.0
-        return removed / (removed + rest) if removed > 0 else 0.0
+        removed = sum(np.sum((old**2 - new**2) / block.floor) for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
+        return removed / (removed + self.rest(chosen, question.sensor)) if removed > 0 else 0.0
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """Return whether the poses before and after the middle show an effect alike (`halves.agree`); smooth in time they differ by nature."""
@@ -74,7 +83,7 @@ class Inquiry:
 
 
 @dataclass(frozen=True, eq=False)
-class HandInvestigation:
+class HandInvestigation(Named):
     """What a search found, before it is put into words."""
 
     baseline: HandCalibration
@@ -94,8 +103,13 @@ class HandInvestigation:
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """Sensor -> effects that became findings."""
-        return {sensor: tuple(q.name for q in self.named if q.sensor == sensor) for sensor in SENSORS}
+        """Sensor -> effects that belong into the model."""
+        return {sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS}
+
+    @property
+    def search(self) -> Search:
+        """On which they were chosen."""
+        return self.inquiry.search
 
     def point(self) -> dict[str, np.ndarray]:
         """Return effect -> values at which its columns are first taken, of the warm-ups that became findings."""
@@ -110,7 +124,8 @@ class HandInvestigation:
     def moved_by(self, question: Question) -> dict[str, float]:
         """Return parameter -> by how much an effect moves it, of the baseline, when it joins the findings."""
         search, evidence = self.inquiry.search, self.inquiry.evidence
-        smaller, larger = search.used(self.named), search.used([*self.named, question])
+        others = [q for q in self.named if q is not question]
+        smaller, larger = search.used(others), search.used([*others, question])
         moved = evidence.fit(larger)[0][:len(smaller)] - evidence.fit(smaller)[0]
         names = self.baseline.model.param_names
         return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}

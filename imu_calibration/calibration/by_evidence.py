@@ -67,7 +67,7 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     baseline = baseline_model(options, table, solution.model)
     found, *others = (investigate(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
-    while added := _beyond((*found.named, *more), first[2]):
+    while added := _beyond((*found.adopted, *more), first[2]):
         point = {name: value for each in (*others, found) for name, value in _point(each).items()}
         extended = replace(options, added=tuple(question.effect.key for question in added), point=point)
         solution, gathered, model = solve_recordings(sources, table, extended, progress=progress, mapper=mapper, names=names)
@@ -76,17 +76,17 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
             more = sure
             continue
         found = _without_faint(found, solution)
-        if len(_beyond((*found.named, *more), first[2])) == len(added):
+        if len(_beyond((*found.adopted, *more), first[2])) == len(added):
             options = extended
             break
     else:
         solution, gathered, model = first
     solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
     if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
-        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named,
+        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.adopted,
                                      saturations=found.limits)
     clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
-    changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied))
+    changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied), _strange([found, *others]))
     return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
 
 
@@ -109,9 +109,9 @@ def _without_faint(found, solution):
 def _named_elsewhere(found, others):
     """Return what the search names in other recordings only, those of larger ones first."""
     more = {}
-    for question in (question for other in others for question in other.named):
+    for question in (question for other in others for question in other.adopted):
         more.setdefault(question.effect.key, question)
-    return [question for key, question in more.items() if key not in {known.effect.key for known in found.named}]
+    return [question for key, question in more.items() if key not in {known.effect.key for known in found.adopted}]
 
 
 def stands_out(solution: Solution, question: Question) -> bool:
@@ -150,15 +150,20 @@ def baseline_model(options: CalibrationOptions, table: Table, solved: SensorMode
                    temperature_ref_c=solved.temperature_ref_c)
 
 
+def _strange(found):
+    """Return effect -> how much of the rest it explains with a size that is known of no instrument, of several investigations."""
+    return {question.name: each.explained.share(each.named, question) for each in reversed(found) for question in each.implausible}
+
+
 def _point(found):
     """Return effect -> values at which its columns are to be taken, of what was found."""
     model = found.attempt.recording.model
-    return {question.name: model.point[question.name] for question in found.named if question.name in model.point}
+    return {question.name: model.point[question.name] for question in found.adopted if question.name in model.point}
 
 
 def _disagreement(found, names):
-    """Return the covariance of what other choices would have moved the parameters by: what is denied or doubtful, and rivals."""
-    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful)]
+    """Return the covariance of what other choices would have moved the parameters by: what is denied, doubtful or implausible, and rivals."""
+    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful, *found.implausible)]
     moves += [(rival.moves, rival.weight) for rival in found.rivals]
     total = np.zeros((len(names),) * 2)
     for moved, weight in moves:

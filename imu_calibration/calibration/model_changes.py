@@ -1,6 +1,6 @@
 """What a recording did to the model that was asked for: effects it demands, and effects that it was not believed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -11,7 +11,10 @@ class ModelChanges:
     """Taken into the model because the recording demands them."""
     denied: tuple[str, ...] = ()
     """Not taken in because parts of the recording disagree on them; the standard deviations allow for them."""
+    implausible: dict[str, float] = field(default_factory=dict)
+    """Not taken in because their sizes are known of no instrument -> share of what the model leaves that each explains; the standard deviations allow for them."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        return {name: value for name, value in (('added', list(self.added)), ('denied', list(self.denied))) if value}
+        changes = (('added', list(self.added)), ('denied', list(self.denied)), ('implausible', self.implausible))
+        return {name: value for name, value in changes if value}

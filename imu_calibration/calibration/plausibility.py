@@ -1,19 +1,24 @@
 """Values that no instrument is known to have: what the catalogue knows of grades, held against a calibration."""
 
-import numpy as np
-
 from imu_calibration.calibration.document import Calibration
+
+LOOK_FOR = {'reference': 'such tables are known for: look for a wrong description of the table, a loose mount, wrong stamps'}
+
+
+def beyond_known(share: float, section: str) -> str:
+    """Return what is said of an effect that explains a share of the rest with a size that is known of no instrument."""
+    return (f'explains {100 * share:.0f} % of what the model leaves, but its size is beyond what '
+            f'{LOOK_FOR.get(section, "such sensors are known for: look for saturation, a loose mount, a wrong scale")}')
 
 
 def implausible(calibration: Calibration) -> list[str]:
     """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
     lines = []
     for effect in calibration.model.effects:
-        if not effect.plausible:
-            continue
-        grade, largest, source = effect.plausible[-1]
-        size = np.max(np.abs(effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])))
-        if size > 10 * largest:
+        amplitudes = effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])
+        if effect.surpasses(amplitudes):
+            grade, largest, source = effect.plausible[-1]
+            size = max(map(abs, amplitudes))
             lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
                          f'({largest:.3g}; {source}): check units and axes')
     return lines

@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.plausibility import implausible
+from imu_calibration.calibration.plausibility import beyond_known, implausible
 from imu_calibration.calibration.proof_words import disproved, proven
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.constants import STANDARD_GRAVITY
@@ -82,7 +82,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
     Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
     nothing was determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not
-    determined to its tolerance. Good: neither.
+    determined to its tolerance, or what explains the rest has a size that is known of no instrument. Good: neither.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         Largest standard deviation of a determined parameter.
 
     """
-    against = _disproved(calibration) + _implausible(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
+    against = _disproved(calibration) + _implausible(calibration) + _strange_causes(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
     word = BAD if any(r.word == BAD for r in against) else WEAK if against else GOOD
     favour = [] if against else [_all_well(calibration, tolerances)]
     order = (BAD, WEAK)
@@ -112,6 +112,14 @@ def _disproved(calibration):
 def _implausible(calibration):
     return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description')
             for line in implausible(calibration)]
+
+
+def _strange_causes(calibration):
+    """Return reasons why a cause that is known stays out of the model."""
+    found = calibration.statistics.get('implausible') or {}
+    catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
+    return [Reason(WEAK, f'{name} {beyond_known(share, catalogue.get(name, ""))}; it is not in the model, and the standard deviations allow for it',
+                   f"see 'imu_calibration diagnose'; where {name} is what you expect, name it in the model") for name, share in found.items()]
 
 
 def _ratios(calibration, sensor):

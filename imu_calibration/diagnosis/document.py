@@ -44,7 +44,7 @@ def _finding(finding):
             'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from),
             'sizes_of_mates': {mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
                                for mate, sizes in finding.sizes_of_mates.items()},
-            'separating_motion': finding.separating_motion}
+            'separating_motion': finding.separating_motion, 'implausible': finding.implausible}
 
 
 def _gain(gain):

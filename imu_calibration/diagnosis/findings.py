@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Callable
 
+from imu_calibration.calibration.plausibility import beyond_known
 from imu_calibration.diagnosis.result import Finding, parameters_of
 from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.estimation.solution import Solution
@@ -22,7 +23,7 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     named : list of Question
         In the order found.
     solution : Solution
-        Of the extended model.
+        Of the extended model; what it lacks is told as the search fitted it.
     share : callable
         ``share(named, question)``: share of the unexplained that the effect removes.
     gain_of : callable
@@ -37,17 +38,25 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     """
     question = named[place]
     score = search.score([q for q in named if q is not question], question)
-    parameters, gain = parameters_of(solution, question.sensor, question.name), gain_of(place)
+    gain, explained = gain_of(place), share(named, question)
+    parameters = parameters_of(solution, question.sensor, question.name) if question.effect.key in solution.model.slices else fitted(search, named, question)
+    text = sentence(question.effect, parameters, gain)
+    if score.implausible:
+        text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless asked for.'
     mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
                         if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
-    return Finding(question.name, question.sensor, sentence(question.effect, parameters, gain), parameters, score.p_value, score.gain,
-                   share(named, question), gain, tuple(mate.name for mate in mates), motion_of(question, mates[0]) if mates else '',
-                   question.effect.against, {mate.name: _in_its_place(search, named, place, mate) for mate in mates})
+    return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain, tuple(mate.name for mate in mates),
+                   motion_of(question, mates[0]) if mates else '', question.effect.against,
+                   {mate.name: _in_its_place(search, named, place, mate) for mate in mates}, score.implausible)
 
 
 def _in_its_place(search, named, place, mate):
     """Return parameter name -> (value, unit) of an effect that stands in the place of a finding."""
-    used = search.used([*named[:place], mate, *named[place + 1:]])
-    values = search.evidence.fit(used)[0]
-    return {name: (float(values[used.index(k)]), mate.effect.unit_of(number))
-            for number, (name, k) in enumerate(zip(mate.effect.param_names(), mate.parameters))}
+    found = fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
+    return {name: (value, unit) for name, (value, _, unit) in found.items()}
+
+
+def fitted(search: Search, named: Sequence[Question], question: Question) -> dict[str, tuple[float, float, str]]:
+    """Return parameter name -> (value, sd, unit) of a chosen effect as the search fitted it."""
+    names = question.effect.param_names()
+    return {name: (float(value), float(sd), question.effect.unit_of(k)) for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}

@@ -148,7 +148,7 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
     if not diagnosis.findings:
         return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
     first = diagnosis.findings[0]
-    message = f'{first.effect}: {first.explanation}'
+    message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
         others = ', '.join(first.indistinguishable_from)
         message += f' This motion cannot tell it from {others}; to separate them: {first.separating_motion}'
@@ -159,7 +159,8 @@ def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
               'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
               'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
               'indistinguishable from': ' '.join(first.indistinguishable_from),
-              'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]), **values}
+              'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
+              'implausible': ' '.join(finding.effect for finding in diagnosis.findings if finding.implausible), **values}
     for finding in diagnosis.findings:
         values[MATES + finding.effect] = ' '.join(finding.indistinguishable_from)
         sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}

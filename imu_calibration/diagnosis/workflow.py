@@ -156,7 +156,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """Return findings, what stays unexplained and what could not be tested, as lines."""
     lines = []
     for number, finding in enumerate(diagnosis.findings, 1):
-        lines.append(f'{number}. {finding.effect}: {finding.explanation}')
+        lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
             lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
     if not diagnosis.findings:

@@ -16,6 +16,8 @@ SECTIONS = SENSORS + ('reference',)
 
 VECTOR = AXES
 MATRIX = tuple(row + column for row in AXES for column in AXES)
+KNOWN = 10.0
+"""No instrument is known of with an effect beyond this many times the largest plausible size."""
 PRODUCTS = tuple(f'{row}_{pair}' for row in AXES for pair in ('xy', 'yz', 'xz'))
 
 
@@ -172,6 +174,10 @@ class Effect:
     def largest(self) -> float:
         """Largest plausible size, infinite where nothing is known."""
         return max((limit for _, limit, _ in self.plausible), default=np.inf)
+
+    def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
+        """Return whether amplitudes are beyond what any instrument is known for, by more than three standard deviations."""
+        return bool(np.max(np.abs(amplitudes) - 3 * sd) > KNOWN * self.largest)
 
     def prior_values(self) -> np.ndarray:
         """Return the prior values, shape (size,)."""

@@ -76,6 +76,8 @@ def _reasons(diagnosis, rests):
 
 
 def _next_step(finding):
+    if finding.implausible:
+        return 'the extended calibration.yaml is without it: name it in the model where you expect it, with this size'
     if not finding.indistinguishable_from:
         return 'the extended calibration.yaml contains it'
     others = ', '.join(name.replace('_', ' ') for name in finding.indistinguishable_from)
@@ -111,7 +113,7 @@ def _finding(diagnosis, finding, number):
             'p': chance(finding.p_value), 'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]),
             'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain), 'sensor': gain.sensor,
             'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
-            'motion': finding.separating_motion, 'figure': draw_finding(diagnosis, finding, number)}
+            'motion': finding.separating_motion, 'implausible': finding.implausible, 'figure': draw_finding(diagnosis, finding, number)}
 
 
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> str:

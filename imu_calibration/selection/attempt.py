@@ -1,5 +1,6 @@
 """The recording reduced around a point of linearisation, the search on it, and the decision whether to linearise anew."""
 
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import Callable, Sequence
@@ -47,11 +48,14 @@ class Attempt:
         Sensor -> how its bias moves, where that was measured apart.
     progress : callable, optional
         Called with the share that is done.
+    any_size : bool
+        Whether sizes that are known of no instrument are asked about.
 
     """
 
     def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect],
-                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None):
+                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None,
+                 any_size: bool = False):
         self.baseline, self.effects = baseline, effects
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
@@ -67,7 +71,13 @@ class Attempt:
         self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions), bias_processes)
         self.locked = locked_windows(recording.kind)
         self.evidence = WindowEvidence(self.space, self.noise, folds_of(recording.kind, self.locked))
-        self.search = Search(self.evidence, used, self.questions, encoder_step=encoder_step(windows))
+        self.search = Search(self.evidence, used, self.questions, encoder_step=encoder_step(windows), any_size=any_size)
+
+    def asking_any_size(self) -> 'Attempt':
+        """Return the same, asking about sizes that are known of no instrument too."""
+        other = copy(self)
+        other.search = Search(self.evidence, self.search.baseline, self.questions, encoder_step=self.search.encoder_step, any_size=True)
+        return other
 
     @property
     def recording(self) -> ReducedRecording:

@@ -1,7 +1,7 @@
 """The search from windows to named effects: clipped samples out, linearise, choose, prove, linearise anew."""
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Callable, Sequence
 
 import numpy as np
@@ -26,6 +26,7 @@ from imu_calibration.selection.saturation import (
     simple_fit,
     without_clipped,
 )
+from imu_calibration.selection.search import Named, Search
 
 LINEARISATIONS = 3
 """Times that the columns are taken anew, at most."""
@@ -36,7 +37,7 @@ LEAST_WINDOWS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Investigation:
+class Investigation(Named):
     """What a search found, before it is put into words."""
 
     used: list[Window]
@@ -57,6 +58,11 @@ class Investigation:
     """Questions that likelihood asks for, but that are not named: they pay too little, or leave too much, to be sure of them."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """What would do nearly as well in the place of a finding."""
+
+    @property
+    def search(self) -> Search:
+        """On which they were chosen."""
+        return self.attempt.search
 
 
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
@@ -95,17 +101,44 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     attempt = attempted(progress=lambda share: report(0.4 * share))
     chosen = attempt.search.run()
     settled, rivals = settle_rivals(attempt, chosen, attempted)
-    if settled is not attempt:
-        attempt, chosen = settled, settled.search.run()
     report(0.5)
+    outcome = _settled(attempted, settled, chosen if settled is attempt else settled.search.run(), lambda share: report(0.5 + 0.2 * share))
+    report(0.75)
+    if outcome.rest:
+        other = outcome.attempt.asking_any_size()
+        outcome = min(outcome, _settled(partial(attempted, any_size=True), other, other.search.run()), key=lambda each: each.rest)
+    attempt, named, denied = outcome.attempt, outcome.named, outcome.denied
+    names = {question.name for question in named}
+    rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
+    doubtful = [question for question in outcome.chosen if question not in (*named, *denied)]
+    return Investigation(used, attempt, outcome.explained, named, limits, not_testable, denied, doubtful, rivals)
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """What became of a choice."""
+
+    attempt: Attempt
+    explained: Explained
+    chosen: Sequence[Question]
+    named: Sequence[Question]
+    denied: Sequence[Question]
+
+    @cached_property
+    def rest(self):
+        """What the findings leave in excess of noise, where it is significant."""
+        return sum(map(self.explained.rest, self.explained.excess(self.named).values()))
+
+
+def _settled(attempted, attempt, chosen, progress=None):
+    """Return the _Outcome of a choice: columns are taken where the effects are, then those stay that are sure to explain and to help."""
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
-        attempt = attempted(point=attempt.point(chosen), progress=lambda share: report(0.5 + 0.2 * share))
+        attempt = attempted(point=attempt.point(chosen), progress=progress)
         chosen = attempt.search.run()
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
-    report(0.75)
     explained = Explained(attempt.evidence, attempt.search)
     named, denied = _agreed(attempt, explained, _that_help(attempt, explained, pruned(chosen, explained.share)))
     for _ in range(LINEARISATIONS - 1):
@@ -115,10 +148,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
         explained = Explained(attempt.evidence, attempt.search)
         again, denied, chosen = (same_questions(attempt, some) for some in (named, denied, chosen))
         named = _that_help(attempt, explained, pruned(again, explained.share))
-    names = {question.name for question in named}
-    rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
-    doubtful = [question for question in chosen if question not in (*named, *denied)]
-    return Investigation(used, attempt, explained, named, limits, not_testable, denied, doubtful, rivals)
+    return _Outcome(attempt, explained, chosen, named, denied)
 
 
 def too_few_windows(count: int) -> NotObservableError:

@@ -1,5 +1,6 @@
 """Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Sequence
 
@@ -19,8 +20,8 @@ BETTER = 0.01
 """Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
 TIE = 8.0
 """Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
-ABSURD = 50.0
-"""A size beyond this many times the largest that the catalogue knows of is no explanation."""
+IMPLAUSIBLE = 8.0
+"""Price of a size beyond what is known of any instrument, nats: what is plausible and does as well is the explanation."""
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
@@ -39,11 +40,13 @@ class Score:
     """Chi-square p-value times the number of effects asked about, at most 1."""
     allowed: bool
     """Whether the estimate is physically possible."""
+    implausible: bool = False
+    """Whether its size is beyond what is known of any instrument."""
 
     @property
     def net(self) -> float:
-        """Gain less the penalty for the parameters."""
-        return self.gain - PENALTY * self.question.penalty
+        """Gain less the penalty for the parameters and for a size that is known of no instrument."""
+        return self.gain - PENALTY * self.question.penalty - IMPLAUSIBLE * self.implausible
 
     @property
     def significant(self) -> bool:
@@ -52,10 +55,26 @@ class Score:
 
 
 class Search:
-    """Forward selection with reconsideration over a fixed set of questions."""
+    """
+    Forward selection with reconsideration over a fixed set of questions.
 
-    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], *, encoder_step: float = 0.0):
-        self.evidence, self.baseline, self.questions, self.encoder_step = evidence, tuple(baseline), questions, encoder_step
+    Parameters
+    ----------
+    evidence : Evidence
+    baseline : sequence of int
+        Parameters that are always there.
+    questions : sequence of Question
+    encoder_step : float
+        Resolution of the encoders, rad.
+    any_size : bool
+        Whether sizes that are known of no instrument are asked about: for what known ones leave.
+
+    """
+
+    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], *, encoder_step: float = 0.0,
+                 any_size: bool = False):
+        self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
+        self.encoder_step, self.any_size = encoder_step, any_size
         self.history = []
 
     def used(self, chosen: Sequence[Question]) -> tuple[int, ...]:
@@ -69,30 +88,41 @@ class Search:
 
     def cost(self, chosen: Sequence[Question]) -> float:
         """Return the held-out cost of a choice, nats, penalties included."""
-        return 0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
+        return (0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
+                + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen))
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
         smaller, larger = self.used(chosen), self.used(chosen + [question])
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
-        return Score(question, gain, p_value, self.allowed(chosen + [question], question))
+        beside = [*chosen, question]
+        return Score(question, gain, p_value, self.allowed(beside, question), self.implausible(beside, question))
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the effect's estimate is possible: a lag is not negative, no size is absurd, no angle within half an encoder step."""
-        used = self.used(chosen)
-        values, covariance = self.evidence.fit(used)
-        places = [used.index(k) for k in question.parameters]
-        value, sd = values[places], np.sqrt(np.diag(covariance)[places])
+        """Return whether the effect's estimate is possible: a lag is not negative, no angle within half an encoder step, and unless asked no size implausible."""
+        value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
             return False
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
         if question.effect.unit == 'rad' and np.all(np.abs(value) < 0.5 * self.encoder_step):
             return False
-        if not self.shows_alike(chosen, question):
+        if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
             return False
-        largest = question.effect.largest * (1.0 if question.effect.known_size else ABSURD)
-        return bool(np.all(np.abs(value) - 3 * sd < largest))
+        return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(chosen, question)
+
+    def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
+        """Return whether the estimate of a chosen effect is beyond what is known of any instrument: a range is a prior, not a wall."""
+        amplitudes = question.effect.size - question.effect.time_constant
+        value, sd = self.estimate(chosen, question)
+        return question.effect.surpasses(value[:amplitudes], sd[:amplitudes])
+
+    def estimate(self, chosen: Sequence[Question], question: Question) -> tuple[np.ndarray, np.ndarray]:
+        """Return (values, standard deviations) of the parameters of a chosen effect."""
+        used = self.used(chosen)
+        values, covariance = self.evidence.fit(used)
+        places = [used.index(k) for k in question.parameters]
+        return values[places], np.sqrt(np.diag(covariance)[places])
 
     def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -170,3 +200,25 @@ class Search:
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
         return sorted(found.values(), key=lambda pair: pair[1])[:CLASS_SIZE - 1]
+
+
+class Named(ABC):
+    """What a search named, told apart by whether its sizes are known of instruments."""
+
+    named: Sequence[Question]
+
+    @property
+    @abstractmethod
+    def search(self) -> Search:
+        """On which they were chosen."""
+
+    @property
+    def implausible(self) -> list[Question]:
+        """Findings whose size is beyond what is known of any instrument: told, and put into no model unasked."""
+        return [question for question in self.named if self.search.implausible(self.named, question)]
+
+    @property
+    def adopted(self) -> list[Question]:
+        """Findings that belong into the model."""
+        strange = self.implausible
+        return [question for question in self.named if question not in strange]

@@ -70,7 +70,7 @@ SEARCH = _of(
     ('gain on held-out windows not asked for', 'search.py', ' and self.net > 0 and self.gain > LEAST_GAIN', '', 'test_search.py'),
     ('a negative time constant is allowed', 'search.py', 'if question.effect.nonnegative and value[0] < 0:', 'if False:', 'test_search.py'),
     ('steps of the encoder pass for errors of the table', 'search.py', '< 0.5 * self.encoder_step)', '< 0.0 * self.encoder_step)', 'test_search.py'),
-    ('absurd sizes are explanations', 'search.py', '(1.0 if question.effect.known_size else ABSURD)', '1e9', 'test_search.py'),
+    ('implausible sizes are explanations', 'search.py', '(self.any_size or not self.implausible(chosen, question))', 'True', 'test_search.py'),
     ('earlier choices never reconsidered', 'search.py', 'chosen = self.reconsidered(chosen + [best.question])', 'chosen = chosen + [best.question]',
      'test_search.py'),
     ('share of the unexplained that a finding must remove', 'explained_share.py', 'LEAST_SHARE = 0.7', 'LEAST_SHARE = 0.1', 'test_search.py'),
