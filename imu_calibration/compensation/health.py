@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,6 +64,17 @@ class HealthOptions:
     """Seconds in which an update loses its meaning."""
 
 
+class _Judged(NamedTuple):
+    """A stop with what was known at its end; replaced as a whole, so that another thread may read it."""
+
+    stop: Stop
+    of_mean: np.ndarray
+    """Variance of its mean, shape (6,)."""
+    n_stops: int
+    bias_update: tuple[np.ndarray, np.ndarray] | None
+    """Bias that is taken off, and its variance, each shape (3,)."""
+
+
 class CalibrationHealth:
     """
     Judges stops of a stream of corrected readings.
@@ -89,7 +101,7 @@ class CalibrationHealth:
         self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * PLACE if options.gravity else PLACE
         self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None
         self._judged: float | None = None
-        self.state = HealthState(WAITING, 'no stop of two seconds yet')
+        self._last: _Judged | None = None
 
     def judge(self, stop: Stop) -> None:
         """
@@ -106,19 +118,24 @@ class CalibrationHealth:
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
         of_mean = np.square(np.maximum(stop.shake_sd, self.noise_sd)) / stop.n_samples
-        total = self._known + np.diag(of_mean)
         if self.update is not None:
             self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
+        self._last = _Judged(stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end))
+
+    @property
+    def state(self) -> HealthState:
+        """What the last stop said, worked out when somebody asks."""
+        return HealthState(WAITING, 'no stop of two seconds yet') if self._last is None else self._told(*self._last)
+
+    def _told(self, stop, of_mean, n_stops, bias_update):
+        total = self._known + np.diag(of_mean)
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
         gravity_sd = float(np.sqrt(along @ total[:3, :3] @ along))
-        self.state = self._told(stop, rate_off, gravity_sd)
-
-    def _told(self, stop, rate_off, gravity_sd):
         rate, length = stop.mean[3:], float(np.linalg.norm(stop.mean[:3]))
         force_off = max(abs(length - self._gravity) - self._place * self._gravity, 0) / gravity_sd
         axis = int(np.argmax(rate_off))
-        values = {'stops': self.n_stops, 'seconds of the last stop': f'{stop.seconds:.1f}',
+        values = {'stops': n_stops, 'seconds of the last stop': f'{stop.seconds:.1f}',
                   'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate), 'rate at rest [sd]': f'{rate_off.max():.1f}',
                   'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}', 'gravity off [sd]': f'{force_off:.1f}'}
         lines = []
@@ -126,8 +143,8 @@ class CalibrationHealth:
             lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd')
         if force_off > LIMIT:
             lines.append(f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what places differ by')
-        if self.update is not None:
-            bias, variance = self.update.predict(stop.end)
+        if bias_update is not None:
+            bias, variance = bias_update
             values |= {'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
                        'bias update, sd [deg/s]': ', '.join(f'{value / DEG:.4f}' for value in np.sqrt(variance))}
         if not lines:
@@ -137,6 +154,6 @@ class CalibrationHealth:
             force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
         if harms:
             return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again', values)
-        if self.update is not None and force_off <= LIMIT:
+        if bias_update is not None and force_off <= LIMIT:
             return HealthState(FOLLOWED, '; '.join(lines) + ': taken off as long as stops show it', values)
         return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)

@@ -9,6 +9,8 @@ from imu_calibration.compensation.health import CalibrationHealth
 from imu_calibration.compensation.stops import BLOCK, StopDetector
 
 SIX = tuple[float, ...]
+AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
+"""Columns of a sample in the order in which stops are looked for: time, force, rate, measured force, measured rate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,8 +19,8 @@ class CorrectedStretch:
 
     first_ns: int
     """Where the times of the samples begin, ns."""
-    samples: list[tuple[int, SIX, SIX]]
-    """Time in ns, corrected and measured (rate x, y, z, force x, y, z); the corrected ones before any update of the bias."""
+    samples: np.ndarray
+    """Time in ns, corrected and measured (rate x, y, z, force x, y, z), the corrected ones before any update of the bias, shape (n, 13)."""
     offset: tuple[float, float, float]
     """What was taken off the corrected rate, rad/s."""
 
@@ -37,14 +39,14 @@ class StopWatch:
         self.health, self._detector = health, StopDetector(health.noise_sd)
         self.listener: Callable[[CorrectedStretch], None] | None = None
         """Called with each CorrectedStretch, in the midst of the stream: it must be quick and must not fail."""
-        self._waiting: list[tuple[int, SIX, SIX]] = []
+        self._waiting: list[SIX] = []
         self._first_ns = self._look = 0
         self._offset: tuple[float, float, float] | None = None
 
     def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
         """Take a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one less the update of the bias."""
         since = stamp_ns - self._first_ns
-        self._waiting.append((since, corrected, measured))
+        self._waiting.append((since, *corrected, *measured))
         if since >= self._look or since < 0:
             self._take(stamp_ns)
         if self._offset is None:
@@ -63,12 +65,15 @@ class StopWatch:
         if stamp_ns < self._first_ns or not self._first_ns:   # the beginning, or a clock set back
             self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
             return
+        samples = np.array(self._waiting)
         if self.listener is not None:
-            self.listener(CorrectedStretch(self._first_ns, self._waiting, self._offset or (0.0, 0.0, 0.0)))
-        since, corrected, measured = map(np.array, zip(*self._waiting, strict=True))
-        self._waiting, self._look = [], int(since[-1]) + round(1e9 * BLOCK)
-        stop = self._detector.push(np.column_stack([since * 1e-9, corrected[:, 3:], corrected[:, :3], measured[:, 3:], measured[:, :3]]))
+            self.listener(CorrectedStretch(self._first_ns, samples, self._offset or (0.0, 0.0, 0.0)))
+        since = int(samples[-1, 0])
+        self._waiting, self._look = [], since + round(1e9 * BLOCK)
+        rows = samples[:, AS_STOPS]
+        rows[:, 0] *= 1e-9
+        stop = self._detector.push(rows)
         if stop is not None:
             self.health.judge(stop)
         if self.health.update is not None and self.health.update.n_stops:
-            self._offset = tuple(self.health.update.predict(since[-1] * 1e-9)[0].tolist())
+            self._offset = tuple(self.health.update.predict(since * 1e-9)[0].tolist())

@@ -58,6 +58,7 @@ class StopDetector:
 
     def __init__(self, noise_sd: np.ndarray):
         self._noise_sd = np.asarray(noise_sd, float)
+        self._most_variance = (MOST_SHAKE + 4 * self._noise_sd)**2
         self._rest: np.ndarray = np.zeros((0, 1))
         self._blocks: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
         self._sums: tuple[float, float, int, np.ndarray, np.ndarray] | None = None
@@ -93,7 +94,7 @@ class StopDetector:
             self._blocks, self._sums = [], None
         block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
         self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
-        if not self._is_still():
+        if not self._may_be_still(*block[3:]) or not self._is_still():
             self._sums = None
         elif self._sums is not None and block[1] - self._sums[0] > LONGEST:
             self._sums = None
@@ -101,6 +102,11 @@ class StopDetector:
         else:
             for each in self._blocks if self._sums is None else [block]:
                 self._add(*each)
+
+    def _may_be_still(self, mean, variance):
+        """Return whether a block turns and shakes little enough by itself; most blocks of a robot that drives do not."""
+        wx, wy, wz = mean[3:6].tolist()
+        return wx * wx + wy * wy + wz * wz < MOST_RATE**2 and bool((variance <= self._most_variance).all())
 
     def _is_still(self):
         if len(self._blocks) < N_BLOCKS:
@@ -111,7 +117,7 @@ class StopDetector:
         apart = np.ptp(means, axis=0)
         # What shakes the robot is noise for the means as well.
         allowed = STEADY + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
-        return bool((apart <= allowed).all() and (shake <= MOST_SHAKE + 4 * self._noise_sd).all() and np.linalg.norm(means[-1, 3:]) < MOST_RATE)
+        return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
 
     def _add(self, start, end, n, mean, variance):
         before = self._sums or (start, end, 0, np.zeros_like(mean), np.zeros(6))

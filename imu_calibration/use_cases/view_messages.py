@@ -82,7 +82,7 @@ def readings(stretch: CorrectedStretch, sd: tuple[np.ndarray, np.ndarray]) -> It
         Standard deviations of corrected (rate, force), each shape (3,).
 
     """
-    since, corrected, measured = (np.array(part) for part in zip(*stretch.samples, strict=True))
+    since, corrected, measured = stretch.samples[:, 0], stretch.samples[:, 1:7].copy(), stretch.samples[:, 7:]
     corrected[:, :3] -= stretch.offset
     half = BAND * np.concatenate(sd)
     rate = (len(since) - 1) / max(1e-9 * (since[-1] - since[0]), 1e-9)
