@@ -5,6 +5,7 @@ import struct
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 if __name__ == '__main__':
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -69,7 +70,7 @@ def sink(topic):
     number_at = template()[1]
     late, numbers = [], []
 
-    def record(data):
+    def record(data, information):
         now = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
         number = struct.unpack_from('<d', data, number_at)[0]
         if number == END:
@@ -86,7 +87,7 @@ def sink(topic):
         time.sleep(0.05)
     print('ready', flush=True)
     try:
-        relay_loop.relay(node, subscription, nowhere, convert=record)
+        relay_loop.relay(node, SimpleNamespace(subscription=subscription), nowhere, convert=record)
     except _Ended:
         pass
     late = np.array(late) * 1e-3
