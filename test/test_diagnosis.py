@@ -1,6 +1,7 @@
 """Diagnosis: hidden effects are found, empty sessions stay empty, stories are refused, and what is handed back holds together."""
 
 import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from scipy.stats import chi2
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.errors import NotObservableError
+from imu_calibration.selection.evidence import locked_windows
+from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate
 
 from worlds.hiding import Sizes, record
@@ -86,6 +89,29 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     # The extended model is a model like any other: its residual is noise.
     assert ('accelerometer', 'accel_quadratic') in diagnosis.model.slices
     assert 0.8 < diagnosis.solution.chi2_per_dof['accelerometer']['means'] < 1.3
+
+
+def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
+    """Ten standard deviations onto one locked window of each kind."""
+    recording = record(SEED, {'accel_quadratic': sizes.hidden('accel_quadratic', SEED, 5.0)}, 'white', through_bag=False)
+    used = [window for window in recording.windows if window.kind != 'unused']
+    locked, kinds = locked_windows(np.array([window.kind for window in used])), np.array([window.kind for window in used])
+    struck = [next(window for window, out, own in zip(used, locked, kinds) if out and own == kind) for kind in np.unique(kinds)]
+    windows = [replace(w, force_s=w.force_s + 10 * w.noise_sd[0], rate_s=w.rate_s + 10 * w.noise_sd[1]) if w in struck else w for w in used]
+    found, other = (investigate(some, recording.table, recording.model) for some in (used, windows))
+    assert [q.label for q in found.named] == [q.label for q in other.named] == ['accel_quadratic']
+    assert [[s.gain for s in scores] for scores in found.attempt.search.history] == [[s.gain for s in scores] for scores in other.attempt.search.history]
+    for one, two in zip(found.attempt.evidence.fit(found.attempt.search.used(found.named)), other.attempt.evidence.fit(other.attempt.search.used(other.named))):
+        np.testing.assert_array_equal(one, two)
+    for sensor, noise in found.attempt.noise.items():
+        assert noise_figures(noise) == noise_figures(other.attempt.noise[sensor])
+    gains = [heldout_gain(each.attempt, [], each.named, sensors=['accelerometer']) for each in (found, other)]
+    assert gains[0].heldout_rms_after < 0.9 * gains[1].heldout_rms_after
+
+
+def noise_figures(noise):
+    """Return all that a NoiseModel says as text of full precision."""
+    return json.dumps(asdict(noise), default=lambda array: array.tolist())
 
 
 def test_gain_is_measured_on_windows_that_took_no_part(sizes):

@@ -1,5 +1,7 @@
 """A limit that outputs pile up at is told from a coarse output that repeats all its values."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -72,6 +74,14 @@ def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
     folder = recordings / 'shaft_yaw_slow_later'
     found = diagnose(folder, folder / 'table.yaml')
     assert found.result.diagnosis.windows >= 8
+
+
+def test_locked_windows_show_no_limit(monkeypatch):
+    windows = [SimpleNamespace(kind='static', number=number) for number in range(12)]
+    seen = []
+    monkeypatch.setattr(investigation, '_limits', lambda some, table, model: (seen.extend(window.number for window in some), ([], {}, None))[1])
+    _, locked, _ = investigation._without_clipping(windows, None, None)
+    assert locked.sum() == 3 and seen == [number for number in range(12) if not locked[number]]
 
 
 def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):

@@ -18,7 +18,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.extended_model import extended_solution
-from imu_calibration.selection.gain import Gain, heldout_gain
+from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
 from imu_calibration.selection.investigation import Investigation, investigate
 
 MATE = 0.5
@@ -85,8 +85,10 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
         return heldout_gain(attempt, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
 
     def shows(place, mate, gain):
-        return gain.sensor in sensors_of(mate.effect) and MATE * gain.reduction <= heldout_gain(
-            attempt, named[:place], [*named[:place], mate], sensors=[gain.sensor]).reduction
+        if gain.sensor not in sensors_of(mate.effect):
+            return False
+        own, other = (gain_in_turn(attempt, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction for each in (named[place], mate))
+        return MATE * own <= other
 
     def motion_of(question, mate):
         return separating_motion(solution, question, mate, gravity=table.gravity_value)

@@ -68,7 +68,7 @@ def _rest(attempt, explained, sensor, excess, values):
     if excess[1] > WITHIN_SHARE * explained.n_within:
         sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
-    significant = bool(sigma > SIGNIFICANT and explained.chosen.sum() >= LEAST_WINDOWS)
+    significant = bool(sigma > SIGNIFICANT and explained.n_means >= 3 * LEAST_WINDOWS)
     if not significant:
         return Unexplained(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
     if sigma_means <= SIGNIFICANT:

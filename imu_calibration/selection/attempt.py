@@ -9,14 +9,14 @@ import numpy as np
 
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.scaled_solve import quadratic, solve_normal
+from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
-from imu_calibration.selection.evidence import WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.evidence import WindowEvidence, folds_of
 from imu_calibration.selection.halves import agree
 from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
 from imu_calibration.selection.normal_matrices import normal_matrix
-from imu_calibration.selection.parameter_space import counted_from_values, parameter_space, questions, smooth_parameters
+from imu_calibration.selection.parameter_space import ParameterSpace, counted_from_values, parameter_space, questions, smooth_parameters
 from imu_calibration.selection.questions import Question, extended_model, time_constants
 from imu_calibration.selection.reduced_recording import ReducedRecording, mean_arms, reduce_recording
 from imu_calibration.selection.search import Search
@@ -44,6 +44,8 @@ class Attempt:
         That are asked about.
     point : (SensorModel, array), optional
         Where the columns are taken; at the baseline's own solution where not given.
+    locked : array, shape (k,)
+        Which windows are kept for the gain: columns are taken there too, but noise, fits and choices know nothing of them.
     bias_processes : dict, optional
         Sensor -> how its bias moves, where that was measured apart.
     progress : callable, optional
@@ -53,25 +55,27 @@ class Attempt:
 
     """
 
-    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect],
+    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect], locked: np.ndarray,
                  point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None,
                  any_size: bool = False):
-        self.baseline, self.effects = baseline, effects
+        self.baseline, self.effects, self.locked = baseline, effects, locked
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values),
                                      progress=progress)
-        used = baseline_parameters(baseline, model)
+        used, judged = baseline_parameters(baseline, model), recording.select(~locked)
         if point is None:
-            recording = _at_baseline(recording, baseline, used)
-        self.all_samples = parameter_space(recording, baseline)
-        self.space = in_trusted_band(self.all_samples)
-        self.questions = questions(self.space, effects)
-        self.noise = noise_beside_effects(self.space, smooth_parameters(self.questions), bias_processes)
-        self.locked = locked_windows(recording.kind)
-        self.evidence = WindowEvidence(self.space, self.noise, folds_of(recording.kind, self.locked))
-        self.search = Search(self.evidence, used, self.questions, encoder_step=encoder_step(windows), any_size=any_size)
+            judged = _at_baseline(judged, baseline, used)
+            recording = recording.rebased(judged.values)
+        self.all_samples = parameter_space(judged, baseline)
+        judged = in_trusted_band(self.all_samples)
+        self.space = replace(judged, recording=recording)
+        self.questions = questions(judged, effects)
+        self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
+        self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
+        step = encoder_step([window for window, kept in zip(windows, locked) if not kept])
+        self.search = Search(self.evidence, used, self.questions, encoder_step=step, any_size=any_size)
 
     def asking_any_size(self) -> 'Attempt':
         """Return the same, asking about sizes that are known of no instrument too."""
@@ -81,11 +85,16 @@ class Attempt:
 
     @property
     def recording(self) -> ReducedRecording:
-        """The reduced recording."""
+        """The reduced recording, all of its windows."""
         return self.space.recording
 
+    @cached_property
+    def locked_samples(self) -> ParameterSpace:
+        """The locked windows, all samples compared: for the gain alone."""
+        return replace(self.all_samples, recording=self.recording.select(self.locked))
+
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
-        """Return the parameters of the whole space for a choice, fitted to the chosen windows, baseline in full, shape (q,)."""
+        """Return the parameters of the whole space for a choice, fitted to the windows that choose, baseline in full, shape (q,)."""
         used = self.search.used(chosen)
         values = np.zeros(self.space.size)
         values[list(used)] = self.evidence.fit(used)[0]
@@ -105,16 +114,6 @@ class Attempt:
                 return True
         return False
 
-    @cached_property
-    def _locked_normal(self):
-        return normal_matrix(self.space, self.noise, self.locked)
-
-    def locked_gain(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return by how much an effect of a choice raises the log likelihood of the locked windows, fitted to the others, nats."""
-        rest = [q for q in chosen if q is not question]
-        losses = [quadratic(self._locked_normal, used, self.evidence.fit(used)[0]) for used in map(self.search.used, (rest, chosen))]
-        return 0.5 * (losses[0] - losses[1])
-
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
         Return whether both halves of the recording show an effect alike (`halves.agree`).
@@ -130,9 +129,10 @@ class Attempt:
 
     @cached_property
     def _halves(self):
-        """Normal matrices of the windows before and after the middle of those used."""
-        early = np.arange(len(self.recording.windows)) < len(self.recording.windows) // 2
-        return [normal_matrix(self.space, self.noise, half) for half in (early, ~early)]
+        """Normal matrices of the windows before and after the middle of those that choose."""
+        judged = self.evidence.space
+        early = np.arange(len(judged.recording.windows)) < len(judged.recording.windows) // 2
+        return [normal_matrix(judged, self.noise, half) for half in (early, ~early)]
 
     def moved_by(self, chosen: Sequence[Question], question: Question) -> dict[str, float]:
         """Return parameter -> by how much an effect moves it, of the baseline and of the other choices, when it joins them."""

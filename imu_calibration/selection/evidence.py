@@ -15,19 +15,17 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 FOLDS = 6
 """Parts that are held out in turn."""
 LOCKED_EVERY = 4
-"""Every so many windows of each kind take no part in choosing."""
+"""Every so many windows of each kind are locked away: nothing is estimated, chosen or refused on them."""
 
 
 def locked_windows(kind: np.ndarray) -> np.ndarray:
-    """Return a mask of the windows that take no part in choosing: every fourth of each kind, spread through the session."""
+    """Return a mask of the windows that are looked at once, for the gain: every fourth of each kind, spread through the session."""
     return _turn_of(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
 
 
-def folds_of(kind: np.ndarray, locked: np.ndarray) -> np.ndarray:
-    """Return the fold of each window, -1 where locked; windows of each kind are dealt out in turn."""
-    fold = np.full(len(kind), -1)
-    fold[~locked] = _turn_of(kind[~locked], FOLDS)
-    return fold
+def folds_of(kind: np.ndarray) -> np.ndarray:
+    """Return the fold of each window; windows of each kind are dealt out in turn."""
+    return _turn_of(kind, FOLDS)
 
 
 def _turn_of(kind, modulus):
@@ -87,7 +85,7 @@ class WindowEvidence(Evidence):
     noise : dict
         Sensor -> NoiseModel.
     fold : array, shape (k,)
-        Fold of each window, -1 where it is locked.
+        Fold of each window.
 
     """
 

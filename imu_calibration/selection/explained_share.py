@@ -35,9 +35,8 @@ class Explained:
         self.search, recording = search, evidence.space.recording
         noise = {s: own.at_rest_only(*natural_processes(own, recording.period)) for s, own in evidence.noise.items()}
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold)
-        self.chosen = evidence.fold >= 0
-        self.n_means = 3.0 * self.chosen.sum()
-        self.n_within = 3.0 * (recording.count - 1)[self.chosen & recording.moving].sum()
+        self.n_means = 3.0 * len(recording.windows)
+        self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, tuple[float, float]]:
         """Return sensor -> (excess of the means, excess within windows): losses above what noise leaves, on held-out windows."""

@@ -1,7 +1,7 @@
-"""How much better the extended model predicts windows that took no part in choosing it."""
+"""How much better the extended model predicts windows that it was not fitted to; the locked ones took no part in choosing it either."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Sequence
+from typing import Sequence
 
 import numpy as np
 
@@ -10,16 +10,18 @@ from imu_calibration.selection.questions import Question
 
 RESAMPLES = 1000
 """Of whole windows, for an interval."""
+MEASURES = ('samples', 'window means', 'samples about the mean of their window')
+"""Residuals that a gain is told of."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """Residual on windows that took no part in choosing, before and after."""
+    """Residual on windows that were held out, before and after."""
 
     sensor: str
     """Sensor in whose unit the residuals are."""
     measure: str
-    """'samples', 'window means' or 'samples about the mean of their window', whichever shows the effect better in the windows that it was chosen on."""
+    """One of `MEASURES`, whichever shows the effect better in the windows that it was chosen on."""
     heldout_rms_before: float
     """Rms residual of the model without the finding, m/s^2 or rad/s."""
     heldout_rms_after: float
@@ -37,10 +39,9 @@ class Gain:
 
 def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
-    Return the Gain of the choice `after` over the choice `before`.
+    Return the Gain of the choice `after` over the choice `before` on the locked windows, which nothing else looks at.
 
-    Both are fitted to the windows that were chosen from; both are judged on the locked ones, by the measure that falls most, or where that is not sure, by
-    the one that falls most surely: a small lag takes a tenth off the few window means by chance, and half a percent off the samples for sure.
+    Both are fitted to the windows that choose, and these choose sensor and measure too (`gain_in_turn`).
 
     Parameters
     ----------
@@ -50,67 +51,54 @@ def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
         Sensors that the difference acts on; the one with the larger reduction is reported.
 
     """
-    found = _judged(attempt, before, after, sensors)
-    most = _gain(attempt, max(found, key=lambda entry: entry.most))
-    return most if most.ci95[0] > 0 else _gain(attempt, max(found, key=lambda entry: entry.surely))
+    told = gain_in_turn(attempt, before, after, sensors=sensors)
+    used = map(attempt.search.used, (before, after))
+    values = [attempt.space.reduced(some, attempt.evidence.fit(some)[0])[None] for some in used]
+    return _gain(told.sensor, told.measure, [_squares(attempt.locked_samples, each, told.sensor)[told.measure] for each in values])
 
 
-def _gain(attempt, judged):
-    rms = [_rms(*entry) for entry in judged.locked]
-    return Gain(judged.sensor, judged.measure, rms[0], rms[1], reduction_interval(judged.locked), int(attempt.locked.sum()))
+def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
+    """
+    Return the same Gain on the windows that choose, each fold under the fit to the others.
 
-
-class _Judged(NamedTuple):
-    """One measure of one sensor."""
-
-    sensor: str
-    measure: str
-    most: float
-    surely: float
-    locked: list
-
-
-def _judged(attempt, before, after, sensors):
-    """Return a _Judged for each measure of each sensor, judged by the windows that were chosen from."""
-    found = []
+    Told is the measure that falls most, or where that is not sure, the one that falls most surely: a small lag takes a tenth off the window means by
+    chance, and half a percent off the samples for sure.
+    """
+    found, fold = [], attempt.evidence.fold
     for sensor in sensors:
-        squares = [_squares(attempt, choice, sensor) for choice in (before, after)]
-        for measure, sums in _MEASURES.items():
-            chosen, locked = ([[part[rows] for part in sums(*s)] for s in squares] for rows in (~attempt.locked, attempt.locked))
-            # What is sure to fall: a large fall of a few window means may be chance.
-            reduction = np.nan_to_num(reduction_interval(chosen)[0], nan=-np.inf)
-            found.append(_Judged(sensor, measure, reduction, _certainty(chosen), locked))
-    return found
+        pair = []
+        for used in map(attempt.search.used, (before, after)):
+            values = np.array([attempt.space.reduced(used, attempt.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
+            pair.append(_squares(attempt.all_samples, values[fold], sensor))
+        of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
+        found += [(_gain(sensor, measure, each), each) for measure, each in of.items()]
+    most = max(found, key=lambda entry: np.nan_to_num(entry[0].ci95[0], nan=-np.inf))
+    return (most if most[0].ci95[0] > 0 else max(found, key=lambda entry: _certainty(entry[1])))[0]
 
 
-_MEASURES = {
-    'samples': lambda samples, means, count, three: (samples, count),
-    'window means': lambda samples, means, count, three: (means, three),
-    'samples about the mean of their window': lambda samples, means, count, three: (samples - count / three * means, count - three),
-}
-"""What may fall -> (sums of squares, numbers) per window, of those that `_squares` returns."""
+def _gain(sensor, measure, pair):
+    return Gain(sensor, measure, *(_rms(*entry) for entry in pair), reduction_interval(pair), len(pair[0][0]))
+
+
+def _squares(space, values, sensor):
+    """Return measure -> (sums of squares, their numbers) per window, each (k,), at vectors of `ParameterSpace.reduced`, one for all or each."""
+    recording = space.recording
+    means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
+    for axis in range(3):
+        weights = np.broadcast_to(values[:, space.places(sensor, axis)], (len(means), len(space.places(sensor, axis))))
+        means += np.einsum('kq,kq->k', space.mean[sensor][axis], weights)**2
+        within += space.squares_within(sensor, axis, weights)
+    rest = ~recording.moving
+    at_rest = np.array([window.sensors[sensor].noise_variance.sum() for window in recording.windows])
+    within[rest] = at_rest[rest] * (recording.count[rest] - 1)
+    three = np.full(len(means), 3.0)
+    return dict(zip(MEASURES, ((within + recording.count * means, 3 * recording.count), (means, three), (within, 3 * (recording.count - 1)))))
 
 
 def _certainty(pair):
     """Return by how many standard deviations sums of squares fall from window to window."""
     fall = pair[0][0] - pair[1][0]
     return float(fall.sum() / max(np.sqrt(fall @ fall), 1e-300))
-
-
-def _squares(attempt, choice, sensor):
-    """Return sums of squares of samples and of window means, and the numbers of each, per window, four arrays (k,)."""
-    space, recording = attempt.all_samples, attempt.recording
-    used = attempt.search.used(choice)
-    values = space.reduced(used, attempt.evidence.fit(used)[0])
-    means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
-    for axis in range(3):
-        weights = values[space.places(sensor, axis)]
-        means += (space.mean[sensor][axis] @ weights)**2
-        within += space.squares_within(sensor, axis, weights)
-    rest = ~recording.moving
-    at_rest = np.array([window.sensors[sensor].noise_variance.sum() for window in recording.windows])
-    within[rest] = at_rest[rest] * (recording.count[rest] - 1)
-    return within + recording.count * means, means, 3 * recording.count, np.full(len(means), 3.0)
 
 
 def _rms(squares, number):

@@ -12,8 +12,9 @@ from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
-from imu_calibration.selection.gain import heldout_gain
+from imu_calibration.selection.gain import gain_in_turn
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 from imu_calibration.selection.saturation import (
@@ -28,10 +29,10 @@ from imu_calibration.selection.saturation import (
 )
 from imu_calibration.selection.search import Named, Search
 
-LINEARISATIONS = 3
+LINEARISATIONS = 5
 """Times that the columns are taken anew, at most."""
 LEAST_REDUCTION = 0.01
-"""Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of the locked windows, for sure."""
+"""Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for sure."""
 LEAST_WINDOWS = 8
 """Fewer windows leave none to hold out."""
 
@@ -94,10 +95,10 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
         raise too_few_windows(len(used))
     report = progress or (lambda share: None)
     model = with_joints_of(model, table)
-    used, limits = _without_clipping(used, table, model)
-    effects, not_testable = testable_effects(model, table, used)
+    used, locked, limits = _without_clipping(used, table, model)
+    effects, not_testable = testable_effects(model, table, _of(used, ~locked))
     asked = without_saturation(effects)
-    attempted = partial(Attempt, used, table, model, effects=asked, bias_processes=bias_processes)
+    attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.4 * share))
     chosen = attempt.search.run()
     settled, rivals = settle_rivals(attempt, chosen, attempted)
@@ -166,17 +167,13 @@ def _agreed(attempt, explained, named):
 
 def _that_help(attempt, explained, named):
     """
-    Return the findings that are possible and predict the locked windows better, one at a time the least helpful taken out.
+    Return the findings that are possible and predict windows held out in turn better, one at a time the least helpful taken out.
 
     Likelihood alone is not enough: without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes
-    evidence of anything that goes with it. So the plain residual of the locked windows, in the unit of the sensor, must fall too.
+    evidence of anything that goes with it. So the plain residual, in the unit of the sensor, must fall too. The locked windows are not asked:
+    what they show afterwards could not be told as a gain.
     """
     kept = [question for question in named if attempt.search.allowed(named, question)]
-    while kept:
-        helps = [attempt.locked_gain(kept, question) for question in kept]
-        if min(helps) >= 0.0:
-            break
-        del kept[int(np.argmin(helps))]
     while kept:
         least = [_sure_reduction(attempt, kept, each) for each in kept]
         short = [paid <= _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]
@@ -194,8 +191,8 @@ def _needed_reduction(attempt, explained, chosen, question):
 
 
 def _sure_reduction(attempt, chosen, question):
-    """Return the lower end of the interval of what an effect takes off the residual of the locked windows, in the sensor's own unit."""
-    return heldout_gain(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
+    """Return the lower end of the interval of what an effect takes off the residual of windows held out in turn, in the sensor's own unit."""
+    return gain_in_turn(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
 
 
 def with_joints_of(model: SensorModel, table: Table) -> SensorModel:
@@ -203,11 +200,30 @@ def with_joints_of(model: SensorModel, table: Table) -> SensorModel:
     return model if model.joint_names == table.joint_names else replace(model, joint_names=table.joint_names)
 
 
+def _of(windows, rows):
+    return [window for window, taken in zip(windows, rows) if taken]
+
+
 def _without_clipping(windows, table, model):
-    """Return (windows without samples that a limit spoils, the limits found)."""
+    """Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show)."""
+    locked = locked_windows(np.array([window.kind for window in windows]))
+    limits, noise_sd, values = _limits(_of(windows, ~locked), table, model)
+    if not limits:
+        return windows, locked, []
+    levels, kept = {limit.sensor: limit.level for limit in limits}, []
+    for rows in (~locked, locked):
+        part = _of(windows, rows)
+        kept.append(without_clipped(part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd))
+    in_order = sorted([(window.time[0], number, window) for number, part in enumerate(kept) for window in part], key=lambda entry: entry[:2])
+    return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
+
+
+def _limits(windows, table, model):
+    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without what the limits spoil)."""
+    nothing = [], {}, None
     suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
     if not suspects:
-        return windows, []
+        return nothing
     limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
     noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
     kept = windows
@@ -215,9 +231,8 @@ def _without_clipping(windows, table, model):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
         if len(kept) < LEAST_WINDOWS:
-            return windows, []   # what is always at its limit, or always near it, shows no limit
-    predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
+            return nothing   # what is always at its limit, or always near it, shows no limit
+    values = simple_fit(kept, table, model)
+    predicted = predictions(windows, table, model, values=values)
     found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]
-    if not found:
-        return windows, []
-    return without_clipped(windows, predicted, {limit.sensor: limit.level for limit in found}, noise_sd=noise_sd), found
+    return found, noise_sd, values

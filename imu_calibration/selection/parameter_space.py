@@ -72,9 +72,9 @@ class ParameterSpace:
         return self._joined(sensor, axis, part, lambda products: products[rows].sum(axis=0, keepdims=True), rows)[0]
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
-        """Return the sum of squares of the centred rows of each window times `weights`, shape (k,)."""
-        columns = self.join[sensor][axis] @ weights
-        return np.maximum(np.einsum('kij,i,j->k', self.recording.products[sensor, 'within'], columns, columns, optimize=True), 0.0)
+        """Return the sum of squares of the centred rows of each window times its `weights` (k, q_a + 1), shape (k,)."""
+        columns = weights @ self.join[sensor][axis].T
+        return np.maximum(np.einsum('kij,ki,kj->k', self.recording.products[sensor, 'within'], columns, columns, optimize=True), 0.0)
 
     def _joined(self, sensor, axis, part, pick, rows):
         slow_only = part is None and self.slow_only[sensor][axis]

@@ -112,6 +112,11 @@ class ReducedRecording:
                                                                       '_factors') if name in self.__dict__})
         return moved
 
+    def select(self, rows: np.ndarray) -> 'ReducedRecording':
+        """Return the recording of the windows `rows` (mask) alone."""
+        return replace(self, windows=tuple(window for window, kept in zip(self.windows, rows) if kept),
+                       describe={name: values[rows] for name, values in self.describe.items()})
+
     def accumulated(self, model: SensorModel) -> Accumulator:
         """Return the Accumulator of a model whose columns are among those of this recording's."""
         chosen = selected_columns(self.model, model)

@@ -63,8 +63,13 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
 
 
 def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Question]:
-    """Return the questions of another attempt that ask the same."""
-    return [next(question for question in attempt.questions if question.label == each.label) for each in chosen]
+    """Return the questions of another attempt that ask the same: a warm-up that it has in its bank at the likeliest time constant."""
+    found = []
+    for each in chosen:
+        asked = [question for question in attempt.questions if question.name == each.name]
+        same = [question for question in asked if question.label == each.label]
+        found.append((same or [min(asked, key=lambda question: attempt.evidence.loss(attempt.search.used([question])))])[0])
+    return found
 
 
 def _swapped(attempt, chosen):
@@ -80,6 +85,6 @@ def _difference(one, two):
 
 def _cost(attempt, chosen, judge):
     """Return the held-out cost of a choice at its own linearisation, judged with the noise and the band of another attempt."""
-    space = replace(attempt.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
+    space = replace(attempt.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
     evidence = WindowEvidence(space, judge.noise, attempt.evidence.fold)
     return 0.5 * evidence.heldout(attempt.search.used(chosen)) + PENALTY * sum(question.penalty for question in chosen)

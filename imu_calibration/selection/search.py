@@ -6,6 +6,7 @@ from typing import Sequence
 
 import numpy as np
 
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
@@ -100,12 +101,13 @@ class Search:
         return Score(question, gain, p_value, self.allowed(beside, question), self.implausible(beside, question))
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the effect's estimate is possible: a lag is not negative, no angle within half an encoder step, and unless asked no size implausible."""
+        """Return whether the effect's estimate is possible: a lag is not negative, no angle (at 1 g) within half an encoder step, and unless asked no size implausible."""
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
             return False
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
-        if question.effect.unit == 'rad' and np.all(np.abs(value) < 0.5 * self.encoder_step):
+        turns = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}.get(question.effect.unit)
+        if turns is not None and np.all(np.abs(value) * turns < 0.5 * self.encoder_step):
             return False
         if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
             return False

@@ -21,6 +21,7 @@ from worlds.physics_cause import NO_CAUSE
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
 from worlds.physics_sensor import low_pass
 from worlds.physics_table import local_gravity, move_table
+from worlds.wanders import WANDERS, add_wander
 
 PLACE = {'gravity': None, 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 20.0}
 Z_Y_X = [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}]
@@ -72,7 +73,8 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         value itself. Saturation: the fraction of samples that are clipped, or the array (level,). Drift: the amplitude, or the
         array (x, y, z, time constant).
     noise : str or SimulatedNoise
-        'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too.
+        'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too; a name in `worlds.wanders.WANDERS`:
+        realistic, but the bias wanders in that way.
     grade : str
         IMU grade in `imu_calibration.simulation.sensor_noise.GRADES`.
     duration : float, optional
@@ -129,6 +131,8 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     if knock or 'knock_step' in values:
         outputs = [out + shock for out, shock in zip(outputs, _shock(sampling.time, events['knock']))]
     _set_limits(triads, outputs, values)
+    if noise in WANDERS:
+        outputs = add_wander(outputs, noise, GRADES[grade].noise, 1.0 / imu_rate, generator(seed, 'wander'))
     outputs = add_imu_noise(*outputs, model, sample_rate=imu_rate, rng=generator(seed, 'noise'))
     outputs = [np.clip(out, -triad.limit, triad.limit) for out, triad in zip(outputs, triads)]
 
@@ -160,7 +164,9 @@ def _noise_model(noise, grade, encoder_resolution):
     if isinstance(noise, str):
         full = realistic(grade)
         quiet = replace(full.white_only(), encoder_noise=2e-6)
-        noise = {'none': SimulatedNoise(), 'white': quiet, 'realistic': replace(full, encoder_noise=2e-6)}[noise]
+        real = replace(full, encoder_noise=2e-6)
+        still = replace(real, accel_instability=0.0, gyro_instability=0.0)
+        noise = {'none': SimulatedNoise(), 'white': quiet, 'realistic': real, **dict.fromkeys(WANDERS, still)}[noise]
     return noise if encoder_resolution is None else replace(noise, encoder_resolution=encoder_resolution)
 
 

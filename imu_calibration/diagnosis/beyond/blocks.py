@@ -110,7 +110,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     for sensor, residual in _residuals(windows, table, attempt).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
-        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which])[place] / count[:, None]
+        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])[place] / count[:, None]
         found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, floor.bias_processes)
     return found
 
@@ -123,19 +123,19 @@ def _some(windows, length):
     return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MOST_BLOCKS // blocks])
 
 
-def _busier(windows, sensor, floor, kinds):
+def _busier(windows, sensor, floor, kinds, judged):
     """
     Return by how much each window's white noise exceeds that at rest, shape (k, 3).
 
-    By kind, from second differences, in which a cause that goes with the motion hardly shows; at most what its misfit allows.
+    By kind, from second differences of the windows `judged` (mask), in which a cause that goes with the motion hardly shows; at most what its misfit allows.
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))
     own = np.array([window.noise_sd[place]**2 if len(window) > 8 else np.full(3, np.nan) for window in windows])
-    still = np.nanmedian(own[kinds == 'static'], axis=0) if np.any(kinds == 'static') else floor.white_variance
+    still = np.nanmedian(own[judged & (kinds == 'static')], axis=0) if np.any(judged & (kinds == 'static')) else floor.white_variance
     for kind in np.unique(kinds[kinds != 'static']):
         most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
-        found[kinds == kind] = np.clip(np.nanmedian(own[kinds == kind], axis=0) / still, 1.0, most)
+        found[kinds == kind] = np.clip(np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most)
     return found
 
 
