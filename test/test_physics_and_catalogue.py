@@ -15,8 +15,12 @@ from worlds.physics import encoder_reading, make_session
 from worlds.physics_draw import EFFECTS
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
-LEFT = {'load_compliance': 3e-3, 'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02, 'time_offset': 2e-3}
-"""Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; the mount's turn to first order; else 1 ns stamps."""
+LEFT = {'load_compliance': 3e-3, 'axis_wobble': 3e-3, 'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02,
+        'accel_cross_axis_lag': 0.03, 'gyro_cross_axis_lag': 0.03, 'time_offset': 2e-3}
+"""
+Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; the mount's turn to first order; the world's differences
+in time; what a neighbour feels along its own crooked axis; else 1 ns stamps.
+"""
 
 
 @lru_cache(maxsize=1)

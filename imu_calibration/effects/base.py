@@ -15,6 +15,7 @@ SECTIONS = SENSORS + ('reference',)
 """Sections of a model and of a calibration document."""
 
 VECTOR = AXES
+OTHERS = tuple(f'{row}_{column}' for row in AXES for column in AXES if row != column)
 MATRIX = tuple(row + column for row in AXES for column in AXES)
 KNOWN = 10.0
 """No instrument is known of with an effect beyond this many times the largest plausible size."""

@@ -62,6 +62,20 @@ class Products:
 
 
 @dataclass(frozen=True)
+class OfOthers:
+    """Two values for each axis, before the columns of the two others."""
+
+    effect: str
+    group: str
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        block = np.zeros((3, 3), values[self.effect].dtype)
+        block[~np.eye(3, dtype=bool)] = values[self.effect]
+        return {self.group: block.T}
+
+
+@dataclass(frozen=True)
 class OfMatrix:
     """The sensor's matrix, or its rows times one value per axis."""
 

@@ -1,4 +1,4 @@
-"""Effects of the table, the clock and a sensor's own lag: they change the motion that the sensor is thought to have felt."""
+"""Effects of the table and the clock: they change the motion that the sensors are thought to have felt."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -6,16 +6,16 @@ from functools import lru_cache
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.base import MATRIX, SENSORS, SHORT, Effect, Role
+from imu_calibration.effects.base import MATRIX, Effect, Role
+from imu_calibration.effects.lags import LAGS
 from imu_calibration.effects.regressors import ATTITUDE, LOAD, PAIRS
 from imu_calibration.reference.axis_angles import with_axis_angles, with_axis_places
 from imu_calibration.reference.encoder import with_encoder_harmonics
 from imu_calibration.reference.joint import JointNames
 from imu_calibration.reference.joint_delay import shifted
+from imu_calibration.reference.leaning_axes import WOBBLES, with_sag, with_wobble
 from imu_calibration.reference.levelling import tilt
 
-LAGUERRE = np.polynomial.laguerre.laggauss(5)
-"""Nodes and weights that turn an exponential lag into a weighted mean of delays: int e^-x f(t - tau x) dx."""
 EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
 """Axes i, j, k of a cross product with their sign."""
 _PAIR = {pair: place for place, pair in enumerate(PAIRS)}
@@ -48,6 +48,16 @@ def _places(table, motion, values):
     return [(1.0, _changed(with_axis_places, table, tuple(values)), motion)]
 
 
+def _sag(table, motion, values):
+    """Let the axes behind the first one hang with their weight."""
+    return [(1.0, _changed(with_sag, table, tuple(values)), motion)]
+
+
+def _wobble(table, motion, values):
+    """Let each axis lean as it turns."""
+    return [(1.0, _changed(with_wobble, table, tuple(values)), motion)]
+
+
 def _zero(table, motion, values):
     """Shift the joints between the first and the last: the first one's zero is the azimuth, the last one's belongs to the mount."""
     offset = np.zeros(motion.position.shape[1])
@@ -69,11 +79,6 @@ def _harmonics(table, motion, values):
 
 def _late(table, motion, values):
     return [(1.0, table, shifted(motion, values[0]))]
-
-
-def _lag(table, motion, values):
-    """First-order low-pass of time constant tau: y = int e^-x u(t - tau x) dx, by Gauss-Laguerre quadrature."""
-    return [(weight, table, shifted(motion, values[0] * node)) for node, weight in zip(*LAGUERRE)]
 
 
 def _earth(values, point):
@@ -107,23 +112,6 @@ def _bent(values, point):
     return {LOAD['accelerometer'].name: force @ matrix.T, LOAD['gyroscope'].name: rate @ matrix.T}
 
 
-def _places_taken(table):
-    """Return why the places of axes cannot be asked about: the axes of a turntable meet well enough."""
-    if table.joint_error_m is not None:
-        return None
-    return 'the table description takes the places of the axes for exact', 'say there what they may be off by (joint_error_m)'
-
-
-def _lag_effect(sensor):
-    return Effect(
-        name=f'{SHORT[sensor]}_bandwidth', sensor=sensor, components=('time_constant',), shape=(), unit='s', nonnegative=True,
-        in_reference=True,
-        explanation=f'The {sensor} answers through a first-order low-pass filter: its output lags and loses amplitude at speed.',
-        tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
-        tolerance_reason='1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer' else '0.1 deg/s while the rate changes by 1000 deg/s^2',
-        motion=('oscillate_fast',), compensation='none', warp=_lag, acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
-
-
 def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
@@ -148,7 +136,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),),
             motion=('static_dense',), warp=_zero, needs=('joints', 'three_joints')),
         Effect(
-            **of_table | {'unit': 'm'}, name='axis_offset', components=names.places, shape=(len(names.places),), moot=_places_taken,
+            **of_table | {'unit': 'm'}, name='axis_offset', components=names.places, shape=(len(names.places),),
             explanation='The axes do not pass through the points that the description says.',
             tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
             plausible=(('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),), motion=('two_axis', 'three_speeds'),
@@ -156,9 +144,20 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         Effect(
             **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ORDERS), 2),
             components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
-            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc), or the axis sags with the weight, which no turn of this joint tells apart.',
+            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
             tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),),
             motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
+        Effect(
+            **of_table, name='axis_sag', components=names.turning[1:], shape=(len(names.turning[1:]),),
+            explanation='The axes sag: each hangs towards the ground by an angle that goes with how level it lies, as a loaded shaft bends.',
+            tolerance_reason='as the tilt', prior_sd=2e-3, plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),),
+            motion=('static_dense', 'two_axis'), warp=_sag, needs=('joints', 'two_joints')),
+        Effect(
+            **of_table, name='axis_wobble', shape=(len(names.turning), len(WOBBLES), 2),
+            components=tuple(f'{name}_{kind}{order:+d}' for name in names.turning for order in WOBBLES for kind in ('cos', 'sin')),
+            explanation='An axis wobbles: it leans another way at every angle of its turn, as a bearing out of round makes it.',
+            tolerance_reason='as the tilt', prior_sd=2e-3, plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),),
+            motion=('slow_turn', 'two_axis'), warp=_wobble, needs=('joints',)),
         Effect(
             **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance', components=MATRIX, shape=(3, 3),
             explanation='The mount bends with the load: the sensor turns a little with the force that it carries, which both sensors see.',
@@ -180,5 +179,5 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth,
             acts_on=('gyroscope',),
             needs=('joints',)),
-        *map(_lag_effect, SENSORS),
+        *LAGS,
     )

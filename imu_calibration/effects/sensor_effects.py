@@ -4,10 +4,17 @@ import numpy as np
 
 from imu_calibration.constants import DEG, MILLI_G, STANDARD_GRAVITY
 from imu_calibration.effects import regressors
-from imu_calibration.effects.base import AXES, MATRIX, PRODUCTS, SHORT, VECTOR, Effect, Role
-from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, Products
+from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, VECTOR, Effect, Role
+from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, OfOthers, Products
 
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
+
+
+def _one_axis(table):
+    """Return why lags between axes cannot be asked about: they show where motions about several axes mix."""
+    if len(table.joint_names.turning) > 1:
+        return None
+    return 'the table turns about one axis only', 'record on a table that turns about two axes at once'
 
 
 def _pair(sensor):
@@ -16,7 +23,7 @@ def _pair(sensor):
     short, kind, unit = SHORT[sensor], regressors.INPUT[sensor], UNIT[sensor]
     small = MILLI_G if accel else 0.01 * DEG
     full = STANDARD_GRAVITY if accel else 100 * DEG
-    own = {group: getattr(regressors, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'WARM_UP')}
+    own = {group: getattr(regressors, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')}
     curved = ('static_dense', 'centrifuge') if accel else ('three_speeds',)
 
     def along_axis(name, group, function):
@@ -70,6 +77,13 @@ def _pair(sensor):
             plausible=(('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',) if accel else ('temperature', 'rotation'),
             groups=(own['THERMAL'],), coefficients=OfMatrix(f'{short}_thermal_scale', own['THERMAL'].name)),
+        Effect(
+            name=f'{short}_cross_axis_lag', sensor=sensor, components=OTHERS, shape=(3, 2), unit='s', against=('rate',),
+            explanation=f'Each {sensor} axis hears the others with another lag than its own: what they feel comes onto it by how fast it changes.',
+            tolerance=1e-5, tolerance_reason='1 mrad of cross coupling through a lag of 10 ms', prior_sd=1e-3,
+            plausible=(('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),),
+            motion=('oscillate_fast', 'two_axis'), compensation='exact', needs=('rotation',), moot=_one_axis,
+            groups=(own['CHANGE'],), coefficients=OfOthers(f'{short}_cross_axis_lag', own['CHANGE'].name)),
         Effect(
             name=f'{short}_bias_drift', sensor=sensor, components=VECTOR + ('time_constant',), shape=(4,), unit=(unit, unit, unit, 's'),
             time_constant=True, smooth=True, against=('time',),

@@ -57,6 +57,10 @@ class Joint:
     """Set when the joint follows another one."""
     limits: JointLimits = field(default=JointLimits())
     """How far and how fast it may go."""
+    sag: float = 0.0
+    """Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`): an estimate, which no description holds."""
+    wobble: tuple[tuple[int, complex], ...] = ()
+    """How it leans as it turns: (turns of the lean for one of the joint, amplitude, rad), an estimate too."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
@@ -70,6 +74,11 @@ class Joint:
     def turns(self) -> bool:
         """Whether it turns; else it slides."""
         return self.type == 'revolute'
+
+    @property
+    def leans(self) -> bool:
+        """Whether its axis does not keep its direction."""
+        return bool(self.sag or self.wobble)
 
     @property
     def source(self) -> str:

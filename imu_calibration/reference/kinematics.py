@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from imu_calibration.reference.axis_angles import axis_error_directions
 from imu_calibration.reference.earth import earth_rate_n
+from imu_calibration.reference.leaning_axes import wobble_at
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.rotations import align, rotation
 
@@ -30,6 +32,14 @@ class _Link(NamedTuple):
     """Column of the motion that drives it."""
     multiplier: float
     plus: float
+    sag: float
+    wobble: tuple
+    across: np.ndarray
+    """`axis_error_directions`, shape (2, 3)."""
+
+    @property
+    def leans(self):
+        return bool(self.sag or self.wobble)
 
 
 class _Step(NamedTuple):
@@ -42,6 +52,8 @@ class _Step(NamedTuple):
     sense: float = 1.0
     third: int = 2
     """Coordinate axis that the joint turns about, in this sense."""
+    across: np.ndarray | None = None
+    """Directions u, v of a lean in these coordinates, shape (2, 3)."""
 
 
 def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None) -> Reference:
@@ -93,7 +105,7 @@ def _chain_steps(constants, motion):
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
         matrix = link.mat_in @ matrix
-        if not _moves(motion, link.column):
+        if not link.leans and not _moves(motion, link.column):
             at = link.plus + (link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0)
             if link.turns:
                 matrix = rotation(-at * link.axis) @ matrix
@@ -101,7 +113,7 @@ def _chain_steps(constants, motion):
                 offset = offset + matrix.T @ (at * link.axis)
             continue
         before, sense, third = _to_coordinate_axis(link.axis) if link.turns else (np.eye(3), 1.0, 2)
-        steps.append(_Step(offset, before @ matrix, link, sense, third))
+        steps.append(_Step(offset, before @ matrix, link, sense, third, link.across @ before.T))
         matrix, offset = before.T, np.zeros(3)
     return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
 
@@ -137,10 +149,11 @@ def _constants(table):
     """Return the `_Constants`: thousands of short windows share one table."""
     columns = {name: column for column, name in enumerate(table.joint_names)}
     links = tuple(_Link(np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, joint.turns, columns[joint.source],
-                        *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset))) for joint in table.joints)
+                        *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
+                        joint.sag, joint.wobble, axis_error_directions(np.array(joint.axis))) for joint in table.joints)
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
     constants = _Constants(_base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value)
-    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in link[:3])):
+    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in (*link[:3], link.across))):
         array.flags.writeable = False
     return constants
 
@@ -176,8 +189,28 @@ def _move(columns, step, motion, part):
     position, rate, acceleration = (factor * values[part, link.column] for values in (motion.position, motion.rate, motion.acceleration))
     position += step.sense * link.plus
     if link.turns:
+        if link.leans:
+            columns = _lean(columns, step, *(step.sense * values for values in (position, rate, acceleration)))
         return _turn(columns, step.third, position, rate, acceleration)
     return _slide(columns, link.axis[:, None], position, rate, acceleration)
+
+
+def _lean(columns, step, angle, rate, acceleration):
+    """Bring `columns` into the frame of a joint whose axis sags and wobbles, by two small turns across it; the joint is at `angle`."""
+    link, first, second = step.link, (step.third + 1) % 3, (step.third + 2) % 3
+    vector = np.zeros((3, 3, len(angle)))   # derivative, direction, sample
+    if link.wobble:
+        lean = wobble_at(link.wobble, angle, rate, acceleration=acceleration)
+        vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
+    if link.sag:
+        up, spin, alpha = columns[:, 2], columns[:, 3], columns[:, 4]
+        moves = _cross(up, spin)   # up stays in space; the Earth's turn of it is nothing beside the sag
+        axis = np.zeros((3, 1))
+        axis[step.third] = step.sense * link.sag
+        vector += np.stack([_cross(each, axis) for each in (up, moves, _cross(moves, spin) + _cross(up, alpha))])
+    for which in (first, second):
+        columns = _turn(columns, which, *vector[:, which])
+    return columns
 
 
 def _arm_force(rate, alpha, arm):

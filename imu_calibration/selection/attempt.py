@@ -25,6 +25,8 @@ from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
+TOO_COARSE = 4.0
+"""Evidence that a curvature may make before the columns are taken anew, nats."""
 BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
@@ -104,15 +106,12 @@ class Attempt:
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
         """Return whether the linearisation is too coarse for what was chosen: curvature times evidence."""
-        values, model = self.values(chosen), self.recording.model
-        full = self.evidence.loss(self.search.used(chosen))
-        if any('@' in question.label for question in chosen):
-            return True
-        for question in chosen:
-            weight = self.evidence.loss(self.search.used([q for q in chosen if q is not question])) - full
-            if weight * _curvature(question, values, model)**2 > 4.0:
-                return True
-        return False
+        return any('@' in question.label for question in chosen) or any(self.curvature_shows(chosen, question) > TOO_COARSE for question in chosen)
+
+    def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
+        """Return what the evidence makes of an effect's curvature, nats: how well it is told from its own first derivative."""
+        weight = self.evidence.loss(self.search.used([q for q in chosen if q is not question])) - self.evidence.loss(self.search.used(chosen))
+        return weight * _curvature(question, self.values(chosen), self.recording.model)**2
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -9,6 +10,9 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE
+
+SHOWN = 0.1
+"""Evidence of a curvature below which it tells nothing from anything, nats: a delay of 0.1 ms is a lag of 0.1 ms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +40,7 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
 
     The first derivatives of a delay and of a low-pass are the same, and a search that takes its columns at one of them sees the other by its
     straight line alone: whichever it met first would win. So each is linearised where it is, and all are judged with the same noise,
-    that of each in turn.
+    that of each in turn; only those that are compared have columns there.
 
     Parameters
     ----------
@@ -44,21 +48,24 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
         Linearised where none of them acts.
     chosen : sequence of Question
     attempted : callable
-        ``attempted(point=...)``: the Attempt elsewhere.
+        ``attempted(point=..., effects=...)``: the Attempt elsewhere, or with some of the effects.
 
     """
     chosen = [question for question in chosen if '@' not in question.label]
     choices = [chosen, *_swapped(attempt, chosen)]
     if len(choices) == 1:
         return attempt, []
-    attempts = [attempted(point=attempt.point(choice)) for choice in choices]
+    few = partial(attempted, effects=list({question.name: question.effect for choice in choices for question in choice}.values()))
+    start = few()
+    attempts = [few(point=start.point(same_questions(start, choice))) for choice in choices]
     choices = [same_questions(there, choice) for there, choice in zip(attempts, choices)]
     costs = np.mean([[_cost(*each, judge) for each in zip(attempts, choices)] for judge in attempts], axis=0)
     best = int(np.argmin(costs))
     values = [dict(zip(there.space.names, there.values(choice))) for there, choice in zip(attempts, choices)]
     near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
-    return attempts[best], [
-        Rival(*_difference(choices[best], choices[k]), float(costs[k] - costs[best]),
+    settled = attempted(point=attempt.point(same_questions(attempt, choices[best])))
+    return settled, [
+        Rival(*same_questions(settled, _difference(choices[best], choices[k])), float(costs[k] - costs[best]),
               {name: values[k][name] - values[best][name] for name in attempt.baseline.param_names}) for k in near]
 
 
@@ -73,9 +80,10 @@ def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Questio
 
 
 def _swapped(attempt, chosen):
-    """Return the choices in which an effect gave way to one that only its curvature tells from it, at best."""
-    return [[other if each is question else each for each in chosen] for question in chosen if question.effect.warp is not None
-            for other, _ in attempt.search.class_mates(chosen, question) if other.effect.warp is not None]
+    """Return the choices in which an effect gave way to one that only its curvature tells from it, where that can tell anything."""
+    return [[other if each is question else each for each in chosen] for question in chosen
+            if question.effect.warp is not None and attempt.curvature_shows(chosen, question) > SHOWN
+            for other, _ in attempt.search.class_mates(chosen, question, most=None) if other.effect.warp is not None]
 
 
 def _difference(one, two):

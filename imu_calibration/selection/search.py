@@ -189,8 +189,8 @@ class Search:
                     best, cost = trial, value
         return best
 
-    def class_mates(self, chosen: Sequence[Question], question: Question) -> list[tuple[Question, float]]:
-        """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most two."""
+    def class_mates(self, chosen: Sequence[Question], question: Question, *, most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
+        """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
         place, cost = chosen.index(question), self.cost(chosen)
         found = {}
         for other in self.others(chosen):
@@ -201,7 +201,7 @@ class Search:
             if difference < TIE and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
-        return sorted(found.values(), key=lambda pair: pair[1])[:CLASS_SIZE - 1]
+        return sorted(found.values(), key=lambda pair: pair[1])[:most]
 
 
 class Named(ABC):

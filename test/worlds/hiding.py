@@ -15,7 +15,7 @@ from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.search import FAMILY_WISE
 
 from worlds import physics
-from worlds.physics_draw import EFFECTS, draw_value, generator
+from worlds.physics_draw import EFFECTS, POSITIVE, draw_value, generator
 
 NOT_SIZED = {'earth_rate'}
 """The Earth turns as fast as it does: it is sought with a tactical grade of noise, where it is well above detectability."""
@@ -96,7 +96,7 @@ class Sizes:
         size = factor * np.sqrt(threshold_noncentrality(n_parameters, len(self.attempt.questions)) / strength)
         if effect.endswith('_bias_drift'):
             return np.append(size * value[:3], value[3])
-        if effect.endswith('_bandwidth'):
+        if effect.endswith(POSITIVE):
             return float(abs(size * value[0]))
         return (size * value).reshape(np.shape(draw_value(effect, 1.0, 3, generator(seed, effect))) or (1,))
 

@@ -19,7 +19,7 @@ from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_
 
 from worlds.physics_cause import NO_CAUSE
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
-from worlds.physics_sensor import low_pass
+from worlds.physics_sensor import filtered
 from worlds.physics_table import local_gravity, move_table
 from worlds.wanders import WANDERS, add_wander
 
@@ -122,12 +122,11 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     events = draw_events(moves, generator(seed, 'events'))
     climate = Climate(temperature or 'warm_up', moves.duration, generator(seed, 'climate'))
     gravity = mapping['gravity'] or local_gravity(mapping['latitude'], mapping['height'])
-    sampling = _Sampling(imu_rate, moves.duration, max(cause.oversampling, oversampling if any(triad.low_pass for triad in triads) else 1))
+    sampling = _Sampling(imu_rate, moves.duration, max(cause.oversampling, oversampling if any(triad.lags for triad in triads) else 1))
 
     world = _move(mapping, moves, sampling.fine_time, gravity, values, events)
     outputs = _sense(world, triads, climate.at(sampling.fine_time), values, events, cause)
-    outputs = [low_pass(out, sampling.step, triad.low_pass, triad.low_pass_order)[:: sampling.factor]
-               for out, triad in zip(outputs, triads)]
+    outputs = [filtered(out, sampling.step, triad)[:: sampling.factor] for out, triad in zip(outputs, triads)]
     if knock or 'knock_step' in values:
         outputs = [out + shock for out, shock in zip(outputs, _shock(sampling.time, events['knock']))]
     _set_limits(triads, outputs, values)
@@ -188,7 +187,8 @@ def _move(mapping, moves, time, gravity, values, events):
     slip = None
     if 'fixture_slip' in values:
         slip = np.where(time[:, None] > events['slip'], values['fixture_slip'] * events['turn'], 0.0)
-    return move_table(mapping, time, motion, gravity, values.get('table_tilt', (0.0, 0.0)), values.get('axis_non_orthogonality'), slip)
+    return move_table(mapping, time, motion, gravity, values.get('table_tilt', (0.0, 0.0)), values.get('axis_non_orthogonality'), slip,
+                      sag=values.get('axis_sag'), wobble=values.get('axis_wobble'), beside=values.get('axis_offset'))
 
 
 def _sense(world, triads, temperature_c, values, events, cause):

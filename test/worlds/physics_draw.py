@@ -18,6 +18,9 @@ EFFECTS = {
     'accel_thermal_bias': (0.3 * MG, (3,)), 'accel_thermal_scale': (3e-4, (3,)), 'accel_bias_drift': (2 * MG, None),
     'accel_saturation': (0.02, None), 'accel_bandwidth': (4e-3, None),
     'accel_thermal_bias_2': (0.05 * MG, (3,)), 'gyro_thermal_bias_2': (2e-3 * DEG, (3,)), 'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
+    'accel_delay': (4e-3, None), 'gyro_delay': (4e-3, None), 'accel_filter': (4e-3, None), 'gyro_filter': (4e-3, None),
+    'accel_cross_axis_lag': (2e-4, (3, 2)), 'gyro_cross_axis_lag': (2e-4, (3, 2)),
+    'axis_sag': (5 * ARCMIN, None), 'axis_wobble': (3 * ARCMIN, None), 'axis_offset': (5e-3, None),
     'load_compliance': (1 * ARCMIN / G, (3, 3)),
     'gyro_g_sensitivity': (0.02 * DEG / G, (3, 3)), 'gyro_rate_product': (1e-3, (3, 3)), 'gyro_quadratic': (1e-3, (3,)),
     'gyro_scale_asymmetry': (1e-3, (3,)), 'gyro_thermal_bias': (0.01 * DEG, (3,)), 'gyro_thermal_scale': (5e-4, (3,)),
@@ -29,6 +32,10 @@ EFFECTS = {
 OUTSIDE = {'angle_bias_accel': 2 * MG, 'angle_bias_gyro': 0.05 * DEG, 'stop_bias': 2 * MG, 'knock_step': 5 * MG,
            'fixture_slip': 10 * ARCMIN, 'second_warm_up': 3 * MG}
 """Causes that no catalogue holds: name -> clearly visible size."""
+
+
+POSITIVE = ('_saturation', '_bandwidth', '_delay', '_filter')
+"""Endings of the names of what cannot be negative and has one value."""
 
 
 def generator(seed, what):
@@ -46,7 +53,7 @@ def draw_value(name, size, n_joints, rng):
         return float(OUTSIDE[name] if size is None else size)
     usual, shape = EFFECTS[name]
     size = float(usual if size is None else size)
-    if name.endswith('_saturation') or name.endswith('_bandwidth') or name == 'earth_rate':
+    if name.endswith(POSITIVE) or name == 'earth_rate':
         return size
     if name.endswith('_bias_drift'):
         return np.append(size * _pattern((3,), rng), rng.uniform(40.0, 150.0))
@@ -54,7 +61,8 @@ def draw_value(name, size, n_joints, rng):
         phase = rng.uniform(0.0, 2.0 * np.pi, (n_joints, 2))
         amplitude = size * rng.uniform(0.6, 1.4, (n_joints, 2)) * [1.0, 0.4]
         return np.stack([amplitude * np.cos(phase), amplitude * np.sin(phase)], axis=2)
-    shape = {'axis_non_orthogonality': (n_joints - 1,), 'encoder_zero': (n_joints - 2,)}.get(name, shape)
+    shape = {'axis_non_orthogonality': (n_joints - 1,), 'encoder_zero': (n_joints - 2,), 'axis_sag': (n_joints - 1,),
+             'axis_wobble': (n_joints, 2, 2), 'axis_offset': (n_joints - 1, 2)}.get(name, shape)
     return float(size * _pattern((), rng)) if shape == () else size * _pattern(shape, rng)
 
 
@@ -75,7 +83,8 @@ def draw_imu(grade, values, arms, rng):
         triad.thermal_bias = values.get(short + '_thermal_bias', 0.0)
         triad.thermal_bend = values.get(short + '_thermal_bias_2', 0.0)
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
-        triad.low_pass = float(values.get(short + '_bandwidth', 0.0))
+        triad.low_pass, triad.late = float(values.get(short + '_bandwidth', 0.0)), float(values.get(short + '_delay', 0.0))
+        triad.second_order, triad.crosstalk = float(values.get(short + '_filter', 0.0)), values.get(short + '_cross_axis_lag')
         if short + '_bias_drift' in values:
             triad.drift, triad.drift_constant = values[short + '_bias_drift'][:3], values[short + '_bias_drift'][3]
     accel.cubic = values.get('accel_cubic', 0.0)

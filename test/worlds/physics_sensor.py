@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.interpolate import CubicSpline
+from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 TEMPERATURE_REF_C = 25.0
 
@@ -39,8 +40,19 @@ class Triad:
     """Time constant of the filter behind the elements, s."""
     low_pass_order: int = 1
     """Number of equal first-order stages; their time constants add up to `low_pass`."""
+    second_order: float = 0.0
+    """Delay of a Butterworth filter of second order behind the elements, s."""
+    late: float = 0.0
+    """By how much the output is old when it is stamped, s."""
+    crosstalk: np.ndarray | None = None
+    """What of each other element's change in time comes onto element i, through the capacitance between their wires, s, shape (3, 2)."""
     limit: float = np.inf
     """The output cannot leave [-limit, limit]."""
+
+    @property
+    def lags(self):
+        """Whether the output depends on what was before."""
+        return bool(self.low_pass or self.second_order or self.late or self.crosstalk is not None)
 
     def respond(self, inputs, time, temperature_c, force_s):
         """
@@ -73,6 +85,27 @@ class Triad:
 
 def _of(value, i):
     return value if np.isscalar(value) else value[i]
+
+
+def filtered(values, step, triad):
+    """Return what comes out behind the elements of a triad: crosstalk, filters, delay."""
+    if triad.crosstalk is not None:
+        others = np.gradient(values, step, axis=0)[:, [[1, 2], [0, 2], [0, 1]]]
+        values = values + (others * triad.crosstalk).sum(axis=2)
+    values = low_pass(values, step, triad.low_pass, triad.low_pass_order)
+    if triad.second_order:
+        values = butterworth(values, step, triad.second_order)
+    if triad.late:
+        time = step * np.arange(len(values))
+        values = CubicSpline(time, values)(np.maximum(time - triad.late, 0.0))
+    return values
+
+
+def butterworth(values, step, delay):
+    """Return the output of the maximally flat filter ``1 / (1 + d s + d^2 s^2 / 2)`` that was in balance at the start: bilinear, on a fine grid."""
+    system = cont2discrete(([1.0], [0.5 * delay**2, delay, 1.0]), step, 'bilinear')
+    above, below = system[0].ravel(), system[1]
+    return lfilter(above, below, values, axis=0, zi=lfilter_zi(above, below)[:, None] * values[:1])[0]
 
 
 def low_pass(values, step, time_constant, order=1):

@@ -44,7 +44,7 @@ class World:
         return self.to_sensor(self.force_n + swing)
 
 
-def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None, slip=None):
+def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None, slip=None, *, sag=None, wobble=None, beside=None):
     """
     Return the `World` of a table description under a joint motion.
 
@@ -62,6 +62,12 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
         How much each axis but the first is turned away from the one before it, rad.
     slip : array (n, 3), optional
         Turn of the sensor in its fixture against the nominal mount, rotation vector in s.
+    sag : (n_joints - 1,)
+        By how much the end of each axis but the first would hang down if it lay level, rad: a shaft that bends with its load.
+    wobble : (n_joints, 2, 2)
+        Two circles on which the tip of each axis moves, rad: (cosine, sine) of one against the turn, and of one at twice the turn.
+    beside : (n_joints - 1, 2)
+        By how much each axis but the first passes beside the point where it should meet the others, m, in the two directions across it.
 
     """
     axes = _true_axes(mapping, axis_errors)
@@ -75,6 +81,18 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
     for k, joint in enumerate(mapping['joints']):
         if np.any(joint.get('xyz') or 0.0):
             acceleration = acceleration + _swing(rate, alpha, mats @ np.asarray(joint['xyz'], float))
+        if beside is not None and k:
+            acceleration = acceleration + _swing(rate, alpha, mats @ (np.asarray(beside[k - 1]) @ _across(axes[k])))
+        leans = []
+        if sag is not None and k:
+            leans.append(sag[k - 1] * np.cross(np.swapaxes(mats, 1, 2) @ [0.0, 0.0, 1.0], axes[k]))
+        if wobble is not None:
+            leans.append(_circles(wobble[k], motion.position[:, k]) @ _across(axes[k]))
+        for lean_b in leans:
+            swing_b = np.gradient(lean_b, time, axis=0, edge_order=2)
+            swing_n = np.einsum('nij,nj->ni', mats, swing_b)
+            alpha = alpha + np.einsum('nij,nj->ni', mats, np.gradient(swing_b, time, axis=0, edge_order=2)) + np.cross(rate, swing_n)
+            rate, mats = rate + swing_n, mats @ Rotation.from_rotvec(lean_b).as_matrix()
         axis_n = mats @ axes[k]
         own = motion.rate[:, k, None] * axis_n
         alpha = alpha + motion.acceleration[:, k, None] * axis_n + np.cross(rate, own)
@@ -87,6 +105,20 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
         mats = mats @ Rotation.from_rotvec(slip).as_matrix()
     force = acceleration + gravity * lean.apply([0.0, 0.0, 1.0])
     return World(time, motion.position, mats, rate, alpha, force, earth_n)
+
+
+def _across(axis):
+    """Return two directions across an axis along x, y or z, and right-handed with it, shape (2, 3): the first of x, y, z comes first."""
+    first = np.eye(3)[0 if abs(axis[0]) < 0.5 else 1]
+    return np.array([first, np.cross(axis, first)])
+
+
+def _circles(amplitudes, angle):
+    """Return where the tip of an axis is across it, shape (n, 2), that runs on two circles: backwards, and forwards at twice the turn."""
+    (c1, s1), (c2, s2) = amplitudes
+    one, two = angle, 2 * angle
+    return np.stack([c1 * np.cos(one) + s1 * np.sin(one) + c2 * np.cos(two) - s2 * np.sin(two),
+                     s1 * np.cos(one) - c1 * np.sin(one) + c2 * np.sin(two) + s2 * np.cos(two)], axis=1)
 
 
 def earth_vector(mapping):
