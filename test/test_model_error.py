@@ -11,7 +11,7 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.model_error import LEAST_BLOCKS, NO_BIAS
+from imu_calibration.estimation.model_error import LEAST_BLOCKS, NO_BIAS, Waves, errors_of_waves
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.reference.table import Table
@@ -157,3 +157,16 @@ def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fa
     assert any(process.time < NO_BIAS and process.sd > 2 * noise.offset_sd for process in noise.bias_processes)
     error = (found.solution.values[part] - found.truth['accelerometer'].bias) / found.solution.sd[part]
     assert np.abs(error).max() < 2.0
+
+
+def test_a_drift_shows_beside_noise_that_was_taken_too_large():
+    """Ripple that is fast and not white is taken for noise; a drift of 1.7 such deviations counts where the fast cosines scatter by a third of one, and not by all."""
+    def waves(fast):
+        rng = np.random.default_rng(5)
+        moved = fast * rng.choice([-1.0, 1.0], (12, 3))
+        moved[0] = 1.7
+        return Waves(np.arange(3), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+
+    every = {'gyroscope': [slice(0, 3)]}
+    assert np.all(errors_of_waves(waves(0.33), 3, groups=every)[0].added_variance > 1.0)
+    assert not errors_of_waves(waves(1.0), 3, groups=every)[0].added_variance.any()

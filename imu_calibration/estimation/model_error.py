@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
@@ -184,18 +185,31 @@ class Waves:
         All alike, but for those that walk by more by themselves. The mean over another recording of the same length differs by two thirds
         of the variance that the walk reaches in one, a third for each of both.
         """
-        p_value, common = self._walked(self.moved[:SLOW_WAVES, group], self._inverse(group)[:SLOW_WAVES])
-        own = [self._walked(self.moved[:SLOW_WAVES, at], self._inverse(at)[:SLOW_WAVES]) for at in group[:, None]]
+        p_value, common = self._walked(group)
+        own = [self._walked(at) for at in group[:, None]]
         return p_value, np.array([max(common, variance if chance < CHANCE / len(group) else 0.0) for chance, variance in own])
 
-    def _walked(self, moved, information):
-        """Return (chance, variance to add) by the score test of the variance of a walk."""
-        walk = self.walk[:SLOW_WAVES]
-        score = walk @ (np.einsum('kij,kj->ki', information, moved)**2).sum(axis=1)
-        mean = walk @ np.einsum('kii->k', information)
-        spread = walk**2 @ np.einsum('kij,kij->k', information, information)
+    def _walked(self, group):
+        """
+        Return (chance, variance to add) by the score test of the variance of a walk.
+
+        What is not white but goes up and down fast, as the ripple of a motor, counts as noise and leaves less in the slow cosines than noise is
+        thought to: where the faster ones scatter by less, the slow ones are judged beside them.
+        """
+        inverse, walk, moved = self._inverse(group), self.walk[:SLOW_WAVES], self.moved[:, group]
+        fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]
+        fast_dof = fast.size * len(group)
+        inverse, moved = inverse[:SLOW_WAVES], moved[:SLOW_WAVES]
+        score = walk @ (np.einsum('kij,kj->ki', inverse, moved)**2).sum(axis=1)
+        mean = walk @ np.einsum('kii->k', inverse)
+        spread = walk**2 @ np.einsum('kij,kij->k', inverse, inverse)
         dof = mean**2 / spread
-        return float(chi2.sf(score / mean * dof, dof)), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
+        if fast.sum() < fast_dof:
+            mean = mean * fast.sum() / fast_dof
+            p_value = f_distribution.sf(score / mean, dof, fast_dof)
+        else:
+            p_value = chi2.sf(score / mean * dof, dof)
+        return float(p_value), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
 
     def scatter(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """Return (chance of so much scatter by noise, factor on the variance of each parameter) of a group."""
