@@ -59,7 +59,7 @@ def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(g
     assert ('--imu-topic' in refused.value.told({'imu_topic': '--imu-topic'})) == ('right topic' in str(refused.value))
 
 
-@pytest.mark.parametrize(('seconds', 'words'), [(0.5, 'about 0.5 s behind'), (-0.5, 'about 0.5 s ahead of')])
+@pytest.mark.parametrize(('seconds', 'words'), [(0.5, 'about 0.5 s behind'), (-0.5, 'about 0.5 s ahead of'), (2.0, 'about 2.0 s behind')])
 def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, words):
     with pytest.raises(InputError, match=words):
         calibrate(later(shaft[0], seconds), shaft[1])

@@ -25,6 +25,8 @@ ALIKE = 0.02
 """Shares explained that differ by less do not tell a delay from a wrong sign."""
 MOST_SAMPLES = 5_000
 """Samples of moving windows that are looked at for exchanged joints."""
+LEAST_SAMPLES = 20
+"""Of a window to be looked at."""
 MOST_JOINTS = 3
 """Exchanged joints are looked for up to this number of them."""
 
@@ -48,8 +50,8 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
     gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
-    if explained >= SAME and gain > 0.1 * TURNS:
-        return None   # units, signs and axes are looked at elsewhere
+    if explained >= SAME and gain > 0.1 * TURNS:   # units, signs and axes are looked at elsewhere
+        return _a_period_late(windows, table) if table is not None and explained < 1.0 - ALIKE else None
     key, cause = 'imu_topic', 'this IMU does not turn when the table does; is it the right topic?'
     if np.trace(measured) > TURNS * np.trace(reference):
         cause, key = (_cause(windows, table) if table is not None else ''), None
@@ -63,7 +65,7 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
 
 def _cause(windows, table):
     """Return what would make the streams agree, or ''."""
-    windows = [window for window in windows if len(window) >= 20]
+    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
     if not windows:
         return ''
     shift, share, unshifted = _best_shift(windows, table)
@@ -76,6 +78,18 @@ def _cause(windows, table):
     changes = [f'{names[k]} turns {"the other way round" if j == k else ("as " if sign > 0 else "against what ") + names[j] + " should"}'
                for k, (j, sign) in enumerate(zip(order, signs)) if k != j or sign < 0]
     return f'{", ".join(changes)}; correct names and axes in the table description, or the joint states'
+
+
+def _a_period_late(windows, table):
+    """Return the finding for streams that agree roughly, because the motion repeats, and plainly better a period earlier or later."""
+    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
+    if not windows:
+        return None
+    shift, share, unshifted = _best_shift(windows, table)
+    if abs(shift) <= LEAST_SHIFT or share < max(SURE, unshifted + ALIKE):
+        return None
+    return CheckFinding('on_table', REFUSE, f'both streams must tell the same time, the joints explain {100 * unshifted:.0f} % of the rates as stamped and '
+                        f'{100 * share:.0f} % shifted: {_late(shift)}')
 
 
 def _late(shift):
@@ -106,7 +120,7 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     table : Table
 
     """
-    windows = [window for window in windows if len(window) >= 20]
+    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
     if not windows:
         return None
     shift, share, unshifted = _best_shift(windows, table)
