@@ -80,6 +80,8 @@ def statistics(solution: Solution, gathered: Gathered) -> dict:
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
         if sensor in solution.session_biases:
             result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
+        if noise.left_out:
+            result[sensor]['left_out_s'] = [time for _, time in sorted(noise.left_out)]
     if solution.not_believed:
         result['not_believed'] = dict(solution.not_believed)
     accumulator = gathered.accumulator

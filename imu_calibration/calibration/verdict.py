@@ -205,7 +205,7 @@ def _all_well(calibration, tolerances):
 
 
 def _notes(calibration, tolerances):
-    return _proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _lost(calibration)
+    return _proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _left_out(calibration) + _lost(calibration)
 
 
 def _proven(calibration):
@@ -258,6 +258,18 @@ def _unstable(calibration, tolerances):
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',
                                   'let the IMU warm up and the table stand firm, or estimate the bias in use'))
     return reasons
+
+
+def _left_out(calibration):
+    """Return notes on windows that the others contradict."""
+    notes = []
+    for sensor in SENSORS:
+        times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
+        if times:
+            windows = 'a window, whose mean the others contradict' if len(times) == 1 else f'{len(times)} windows, whose means the others contradict'
+            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
+                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'somebody may have touched the table or the IMU'))
+    return notes
 
 
 def _lost(calibration):

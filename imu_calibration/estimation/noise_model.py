@@ -60,6 +60,8 @@ class NoiseModel:
     """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
     session_variance: float = 0.0
     """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
+    left_out: frozenset[tuple[int, float]] = frozenset()
+    """(recording, middle in s) of windows that the others contradict: their means count for nothing."""
 
     @property
     def white_sd(self) -> np.ndarray:

@@ -44,7 +44,7 @@ def _with_bands(system, sensor, noise):
 
 def _updated(system, sensor, values, noise):
     if white_noise(system.accumulator.rows, sensor) is None:
-        noise = replace(_at_rest(system, sensor, values), known=noise.known)
+        noise = replace(_at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out)
     noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})
     rows, information = system.linearised(sensor, values, noise)
     return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, sessions=system.sessions,

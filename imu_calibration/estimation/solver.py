@@ -1,11 +1,14 @@
 """Solving the system: one weighted non-linear least-squares problem over all windows, with honest standard deviations."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.contradicted import contradicted
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
@@ -20,6 +23,8 @@ HELD_SHARE = 0.5
 """A parameter whose standard deviation exceeds this share of its prior's is held at the prior."""
 NOISE_ROUNDS = 6
 """Times that noise and parameters are estimated in turn, at most."""
+LEAVING_ROUNDS = 5
+"""Times that windows are left out which the others contradict, at most: one may hide another."""
 
 
 def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, prior: Prior | None = None,
@@ -62,13 +67,12 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     values, free = start(system), ~fixed_parameters(model)
     noises = noise or first_noise(system, values, bias_processes or {})
     if noise is None:
-        # Mostly once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
-        # Where slow and fast parts are weighed apart, the weights move the parameters and these the weights.
-        for _ in range(NOISE_ROUNDS):
-            values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
-            before, noises = noises, updated_noise(system, values, noises)
-            if all(noises[s].weighs_alike(before[s]) for s in SENSORS):
+        values, noises = _with_noise(system, values, noises, free)
+        for _ in range(LEAVING_ROUNDS):
+            more = contradicted(system, values, noises)
+            if not any(more.values()):
                 break
+            values, noises = _with_noise(system, values, {s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS}, free)
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
     held = _undetermined(system, values, factors, free)
@@ -89,6 +93,21 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     chi2, rms = _fit_quality(system, values, noises)
     return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
                     not_believed)
+
+
+def _with_noise(system, values, noises, free):
+    """
+    Return (values, noise) that were estimated in turn.
+
+    Mostly once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
+    Where slow and fast parts are weighed apart, the weights move the parameters and these the weights.
+    """
+    for _ in range(NOISE_ROUNDS):
+        values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
+        before, noises = noises, updated_noise(system, values, noises)
+        if all(noises[s].weighs_alike(before[s]) for s in SENSORS):
+            break
+    return values, noises
 
 
 def _refuse(without, held, model, allow_holding):

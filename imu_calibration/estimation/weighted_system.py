@@ -15,6 +15,9 @@ from imu_calibration.estimation.prior import Prior
 from imu_calibration.estimation.triangular import triangular
 from imu_calibration.estimation.whitening import Whitening
 
+LOOSE = 1e3
+"""How many times as uncertain as any other a mean is that does not count."""
+
 
 class WeightedSystem:
     """
@@ -56,13 +59,22 @@ class WeightedSystem:
         """Indices of each recording's windows in order of time."""
         return sessions_of(self.accumulator.rows)
 
+    @cached_property
+    def keys(self) -> list[tuple[int, float]]:
+        """(Recording, middle in s) of each window."""
+        return [(row.session, row.time) for row in self.accumulator.rows]
+
     def misfit(self, sensor: str, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
         return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
 
     def mean_variance(self, noise: NoiseModel) -> np.ndarray:
-        """Return the variance of the window means by the noise within, shape (n_windows, 3)."""
-        return noise.mean_variance(self.kinds, self.counts)
+        """Return the variance of the window means by the noise within, of those left out beyond all others', shape (n_windows, 3)."""
+        variance = noise.mean_variance(self.kinds, self.counts)
+        if noise.left_out:
+            out = np.array([key in noise.left_out for key in self.keys])
+            variance[out] = LOOSE**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)
+        return variance
 
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
