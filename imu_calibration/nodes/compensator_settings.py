@@ -55,7 +55,7 @@ class CompensatorSettings:
                                      'turn is taken for a bias', live=True)
     gyro_bias_time: float = setting(600.0, 's', 'in which such an update loses its meaning while the robot does not stop', (10.0, 86400.0),
                                     'too long: the bias of long ago is believed; too short: it is forgotten between stops', live=True)
-    public_executor: bool = setting(False, '', "use rclpy's public executor, four times slower, instead of a wait set of our own",
+    public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, instead of a wait set of our own",
                                     symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
 
     def __post_init__(self):
