@@ -158,6 +158,9 @@ class Attempt:
             known = self.recording.model.slices.get(effect.key)
             if known is not None:
                 start[model.slices[effect.key]] = values[known]
+                if effect.time_constant:   # a straight line may lead beyond zero
+                    last = model.slices[effect.key].stop - 1
+                    start[last] = np.clip(start[last], 0.25 * self.constants[0], 4.0 * self.constants[-1])
         for question in chosen:
             if '@' in question.label:
                 start[model.slices[question.sensor, question.name]] = self._warm_up(chosen, question, values)

@@ -109,6 +109,11 @@ class WindowEvidence(Evidence):
         """Return the normal matrix of the chosen windows, or of all but fold `number`."""
         return self.total if number is None else self.total - self._parts[number]
 
+    def equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (matrix, right side) of the normal equations of all parameters on all chosen windows, what is known before included."""
+        known = 1 / self._prior['prior_sd']**2
+        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior['prior_mean']
+
     def loss(self, used: Sequence[int]) -> float:
         """Return the loss of the best fit on all chosen windows."""
         return quadratic(self.total, used, self.fit(used)[0])

@@ -15,6 +15,7 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import gain_in_turn
+from imu_calibration.selection.pairs import best_pairs
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 from imu_calibration.selection.saturation import (
@@ -105,9 +106,8 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     report(0.5)
     outcome = _settled(attempted, settled, chosen if settled is attempt else settled.search.run(), lambda share: report(0.5 + 0.2 * share))
     report(0.75)
-    if outcome.rest:
-        other = outcome.attempt.asking_any_size()
-        outcome = min(outcome, _settled(partial(attempted, any_size=True), other, other.search.run()), key=lambda each: each.rest)
+    for any_size in (False, True):
+        outcome = _looked_again(outcome, partial(attempted, any_size=any_size), any_size)
     attempt, named, denied = outcome.attempt, outcome.named, outcome.denied
     names = {question.name for question in named}
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
@@ -129,6 +129,19 @@ class _Outcome:
     def rest(self):
         """What the findings leave in excess of noise, where it is significant."""
         return sum(map(self.explained.rest, self.explained.excess(self.named).values()))
+
+
+def _looked_again(outcome, attempted, any_size):
+    """Return the _Outcome of what leaves less, where a significant rest stays: searches that start from pairs, or that ask about implausible sizes too."""
+    if not outcome.rest:
+        return outcome
+    attempt = outcome.attempt.asking_any_size() if any_size else outcome.attempt
+    search, known = attempt.search, {question.label for question in outcome.chosen}
+    found = [search.run(start) for start in ((), *best_pairs(search))]
+    best = min(found, key=search.cost)
+    if {question.label for question in best} == known or (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
+        return outcome
+    return min(outcome, _settled(attempted, attempt, best), key=lambda each: each.rest)
 
 
 def _settled(attempted, attempt, chosen, progress=None):

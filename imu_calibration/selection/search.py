@@ -138,9 +138,9 @@ class Search:
         before, after = (self.evidence.heldout_parts(self.used(some)) for some in (rest, chosen))
         return all(sum(after[sensor]) - sum(before[sensor]) < 2 * LEAST_GAIN for sensor in question.effect.acts_on)
 
-    def run(self) -> Sequence[Question]:
-        """Return the chosen questions in the order in which they were found."""
-        chosen = []
+    def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
+        """Return the chosen questions in the order in which they were found, from none or from a first choice."""
+        chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
             scores = [self.score(chosen, q) for q in self.others(chosen)]
             self.history.append(scores)

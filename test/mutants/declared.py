@@ -82,6 +82,8 @@ SEARCH = _of(
     ('halves disagree by chance', 'halves.py', 'DISAGREE = 1e-4', 'DISAGREE = 0.5', 'test_search.py'),
     ('a finding need not lower the residual in its own unit', 'investigation.py', 'short = [paid <= _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]',
      'short = [False for each in kept]', 'test_search.py'),
+    ('members of a pair imitate each other', 'pairs.py', 'UNIQUE = 0.05', 'UNIQUE = -1.0', 'test_pairs.py'),
+    ('another look where nothing is left', 'investigation.py', 'if not outcome.rest:', 'if False:', 'test_pairs.py'),
     ('limits need not agree with the motion', 'saturation.py', 'AGREEMENT = 0.25', 'AGREEMENT = 0.0', 'test_saturation.py'),
     ('coarse outputs pass for clipped ones', 'saturation.py', 'return bool(at > 3 * repeats[-5:].max(initial=1))', 'return True', 'test_saturation.py'),
     ('clipped samples stay', 'saturation.py', 'good &= ~(near | at).any(axis=1)', 'good &= ~(near & ~near | at & ~at).any(axis=1)', 'test_saturation.py'),

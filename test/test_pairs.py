@@ -1,0 +1,76 @@
+"""All pairs at once: what no single effect shows, and what two that imitate each other do not prove."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.selection import investigation
+from imu_calibration.selection.evidence import Evidence, WindowEvidence
+from imu_calibration.selection.pairs import _Blocks, best_pairs
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import PENALTY, Search
+
+NAMES = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry')
+ASKED = [Question(CATALOGUE.find('accelerometer', name), (k + 1,), 1, name) for k, name in enumerate(NAMES)]
+N_ROWS = 600
+
+
+def searched(signal, alike, size=1e-6):
+    """Return the Search on rows of which the first column is the baseline's, and the first two effects are alike; each has the size of what is plausible."""
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(N_ROWS, 5))
+    columns[:, 2] = alike * columns[:, 1] + np.sqrt(1 - alike**2) * columns[:, 2] + 0.5 * columns[:, 0]
+    rows = np.column_stack([columns / size, columns @ np.asarray(signal, float) + rng.normal(size=N_ROWS)])
+    evidence = WindowEvidence.__new__(WindowEvidence)
+    Evidence.__init__(evidence, np.full(5, 1e3), np.zeros(5))
+    evidence._parts = [part.T @ part for part in np.split(rows, 6)]
+    evidence.total = sum(evidence._parts)
+    return Search(evidence, (0,), ASKED)
+
+
+def names(choice):
+    return {question.name for question in choice}
+
+
+def test_two_causes_that_hide_each_other_are_found_together():
+    """Each alone removes a tenth of what both do, and no more than noise."""
+    search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
+    assert not any(search.score([], question).significant for question in search.questions) and not search.run()
+    assert names(best_pairs(search)[0]) == set(NAMES[:2])
+    assert names(search.run(best_pairs(search)[0])) == set(NAMES[:2])
+
+
+def test_the_fall_of_a_pair_is_that_of_the_fit():
+    search = searched((1.0, 0.6, -0.3, 0.2, 0.0), 0.6)
+    ((net, *_),) = _Blocks(search).score([(0, 2)])
+    fall = search.evidence.loss((0,)) - search.evidence.loss((0, 1, 3))
+    assert net == pytest.approx(0.5 * fall - 2 * PENALTY)
+
+
+def test_what_the_other_can_imitate_is_no_member():
+    assert set(NAMES[:2]) not in map(names, best_pairs(searched((1.0, 5.0, -5.0, 0.0, 0.0), 0.999)))
+
+
+def test_a_pair_of_which_one_does_nothing_does_not_survive():
+    search = searched((1.0, 1.0, 0.0, 0.0, 0.0), 0.3)
+    assert names(search.run(best_pairs(search)[0])) == {NAMES[0]}
+
+
+def outcome(search, named, rest):
+    attempt = SimpleNamespace(search=search)
+    return SimpleNamespace(attempt=attempt, chosen=named, named=named, rest=rest)
+
+
+@pytest.mark.parametrize(('rest', 'found'), ((0.0, set()), (50.0, set(NAMES[:2]))))
+def test_pairs_are_asked_where_a_rest_stays(monkeypatch, rest, found):
+    search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
+    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, -1.0))
+    assert names(investigation._looked_again(outcome(search, [], rest), None, False).named) == found
+
+
+def test_what_leaves_more_is_not_taken(monkeypatch):
+    search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
+    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, 60.0))
+    assert not investigation._looked_again(outcome(search, [], 50.0), None, False).named
