@@ -2,7 +2,7 @@
 The closed loop as processes over real DDS: a simulated table, calibration_node, planner_node, then compensator_node.
 
 An IMU that nobody has calibrated, with a fault that no parameter of its model describes: the planner drives until more motion brings nothing, the diagnosis
-finds the fault, and the compensator corrects another motion. Run: ``python examples/live_demo.py`` (or ``make live-demo``); takes less than
+finds the fault, which joins the live calibration, and the compensator corrects another motion with it. Run: ``python examples/live_demo.py`` (or ``make live-demo``); takes less than
 two minutes, needs no ``ros2 launch``, and leaves ``live_demo.png``.
 """
 
@@ -18,6 +18,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from imu_calibration import files  # noqa: E402
 from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 
 G, DEG = 9.80665, np.pi / 180
@@ -126,8 +127,8 @@ def run(domain_id, folder, output):
             saved = watcher.call('/calibration_node/save', deadline)
             print(f'~/save: {saved.message}')
             codes = [processes.end(node) for node in (planner, calibration_node, simulator)]
-            calibration = learn(watcher.take('imu/data_raw'), folder)
-            compensator = processes.start('compensator_node', {'calibration_file': folder / 'calibration.yaml'})
+            calibration = files.read_calibration(folder / 'live.yaml')
+            compensator = processes.start('compensator_node', {'calibration_file': folder / 'live.yaml'})
             errors = compare(watcher, processes, deadline)
             codes.append(processes.end(compensator))
         finally:
@@ -142,8 +143,6 @@ def run(domain_id, folder, output):
 def tolerances(folder):
     """Write tolerances that are `SHARE` of the usual ones; return the path."""
     import yaml
-
-    from imu_calibration import files
     usual = files.read_tolerances(ROOT / 'config' / 'tolerances.yaml')
     path = folder / 'tolerances.yaml'
     path.write_text(yaml.safe_dump({section: {name: SHARE * value for name, value in group.items()} for section, group in usual.items()}))
@@ -161,19 +160,6 @@ def drive(watcher, deadline):
     watcher.spin(ended, deadline)
     if watcher.drive[-1][2]['state'] == 'stopped':
         raise SystemExit(f'the planner stopped: {watcher.drive[-1][1]}')
-
-
-def learn(block, folder):
-    """Calibrate what was recorded with all that the diagnosis finds, and write calibration.yaml."""
-    from imu_calibration import calibrate
-    from msg_adapters.write import write_session
-    write_session(folder / 'driven', once(block.imu), block.joints)
-    result = calibrate(folder / 'driven', table=TABLE)
-    result.save(folder / 'result')
-    (folder / 'calibration.yaml').write_bytes((folder / 'result' / 'calibration.yaml').read_bytes())
-    effects = {sensor: [effect.name for effect in result.calibration.model.effects if effect.sensor == sensor] for sensor in ('accelerometer', 'gyroscope')}
-    print(f'calibrated with what the diagnosis finds: accelerometer {"+".join(effects["accelerometer"])}, gyroscope {"+".join(effects["gyroscope"])}')
-    return result.calibration
 
 
 def compare(watcher, processes, deadline):
@@ -203,7 +189,6 @@ def picture(path, watcher, calibration, errors):
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
 
-    from imu_calibration import files
     from imu_calibration.calibration.document import calibration_from_text
     from imu_calibration.calibration.status import tolerances_of
     start = next(at for at, _, values in watcher.drive if values['state'] == 'moving')

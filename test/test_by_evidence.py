@@ -9,7 +9,8 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration import by_evidence, spread_windows
-from imu_calibration.calibration.by_evidence import _disagreement, stands_out
+from imu_calibration.calibration.by_evidence import _moves, stands_out
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.spread_windows import SpreadWindows
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.effects.forward_equations import predict
@@ -127,6 +128,11 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     lag = attempted(point=first.point([by_name['gyro_bandwidth']]))
     assert lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')] > 0.01
     assert settle_rivals(first, [by_name['gyro_quadratic']], attempted) == (first, [])
+
+
+def _disagreement(found, names):
+    """What an investigation adds to the covariance."""
+    return Demand(moves=_moves(found)).disagreement(names)
 
 
 def investigated(late):

@@ -1,4 +1,4 @@
-"""The live diagnosis says what the verb says of the same recording; its windows are bounded; it never holds up the rest. No ROS here."""
+"""The live diagnosis says what the verb says of the same recording; what it finds joins the model; it never holds up the rest. No ROS here."""
 
 import threading
 import time
@@ -6,35 +6,39 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_live_calibration import blocks
+from test_live_calibration import assert_same, blocks
 
+from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.live_settings import LiveSettings
-from imu_calibration.diagnosis.diagnose import diagnose
-from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis, RecentWindows, describe
+from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.diagnosis.diagnose import told
+from imu_calibration.diagnosis.live import Answer, DiagnosisState, describe, question_about
 from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.errors import DocumentError
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 
 from worlds import physics
+from worlds.misfit_worlds import make_pair
 
 pytest.importorskip('rclpy')
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
 
 
 class Station:
-    """A LiveCalibration with its LiveDiagnosis, fed as calibration_node feeds them."""
+    """A LiveCalibration fed as calibration_node feeds it."""
 
-    def __init__(self, session, diagnosis_samples=300_000):
-        self.live = LiveCalibration(Table.from_mapping(session.table), settings=LiveSettings())
-        self.diagnosis = LiveDiagnosis(diagnosis_samples)
+    def __init__(self, session, **settings):
+        self.live = LiveCalibration(Table.from_mapping(session.table), settings=LiveSettings(**settings))
         for block in blocks(session.imu, session.joints):
-            self.diagnosis.add(self.live.push(block))
+            self.live.push(block)
         self.live.solve(pending=True)
 
     def question(self):
-        """Return the Question about the session."""
-        return self.diagnosis.question(self.live)
+        """Return the question about the session."""
+        return question_about(self.live)
 
 
 @pytest.fixture(scope='module')
@@ -43,47 +47,142 @@ def hidden():
     return physics.make_session(3, {'accel_quadratic': None})
 
 
-def test_the_first_finding_is_that_of_the_verb(hidden):
+@pytest.fixture(scope='module')
+def expected(hidden):
+    """What the verb diagnose says of it, and hands over."""
+    return diagnose_recording(lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), Table.from_mapping(hidden.table))
+
+
+@pytest.fixture(scope='module')
+def station(hidden):
+    """A session whose question is answered, and the answer."""
     station = Station(hidden)
-    table = Table.from_mapping(hidden.table)
-    expected = diagnose_recording(lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), table).diagnosis
-    question = station.question()
-    assert len(question.windows) == expected.windows
-    state = question.answer()
-    first = expected.findings[0]
-    assert first.effect == 'accel_quadratic'
-    # the verb tells the parameters of its calibration, which has levelling and arms beside the finding: the size may differ by some sd
-    assert state.word == 'found' and state.message.startswith('accel_quadratic: ' + first.explanation.partition(' Its size')[0])
+    station.before = station.live.result.calibration
+    station.answer = station.question().answer()
+    return station
+
+
+def test_the_answer_is_that_of_the_verb(station, expected):
+    """The same effect, with the very same figures, sizes of the calibration included."""
+    first, state = expected.diagnosis.findings[0], station.answer.state
+    assert first.effect == 'accel_quadratic' and state.values['windows'] == expected.diagnosis.windows
+    assert state.word == 'found' and state.message.startswith(f'accel_quadratic: {first.explanation}')
     assert state.values['p-value'] == f'{first.p_value:.2g}'
     assert state.values['held-out reduction'] == f'{first.gain.reduction:.3f}' and first.gain.reduction > 0.05
     for name, (value, sd, unit) in first.parameters.items():
-        size, _, rest = state.values[name].partition(' +- ')
-        assert abs(float(size) - value) < 2 * sd and rest.endswith(unit)
+        assert state.values[name] == f'{value:.4g} +- {sd:.2g} {unit}'
+
+
+def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(station, expected):
+    live = station.live
+    assert live.adopt(station.answer.demand)
+    found = live.solve(pending=True).calibration
+    assert 'accel_quadratic' in found.statistics['added'] and not {'added', 'denied'} & set(station.before.statistics)
+    assert found.statistics['added'] == expected.calibration.statistics['added']
+    assert_same(found, expected.calibration)
+    for sensor, entry in expected.calibration.proof.items():
+        assert found.proof[sensor]['after'] == pytest.approx(entry['after'], rel=1e-9)
+    assert any('added to the model' in line and 'accel_quadratic (' in line for line in found.verdict_reasons)
+    again = station.question().answer()   # about a session whose model is wide already
+    assert again.demand.added == station.answer.demand.added
+    assert live.adopt(again.demand)
+    assert_same(live.solve(pending=True).calibration, expected.calibration)
+
+
+def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
+    live = LiveCalibration(Table.from_mapping(hidden.table))
+    every = list(blocks(hidden.imu, hidden.joints))
+    for block in every[:3 * len(every) // 4]:
+        live.push(block)
+    live.solve(pending=True)
+    assert live.adopt(question_about(live).answer().demand)
+    for block in every[3 * len(every) // 4:]:
+        live.push(block)
+    named = {key for key, part in live.solve(pending=True).model.slices.items()}
+    assert ('accelerometer', 'accel_quadratic') in named
+    live.adopt(question_about(live).answer().demand)
+    assert_same(live.solve(pending=True).calibration, expected.calibration)
+
+
+def test_a_delay_is_taken_at_its_size_like_offline():
+    """Columns that depend on their own value: those of all windows are taken anew where the search found the delay."""
+    pair = make_pair('driver_lag', 31, table='shaft', profile='sweeps')
+    table = Table.from_mapping(pair.table)
+    live = LiveCalibration(table)
+    for block in blocks(pair.first.imu, pair.first.joints):
+        live.push(block)
+    live.solve(pending=True)
+    assert live.adopt(question_about(live).answer().demand)
+    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table).result.calibration
+    found = live.solve(pending=True).calibration
+    assert 'time_offset' in found.statistics['added']
+    assert_same(found, expected)
+
+
+def test_the_model_as_asked_stays(hidden):
+    live = LiveCalibration(Table.from_mapping(hidden.table), CalibrationOptions(as_asked=True))
+    for block in blocks(hidden.imu, hidden.joints):
+        live.push(block)
+    before = live.solve(pending=True).calibration
+    answer = question_about(live).answer()
+    assert answer.state.word == 'found' and not live.adopt(answer.demand)   # it is said, and that is all
+    after = live.solve(pending=True).calibration
+    assert after.param_names == before.param_names and 'added' not in after.statistics
+    np.testing.assert_array_equal(after.sd, before.sd)
+
+
+def test_what_cannot_join_is_said_and_widens(hidden):
+    """The store was too small for the motion: calibrate the recording offline."""
+    station = Station(hidden, store_samples=500)
+    before, answer = station.live.result.calibration, station.question().answer()
+    assert answer.demand.changes.lacking == ('accel_quadratic',) and not answer.demand.added
+    assert station.live.adopt(answer.demand)
+    after = station.live.solve(pending=True).calibration
+    assert after.param_names == before.param_names and (after.sd >= before.sd).all() and np.max(after.sd / before.sd) > 1.5
+    lines = [line for line in after.verdict_reasons if 'accel_quadratic' in line or 'offline' in line]
+    assert len(lines) == 2 and 'cannot join the model' in lines[0] and lines[1] == 'next: calibrate the recording offline'
+
+
+def test_a_resumed_session_keeps_what_joined(station, hidden):
+    """Saved with the wide model, the session goes on with it, and stays with it: the columns of before cannot be taken anew."""
+    station.live.adopt(station.answer.demand)
+    station.live.solve(pending=True)
+    saved = station.live.saved(pending=True)
+    table = Table.from_mapping(hidden.table)
+    resumed = LiveCalibration(table, saved=saved)
+    assert resumed.demand.added == station.live.demand.added and resumed.model.has_columns_of(station.live.model)
+    assert_same(resumed.solve().calibration, station.live.solve(pending=True).calibration)
+    assert resumed.result.calibration.statistics['added'] == station.live.result.calibration.statistics['added']
+    assert question_about(resumed) is None   # the windows of before have no samples any more
+    half = hidden.imu.stamp_ns[len(hidden.imu) // 2]
+    later = 10**12
+    for block in blocks(replace(hidden.imu, stamp_ns=hidden.imu.stamp_ns + later).select(hidden.imu.stamp_ns < half),
+                        replace(hidden.joints, stamp_ns=hidden.joints.stamp_ns + later).select(hidden.joints.stamp_ns < half)):
+        resumed.push(block)
+    resumed.solve(pending=True)
+    answer = question_about(resumed).answer()
+    assert answer.demand.added == station.live.demand.added and not answer.demand.changes.lacking
+    with pytest.raises(DocumentError, match='accel_quadratic.*start without resume'):
+        LiveCalibration(table, CalibrationOptions(as_asked=True), saved=saved)
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
-    state = Station(physics.make_session(3)).question().answer()
-    assert state.word == 'nothing found' and 'no effect of the catalogue' in state.message
+    station = Station(physics.make_session(3))
+    before, answer = station.live.result.calibration, station.question().answer()
+    assert answer.state.word == 'nothing found' and 'no effect of the catalogue' in answer.state.message
+    assert answer.demand.is_nothing and not station.live.adopt(answer.demand)
+    np.testing.assert_array_equal(station.live.solve(pending=True).calibration.sd, before.sd)
 
 
-def test_without_windows_or_with_nothing_kept_nothing_is_asked(hidden):
-    assert LiveDiagnosis(300_000).question(LiveCalibration(Table.from_mapping(hidden.table))) is None
-    assert Station(hidden, diagnosis_samples=0).question() is None
+def test_without_windows_nothing_is_asked(hidden):
+    live = LiveCalibration(Table.from_mapping(hidden.table))
+    assert question_about(live) is None and question_about(None) is None
 
 
-def test_windows_are_bounded_and_the_oldest_go(hidden):
-    question = Station(hidden, diagnosis_samples=5000).question()
-    assert sum(len(window) for window in question.windows) <= 5000 + 2 * 2000 and question.forgotten > 0
-    assert question.windows[-1].time[-1] > 0.9 * hidden.truth['temperature_c'].size / 100
-    full = Station(hidden).question().windows
-    assert [w.time[0] for w in question.windows] == [w.time[0] for w in full[-len(question.windows):]]
-
-
-def test_a_window_keeps_no_chunk_alive(hidden):
-    windows = Station(hidden).question().windows
-    recent = RecentWindows(10**6)
-    recent.add(windows[:3])
-    assert all(np.shares_memory(w.force_s, r.force_s) is False for w, r in zip(windows, recent.list()))
+def test_a_window_keeps_no_chunk_alive(station):
+    """A window that was cut from a chunk of 20 s would keep all of it."""
+    for window in station.live.last.gathered.spreads[0].windows:
+        assert all(array.base is None for array in (window.force_s, window.rate_s, window.stamp_ns, window.motion.position))
 
 
 class Slow:
@@ -100,7 +199,11 @@ class Slow:
         """Wait, look whether to go on, answer."""
         while not self.go.wait(0.01):
             progress(0.5)
-        return DiagnosisState('found', self.words)
+        return Answer(DiagnosisState('found', self.words), Demand())
+
+    def is_the_same_as(self, other):
+        """Return whether it is this one."""
+        return other is self
 
 
 def until(condition):
@@ -123,8 +226,7 @@ def test_the_thread_answers_when_asked_and_once_at_a_time():
     question.go.set()
     until(lambda: not thread.is_running)
     assert thread.state.message == 'first' and thread.n_answers == 1
-    thread.ask_when_due(question, False)
-    until(lambda: thread.n_answers == 2)   # it was wanted while the first was being answered
+    until(lambda: thread.ask_when_due(question, False) or thread.n_answers == 2)   # it was wanted while the first was being answered
 
 
 def test_a_session_started_anew_forgets_the_question_and_an_ending_one_stops_it():
@@ -153,9 +255,23 @@ def test_a_failure_is_a_status_and_zero_is_off():
     assert off.state.word == 'off' and not off.is_running
 
 
-def test_what_stays_unexplained_is_said(hidden):
-    question = Station(hidden).question()
-    diagnosis = diagnose(question.windows, question.table, question.model)
+def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
+    thread, question = DiagnosisThread(3600.0), Slow('first')
+    threading.Timer(0.2, question.go.set).start()
+    thread.settle(question)
+    assert thread.n_answers == 1 and thread.take_demand() is not None and thread.take_demand() is None
+    thread.settle(question)
+    thread.settle(None)
+    assert thread.n_answers == 1
+    later = Slow('second')
+    later.go.set()
+    thread.settle(later)
+    assert thread.n_answers == 2 and thread.state.message == 'second'
+
+
+def test_what_stays_unexplained_is_said(station):
+    evidence = station.live.last.evidence()
+    diagnosis = told(evidence.found.used, station.live.table, evidence.found)
     rest = {sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3) for sensor, found in diagnosis.unexplained.items()}
     state = describe(replace(diagnosis, findings=(), unexplained=rest))
     assert state.word == 'unexplained' and state.message.startswith('unexplained: ') and 'gyroscope' in state.message

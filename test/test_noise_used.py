@@ -23,7 +23,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.diagnosis.live import LiveDiagnosis
+from imu_calibration.diagnosis.live import question_about
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
@@ -129,12 +129,12 @@ def test_calibrate_takes_the_measured_noise_and_says_so(calibrated, noise_file):
 def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise_file):
     """On a table the biases move as was measured; by hand the noise is refused as it is offline."""
     session, options = physics.make_session(3), CalibrationOptions(noise=files.read_noise(noise_file))
-    live, diagnosis = LiveCalibration(Table.from_mapping(session.table), options), LiveDiagnosis(300_000)
+    live = LiveCalibration(Table.from_mapping(session.table), options)
     for block in blocks(session.imu, session.joints):
-        diagnosis.add(live.push(block))
+        live.push(block)
     known = live.solve(pending=True).solution.noise
     assert {sensor: known[sensor].bias_processes[:len(wanted)] for sensor, wanted in options.bias_processes.items()} == options.bias_processes
-    assert diagnosis.question(live).bias_processes == options.bias_processes
+    assert question_about(live).snapshot.options.bias_processes == options.bias_processes
     with pytest.raises(InputError, match='by hand it must be left out'):
         LiveByHand(options, LiveSettings())
 

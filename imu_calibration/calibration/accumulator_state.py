@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, shortened
@@ -21,7 +22,7 @@ _MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
 
-def to_bytes(gathered: Gathered, model: SensorModel) -> bytes:
+def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) -> bytes:
     """
     Return a `Gathered` as an npz archive: numbers to the last bit, no pickled objects.
 
@@ -31,11 +32,13 @@ def to_bytes(gathered: Gathered, model: SensorModel) -> bytes:
         Its least-squares system, poses and counts; windows with samples are left out.
     model : SensorModel
         The model whose columns it holds.
+    demand : Demand
+        What joined the model that was asked for.
 
     """
     rows, accumulator = gathered.accumulator.rows, gathered.accumulator
     header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')} | {'joint_errors': model.joint_names.errors},
-              'effects': model.definitions,
+              'effects': model.definitions, 'demand': demand.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
@@ -96,6 +99,12 @@ def saved_model(data: bytes) -> SensorModel:
         return _model(header)
 
 
+def saved_demand(data: bytes) -> Demand:
+    """Return what joined the model that was asked for before a session was saved; raises as `from_bytes` when it is damaged."""
+    with _reading(data) as (header, _):
+        return Demand.from_mapping(header.get('demand', {}), header['point'])
+
+
 def _model(header):
     point = {name: np.array(value, float) for name, value in header['point'].items()}
     effects, names = (tuple(header['model'][name]) for name in _MODEL), header['model']['joint_names']
@@ -105,9 +114,7 @@ def _model(header):
 
 def _check(header, model):
     known = _model(header)
-    same = all(getattr(known, name) == tuple(getattr(model, name)) for name in _MODEL)
-    same = same and known.joint_names == model.joint_names and known.definitions == model.definitions and known.temperature_ref_c == model.temperature_ref_c
-    if not same or known.point.keys() != model.point.keys() or any(np.any(known.point[n] != model.point[n]) for n in known.point):
+    if not known.has_columns_of(model):
         raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
                             f'asked for is {_text(model)}; start without resume, or with the old model')
 

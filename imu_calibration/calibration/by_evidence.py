@@ -8,12 +8,14 @@ misses, does not, and widens the standard deviations instead, as does what would
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
 
 from imu_calibration.calibration.calibrate import conclude, solve_recordings
-from imu_calibration.calibration.model_changes import ModelChanges
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.model_changes import Demand, ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
@@ -23,10 +25,30 @@ from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation, investigate
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE
+
+Solved = tuple[Solution, Gathered, SensorModel]
+"""A solution, what it was made of, and the model whose columns that holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class EvidentSolution:
+    """A solution with what its recordings demand of the model, and what was found on the way there."""
+
+    solution: Solution
+    """Of the model that was asked for and what is demanded, its covariance widened."""
+    gathered: Gathered
+    """What was solved."""
+    model: SensorModel
+    """The model whose columns were gathered."""
+    demand: Demand = Demand()
+    """What every later solution of the same recordings needs to know."""
+    found: Investigation | None = None
+    """What was asked and answered; None with too few windows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,36 +80,98 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         As `calibrate`.
 
     """
-    first = solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names,
-                             keep_windows=not options.as_asked)
+    solve = partial(solve_recordings, sources, table, progress=progress, mapper=mapper, names=names)
+    found = solve_by_evidence(solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve, asking=asking)
+    return EvidentResult(conclude(found.solution, found.gathered, found.model, table=table, options=found.demand.options(options),
+                                  provenance=provenance, changes=found.demand.changes), found.found)
+
+
+def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *, solve_again: Callable[[CalibrationOptions], Solved],
+                      asking: Callable | None = None) -> EvidentSolution:
+    """
+    Return what recordings demand on top of the model that is asked for, solved.
+
+    Parameters
+    ----------
+    first : tuple
+        (Solution, Gathered with the windows to ask, SensorModel) of the model that is asked for.
+    table : Table
+    options : CalibrationOptions
+        What is asked for.
+    solve_again : callable
+        Returns the same for other options: `added` effects, taken at their `point`.
+    asking : callable, optional
+        Called with the share of the search that is done.
+
+    """
     solution, gathered, model = first
-    parts = [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= LEAST_WINDOWS]
+    parts = windows_to_ask(gathered)
     if not parts:
-        return EvidentResult(conclude(*first, table=table, options=options, provenance=provenance), None)
+        return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
     found, *others = (investigate(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
-    while added := _beyond((*found.adopted, *more), first[2]):
+    added, point = (), {}
+    while beyond := _beyond((*found.adopted, *more), first[2]):
         point = {name: value for each in (*others, found) for name, value in _point(each).items()}
-        extended = replace(options, added=tuple(question.effect.key for question in added), point=point)
-        solution, gathered, model = solve_recordings(sources, table, extended, progress=progress, mapper=mapper, names=names)
+        added = tuple(question.effect.key for question in beyond)
+        solution, gathered, model = solve_again(replace(options, added=added, point=point))
         sure = [question for question in more if not _is_faint(solution, question)]
         if len(sure) < len(more):   # what may be a rival of what the largest names goes first
             more = sure
             continue
         found = _without_faint(found, solution)
-        if len(_beyond((*found.adopted, *more), first[2])) == len(added):
-            options = extended
+        if len(_beyond((*found.adopted, *more), first[2])) == len(beyond):
             break
     else:
-        solution, gathered, model = first
-    solution = replace(solution, covariance=solution.covariance + _disagreement(found, solution.param_names))
-    if found.limits:   # samples that a limit spoils are out of the windows that were asked, and of no others
-        solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.adopted,
-                                     saturations=found.limits)
-    clipping = [solution.model.find(limit.sensor, Role.LIMIT).name for limit in found.limits]
-    changes = ModelChanges((*clipping, *(question.name for question in added)), tuple(question.name for question in found.denied), _strange([found, *others]))
-    return EvidentResult(conclude(solution, gathered, model, table=table, options=options, provenance=provenance, changes=changes), found)
+        added, point, (solution, gathered, model) = (), {}, first
+    demand = Demand(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
+    return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
+
+
+def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: Demand,
+             asking: Callable | None = None) -> EvidentSolution:
+    """
+    Return what windows demand where columns can be taken no more: what the model holds stays in it, what it lacks is said and widens.
+
+    Parameters
+    ----------
+    solved : tuple
+        As for `solve_by_evidence`, of the model that is asked for with the effects that joined it.
+    table, options, asking
+        As for `solve_by_evidence`.
+    known : Demand
+        What was demanded when the columns were taken.
+
+    """
+    solution, gathered, model = solved
+    parts = windows_to_ask(gathered)
+    if not parts:
+        return EvidentSolution(*solved, known)
+    found = investigate(parts[0], table, baseline_model(options, table, solution.model), progress=asking, bias_processes=options.bias_processes)
+    found = _without_faint(found, solution)
+    lacking = [] if found.limits else _beyond(found.adopted, model)   # a search that met a limit is the solution itself
+    changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
+    demand = Demand(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
+    return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
+
+
+def windows_to_ask(gathered: Gathered) -> list[list[Window]]:
+    """Return the windows of each recording that are enough to ask for effects, those of the largest first."""
+    return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= LEAST_WINDOWS]
+
+
+def _clipped(found):
+    """Return the solution of a search that found a limit: samples that it spoils are out of its windows, and of no others; else None."""
+    return extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.adopted,
+                             saturations=found.limits) if found.limits else None
+
+
+def _changes(searches, added):
+    """Return what searches, the first above all, and what they added do to the model that was asked for."""
+    found, model = searches[0], searches[0].attempt.baseline
+    clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
+    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches))
 
 
 def _beyond(named, model):
@@ -161,12 +245,7 @@ def _point(found):
     return {question.name: model.point[question.name] for question in found.adopted if question.name in model.point}
 
 
-def _disagreement(found, names):
-    """Return the covariance of what other choices would have moved the parameters by: what is denied, doubtful or implausible, and rivals."""
-    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful, *found.implausible)]
-    moves += [(rival.moves, rival.weight) for rival in found.rivals]
-    total = np.zeros((len(names),) * 2)
-    for moved, weight in moves:
-        shift = np.array([moved.get(name, 0.0) for name in names])
-        total += weight * np.outer(shift, shift)
-    return total
+def _moves(found, lacking=()):
+    """Return (what other choices would have moved the parameters by, weight): what is denied, doubtful, implausible or lacking, and rivals."""
+    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
+    return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))

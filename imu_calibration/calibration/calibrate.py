@@ -107,7 +107,7 @@ def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationO
 
 def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
     """
-    Return the calibration of what a live session saved (`accumulator_state`), of the model whose columns it gathered.
+    Return the calibration of what a live session saved (`accumulator_state`), of the model whose columns it gathered, with what joined it.
 
     Raises
     ------
@@ -122,7 +122,10 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
         raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, this is of {', '.join(model.joint_names) or 'none'}; "
                             'give the table or the arm that it was gathered on', key='table')
     gathered = accumulator_state.from_bytes(data, model)
-    return conclude(solve_gathered(gathered, model, options), gathered, model, table=table, options=options).calibration
+    demand = accumulator_state.saved_demand(data)
+    options = demand.options(options)
+    return conclude(demand.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
+                    changes=demand.changes).calibration
 
 
 def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,

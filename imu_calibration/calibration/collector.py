@@ -9,6 +9,7 @@ from imu_calibration.calibration.gathered import KEPT_POSES, KEPT_SAMPLES, Gathe
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window
+from imu_calibration.estimation.window_store import owned_window
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling, SampleBlock
@@ -77,8 +78,6 @@ class Collector:
         else:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
         self._store(window, reduced)
-        if self.spread:
-            found.spreads[0].add(window)
         return reduced
 
     def _columns(self, _window):
@@ -89,6 +88,8 @@ class Collector:
         kept = self.gathered.kept
         if window.kind != 'static' and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES:
             kept.append(window)
+        if self.spread:
+            self.gathered.spreads[0].add(owned_window(window))
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration import accumulator_state
-from imu_calibration.calibration.calibrate import conclude, solve_gathered
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, table_coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
-from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.linearisation import linearise_again
 from imu_calibration.calibration.live_collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
+from imu_calibration.calibration.live_snapshot import LiveSnapshot
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.session import SessionStatus, TableSession
 from imu_calibration.calibration.table_result import TableResult
@@ -22,7 +24,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import selected_columns
 from imu_calibration.estimation.window_store import WindowStore
-from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
@@ -38,8 +39,8 @@ class LiveCalibration:
     One session as it happens: `push` what arrives, `solve` when it is due.
 
     Windows are found and reduced by the very objects that read recordings, and solved by the same functions, so the answer is
-    that of `workflow.calibrate` on the same samples. Memory is bounded: samples in reduced form, a bounded store of windows for
-    effects that must be linearised anew.
+    that of `calibrate_by_evidence` on the same samples, once what they demand was asked (`last`, `LiveSnapshot.evidence`) and adopted.
+    Memory is bounded: samples in reduced form, a bounded store of windows for columns that must be taken anew.
 
     Parameters
     ----------
@@ -61,14 +62,17 @@ class LiveCalibration:
     def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
                  saved: bytes | None = None):
         self.table, self.options, self.settings, self.earlier = table, options, settings, None
-        self._asked = choose_model(options, table)
-        self._waiting, self._collector = [], None
+        self.demand = Demand() if saved is None or options.as_asked else accumulator_state.saved_demand(saved)
+        """What joined the model that was asked for."""
+        self._asked = choose_model(self.demand.options(options), table)
+        self._waiting, self._collector, self._first_temperature_c = [], None, None
         self.result: TableResult | None = None
+        self.last: LiveSnapshot | None = None
+        """What the last solution was made of."""
         self._too_far, self._designs = False, {}
-        self.open_windows: list[Window] = []
-        """Windows that were still open at the last solution with `pending`, closed in a copy."""
         if saved is not None and self._asked.needs_temperature:
-            self._begin(self._asked.with_reference_temperature(accumulator_state.saved_model(saved).temperature_ref_c), saved)
+            self._first_temperature_c = accumulator_state.saved_model(saved).temperature_ref_c
+            self._begin(self._asked.with_reference_temperature(self._first_temperature_c), saved)
         elif not self._asked.needs_temperature:
             self._begin(self._asked, saved)
 
@@ -134,6 +138,8 @@ class LiveCalibration:
             When the joint states do not hold the table's joints.
 
         """
+        if self._first_temperature_c is None and block.temperature is not None and len(block.temperature):
+            self._first_temperature_c = float(block.temperature.temperature_c[0])
         if self._collector is None:
             return self._push_before_temperature(block)
         self._collector.push(block)
@@ -147,9 +153,9 @@ class LiveCalibration:
     def _push_before_temperature(self, block):
         self._waiting.append(block)
         del self._waiting[:-HELD_BACK]
-        if block.temperature is None or not len(block.temperature):
+        if self._first_temperature_c is None:
             return []
-        self._begin(self._asked.with_reference_temperature(float(block.temperature.temperature_c[0])))
+        self._begin(self._asked.with_reference_temperature(self._first_temperature_c))
         blocks, self._waiting = self._waiting, []
         for held_back in blocks:
             self._collector.push(held_back)
@@ -185,21 +191,33 @@ class LiveCalibration:
         """
         if self._collector is None:
             raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
-        gathered, store, self.open_windows = self._collector.snapshot(pending)
-        model = self._collector.model
-        total = self._with_earlier(gathered)
-        check_units(total, model)
-        moved = model
-        for _ in range(PASSES):
-            if moved is not model:
-                model = moved
-                total = total.anew(store.reduced(model, self.table, self._collector.session))
-            solution = solve_gathered(total, model, self.options)
-            moved = linearise_again(model, solution)
-            if moved is None or not store.complete:
-                break
-        self.result, self._too_far = conclude(solution, total, model, table=self.table, options=self.options, provenance=provenance), moved is not None
+        gathered, store = self._collector.snapshot(pending)
+        snapshot = LiveSnapshot(self._with_earlier(gathered), self._collector.model, self.table, self.options, self.demand, store,
+                                self._collector.session, self._first_temperature_c)
+        options = self.demand.options(self.options)
+        solution, total, model = snapshot.solved(options)
+        self.result = conclude(self.demand.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
+                               changes=self.demand.changes)
+        self.last, self._too_far = snapshot, linearise_again(model, solution) is not None
         return self.result
+
+    def adopt(self, demand: Demand) -> bool:
+        """
+        Take what windows of this session demand into the model of all solutions from now on; return whether anything changes.
+
+        Nothing changes where the model stays as it was asked for, nor where windows that need other columns are no longer kept.
+        """
+        collector = self._collector
+        if collector is None or self.last is None or self.options.as_asked or demand.is_nothing and self.demand.is_nothing:
+            return False
+        model = self.last.model_for(demand.options(self.options))
+        if not model.has_columns_of(collector.model):
+            if not collector.store.complete:
+                return False
+            collector.take_model(model)
+            self._designs = {}
+        self.demand = demand
+        return True
 
     def needs_linearising(self) -> bool:
         """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
@@ -213,7 +231,7 @@ class LiveCalibration:
 
     def saved(self, pending: bool = False) -> bytes:
         """Return everything that was gathered as bytes, for another run (see `accumulator_state`)."""
-        return accumulator_state.to_bytes(self.gathered(pending), self.model)
+        return accumulator_state.to_bytes(self.gathered(pending), self.model, self.demand)
 
     def _with_earlier(self, gathered):
         if self.earlier is None:

@@ -13,7 +13,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import joined_motion
-from imu_calibration.estimation.window_store import WindowStore
+from imu_calibration.estimation.window_store import WindowStore, owned_window
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 
@@ -45,16 +45,21 @@ class LiveCollector(Collector):
         return kept
 
     def _store(self, window, reduced):
-        if self.model.relinearised:
-            self.store.add(window, reduced)
+        kept = owned_window(window)
+        self.store.add(kept, reduced)
+        self.gathered.spreads[0].add(kept)
+
+    def take_model(self, model: SensorModel) -> None:
+        """Gather the columns of another model from now on; those of all windows so far are taken anew."""
+        self.model, self.gathered = model, self.gathered.anew(self.store.reduced(model, self.table, self.session))
 
     def take_completed(self) -> dict[Window, tuple[slice, dict[str, np.ndarray]]]:
         """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
         completed, self._completed = self._completed, {}
         return completed
 
-    def snapshot(self, pending: bool) -> tuple[Gathered, WindowStore, list[Window]]:
-        """Return copies of what was gathered and of the store, and the open windows that were closed in the copies, with `pending`."""
+    def snapshot(self, pending: bool) -> tuple[Gathered, WindowStore]:
+        """Return copies of what was gathered and of the store, with `pending` the windows that are still open closed in them."""
         twin = copy.copy(self)
         twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
         if pending:
@@ -62,10 +67,11 @@ class LiveCollector(Collector):
             twin.finish()
         else:
             twin.update_counts()
-        return twin.gathered, twin.store, list(twin.take_completed())
+        return twin.gathered, twin.store
 
 
 def copied(gathered: Gathered) -> Gathered:
     """Return a copy that shares only what nobody changes in place."""
     copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
-    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts))
+    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts),
+                   spreads=[spread.copy() for spread in gathered.spreads])

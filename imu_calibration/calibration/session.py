@@ -6,13 +6,14 @@ from typing import Any, Protocol
 from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.effect_states import GroupState, Progress
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
+from imu_calibration.calibration.live_snapshot import LiveSnapshot
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
-from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 
@@ -35,8 +36,11 @@ class TableSession(Protocol):
     """The reference."""
     options: CalibrationOptions
     """What is estimated."""
-    open_windows: list[Window]
-    """Windows that were still open at the last solution."""
+    last: LiveSnapshot | None
+    """What the last solution was made of."""
+
+    def adopt(self, demand: Demand) -> bool:
+        """Take what the session demands into the model from now on; return whether anything changes."""
 
     @property
     def result(self) -> TableResult | None:

@@ -1,6 +1,5 @@
 """Windows of a recording with their samples, for a search over effects: all of a short one, evenly spread ones of a long one."""
 
-from imu_calibration.estimation.window_store import owned_window
 from imu_calibration.segmentation.window import Window
 
 MOST_SAMPLES = 100_000
@@ -14,16 +13,22 @@ class SpreadWindows:
         self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []
 
     def add(self, window: Window) -> None:
-        """Take a window in order of time."""
+        """Take a window in order of time, in memory of its own (`owned_window`)."""
         number = self._counts[window.kind] = self._counts.get(window.kind, -1) + 1
         if number % self._stride:
             return
-        self._kept.append((number, owned_window(window)))
+        self._kept.append((number, window))
         self.n_samples += len(window.time)
         while self.n_samples > MOST_SAMPLES and len(self._kept) > 1:
             self._stride *= 2
             self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
             self.n_samples = sum(len(window.time) for _, window in self._kept)
+
+    def copy(self) -> 'SpreadWindows':
+        """Return one that goes its own way; the windows are shared."""
+        twin = SpreadWindows()
+        twin.n_samples, twin._stride, twin._counts, twin._kept = self.n_samples, self._stride, dict(self._counts), list(self._kept)
+        return twin
 
     @property
     def windows(self) -> list[Window]:

@@ -219,6 +219,9 @@ def _adopted(calibration):
                     "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
     notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
+    lacking = calibration.statistics.get('lacking') or []
+    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: the standard deviations '
+                     'allow for it', 'calibrate the recording offline')] if lacking else []
     strange = calibration.statistics.get('not_believed') or {}
     return notes + ([Reason(NOTE, f'held, because only what the model misses gives them a value, and one that no sensor has: {_strange(strange)}',
                             'move the table so that gravity or the rate of turn act along their axes')] if strange else [])

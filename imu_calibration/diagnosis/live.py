@@ -1,22 +1,19 @@
-"""A diagnosis while the motion goes on: the windows that are kept for it, and its outcome in the words of a status."""
+"""A diagnosis while the motion goes on: the question about a solution, and its outcome in the words of a status."""
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from imu_calibration.calibration.by_evidence import baseline_model
+from imu_calibration.calibration.by_evidence import windows_to_ask
+from imu_calibration.calibration.live_snapshot import LiveSnapshot
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.session import TableSession
-from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words, nothing_named
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.estimation.window_store import owned_window
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
-from imu_calibration.selection.investigation import LEAST_WINDOWS
+from imu_calibration.selection.investigation import LEAST_WINDOWS, too_few_windows
 
 
 class Outcome(StrEnum):
@@ -53,95 +50,47 @@ class DiagnosisState:
     """Figures by name."""
 
 
-class RecentWindows:
-    """
-    The last windows of a session, with their samples.
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a diagnosis came to, and what follows for the calibration."""
 
-    Parameters
-    ----------
-    most : int
-        Samples kept at most; the oldest windows go first.
-
-    """
-
-    def __init__(self, most: int):
-        self._most, self._windows, self.n_samples, self.forgotten = most, deque(), 0, 0
-
-    def __len__(self) -> int:
-        return len(self._windows)
-
-    def add(self, windows: Sequence) -> None:
-        """Take windows in order."""
-        for window in windows:
-            if window.kind != 'unused' and len(window) <= self._most:
-                self._windows.append(owned_window(window))
-                self.n_samples += len(window)
-        while self.n_samples > self._most:
-            self.n_samples -= len(self._windows.popleft())
-            self.forgotten += 1
-
-    def list(self) -> list[Window]:
-        """Return the windows in order; they are not changed by anybody."""
-        return list(self._windows)
-
-
-class LiveDiagnosis:
-    """
-    Keeps the last windows of a live calibration, and asks about them.
-
-    Parameters
-    ----------
-    most : int
-        Samples kept at most; 0: nothing is kept and nothing is asked.
-
-    """
-
-    def __init__(self, most: int):
-        self._most, self.recent = most, RecentWindows(most)
-
-    def add(self, windows: Sequence) -> None:
-        """Take the windows that a `LiveCalibration` has completed."""
-        if self._most:
-            self.recent.add(windows)
-
-    def question(self, live: TableSession | None) -> 'DiagnosisQuestion | None':
-        """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
-        if live is None:
-            return None
-        windows = self.recent.list() + live.open_windows
-        if live.result is None or len(windows) < LEAST_WINDOWS or not self._most:
-            return None
-        return DiagnosisQuestion(windows, live.table, baseline_model(live.options, live.table, live.result.model), self.recent.forgotten,
-                                 live.options.bias_processes)
+    state: DiagnosisState
+    """For people."""
+    demand: Demand | None = None
+    """What the windows demand of the model; None where they could not be asked."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisQuestion:
     """What a diagnosis needs, for another thread."""
 
-    windows: list
-    """Windows in order."""
-    table: Table
-    """The Table."""
-    model: SensorModel
-    """The model to diagnose."""
-    forgotten: int = 0
-    """Windows that were no longer there."""
-    bias_processes: dict = field(default_factory=dict)
-    """Sensor -> how its bias moves, where that was measured apart."""
+    snapshot: LiveSnapshot
+    """What a solution was made of."""
 
-    def answer(self, progress: Callable[[float], object] | None = None) -> DiagnosisState:
-        """Diagnose and return the DiagnosisState; `progress` is called with the share done and may raise to end it."""
+    def is_the_same_as(self, other: 'DiagnosisQuestion') -> bool:
+        """Return whether another question is about the same samples."""
+        return self.snapshot.gathered.accumulator.samples == other.snapshot.gathered.accumulator.samples
+
+    def answer(self, progress: Callable[[float], object] | None = None) -> Answer:
+        """Diagnose and return the Answer; `progress` is called with the share done and may raise to end it."""
         try:
-            return describe(diagnose(self.windows, self.table, self.model, progress=progress, bias_processes=self.bias_processes), self.forgotten)
+            evidence = self.snapshot.evidence(progress)
+            if evidence.found is None:
+                raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
+            calibrated = None if evidence.demand.changes.lacking else evidence.solution
+            return Answer(describe(told(evidence.found.used, self.snapshot.table, evidence.found, calibrated=calibrated)), evidence.demand)
         except ImuCalibrationError as error:
-            return DiagnosisState(WAITING, str(error), {'windows': len(self.windows)})
+            return Answer(DiagnosisState(WAITING, str(error)))
 
 
-def describe(diagnosis: Diagnosis, forgotten: int = 0) -> DiagnosisState:
+def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
+    """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
+    return DiagnosisQuestion(live.last) if live is not None and live.last is not None and windows_to_ask(live.last.gathered) else None
+
+
+def describe(diagnosis: Diagnosis) -> DiagnosisState:
     """Return the DiagnosisState of a Diagnosis: the first finding, or nothing, or what stays unexplained."""
-    values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked,
-                              'older windows not looked at': forgotten}
+    values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
     values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
                for sensor, found in diagnosis.unexplained.items() if found.significant}

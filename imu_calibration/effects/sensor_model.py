@@ -84,6 +84,12 @@ class SensorModel:
         ends = np.cumsum([0] + [effect.size for effect in self.effects])
         return {effect.key: slice(a, b) for effect, a, b in zip(self.effects, ends, ends[1:])}
 
+    def has_columns_of(self, other: 'SensorModel') -> bool:
+        """Return whether another model makes the very same columns: the same effects, linearised at the same point."""
+        same = all(tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS) \
+            and all(getattr(self, name) == getattr(other, name) for name in ('joint_names', 'temperature_ref_c', 'definitions'))
+        return same and self.point.keys() == other.point.keys() and all(np.array_equal(self.point[name], other.point[name]) for name in self.point)
+
     def find(self, sensor: str, role: Role) -> Effect | None:
         """Return the effect of a sensor in a place of its equation, or None."""
         return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)

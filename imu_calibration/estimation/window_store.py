@@ -43,7 +43,7 @@ class WindowStore:
         return twin
 
     def add(self, window: Window, reduced: WindowStatistics) -> None:
-        """Take one window (Window, WindowStatistics); when it does not fit, forget them all."""
+        """Take one window in memory of its own (`owned_window`), and its statistics; when it does not fit, forget them all."""
         if not self.complete:
             return
         if window.kind == 'static':
@@ -52,7 +52,7 @@ class WindowStore:
             self._entries.append((reduced, window.motion, temperature))
         else:
             self._n_samples += len(window)
-            self._entries.append(owned_window(window))
+            self._entries.append(window)
         if self._n_samples > self._most or self._n_static > STATIC_MOST:
             self.complete, self._entries = False, []
 

@@ -75,6 +75,8 @@ class CalibrationNodeSettings:
                                    "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
                                    'azimuth is unknown', symptom='a tilted table shows as accelerometer bias',
                                    fixed='motion is gathered for the model')
+    model_as_asked: bool = setting(False, '', 'add nothing to the model, whatever the motion demands',
+                                   symptom='an effect that is there bends the others', fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='good parameters are called weak', session=True)
     effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, tolerance, text}, '
@@ -147,7 +149,8 @@ class CalibrationNode(Node):
         place = files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml')
         return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
                                   files.read_tolerances(place, catalogue), windows, catalogue=catalogue,
-                                  noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
+                                  noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None,
+                                  as_asked=settings.model_as_asked)
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
         return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)

@@ -14,7 +14,7 @@ from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveSession
 from imu_calibration.calibration.trust import missing
-from imu_calibration.diagnosis.live import DiagnosisState, LiveDiagnosis
+from imu_calibration.diagnosis.live import DiagnosisState, question_about
 from imu_calibration.errors import ImuCalibrationError, InputError, NotObservableError, shortened
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
@@ -74,7 +74,7 @@ class CalibrationWorker(threading.Thread):
         self.hints = hints or {}
         self._pacer, self._watch = SolvePacer(live.settings.solve_share), StreamWatch(live.needs_joints, live.needs_temperature)
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
-        self._diagnosed, self._windows = 0, self._new_diagnosis()
+        self._diagnosed = 0
         self._asked: list[Request] = []
         self._lock, self._wake, self._ending = threading.Lock(), threading.Event(), False
         self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
@@ -118,7 +118,8 @@ class CalibrationWorker(threading.Thread):
             while not self._ending:
                 self._wake.wait(PERIOD)
                 self._wake.clear()
-                for step in (self._take, self._answer, self._solve_when_due, self._autosave, self._diagnose_when_due, self._tell, self._cover):
+                for step in (self._take, self._answer, self._solve_when_due, self._adopt_what_was_found, self._autosave, self._diagnose_when_due, self._tell,
+                             self._cover):
                     self._survive(step)
             self._survive(self._take)
         finally:
@@ -149,7 +150,6 @@ class CalibrationWorker(threading.Thread):
             self._closed = False
         if windows:
             self._new_windows = True
-            self._windows.add(windows)
             residuals = self.live.residuals(windows)
             if residuals is not None and len(residuals):
                 self.listeners.residuals(residuals)
@@ -184,9 +184,26 @@ class CalibrationWorker(threading.Thread):
 
     def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(lambda: self._windows.question(self.live.on_table), n_windows > self._diagnosed)
+        self._diagnosis.ask_when_due(lambda: question_about(self.live.on_table), n_windows > self._diagnosed)
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
+
+    def _adopt_what_was_found(self) -> None:
+        if self._adopt():
+            self._publish_solution(pending=self._closed)
+
+    def _adopt(self) -> bool:
+        """Take the last answer of the diagnosis into the model; return whether anything changes."""
+        demand, session = self._diagnosis.take_demand(), self.live.on_table
+        return demand is not None and session is not None and session.adopt(demand)
+
+    def _settled_solution(self) -> tuple[CalibrationResult, str]:
+        """Publish the solution of everything so far, with what it demands of the model: what `calibrate` makes of the same messages."""
+        published = self._publish_solution(pending=True)
+        if not self._diagnosis_period:
+            return published
+        self._diagnosis.settle(question_about(self.live.on_table))
+        return self._publish_solution(pending=True) if self._adopt() else published
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
         start = time.monotonic()
@@ -196,7 +213,7 @@ class CalibrationWorker(threading.Thread):
         self._note_fault('solution', '')
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
-        self.listeners.solution(result, self._windows.recent.list())
+        self.listeners.solution(result, [window for spread in result.gathered.spreads for window in spread.windows])
         self._pacer.note(start, time.monotonic())
         return result, text
 
@@ -211,12 +228,12 @@ class CalibrationWorker(threading.Thread):
             return False, "nothing is diagnosed by hand while it runs, nor where parameter 'diagnosis_period' is 0"
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return True, f'asked what the model gets wrong on {self.live.n_windows} windows; the answer comes on /diagnostics'
+        return True, f'asked what the model gets wrong on {self.live.n_windows} windows; the answer comes on /diagnostics, and joins the calibration'
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
         try:
-            result, text = self._publish_solution(pending=True)
+            result, text = self._settled_solution()
             what = f'{result.calibration.verdict}: {missing(result.calibration) or "every parameter is determined"}'
         except ImuCalibrationError as error:
             what = f'no calibration yet: {error.told(self.hints)}'
@@ -226,13 +243,10 @@ class CalibrationWorker(threading.Thread):
         self._note_fault('place', '' if whole else written)
         return whole and text is not None, f'{what}; {written}'
 
-    def _new_diagnosis(self) -> LiveDiagnosis:
-        return LiveDiagnosis(self.live.settings.diagnosis_samples if self._diagnosis_period else 0)
-
     def _reset(self) -> tuple[bool, str]:
         lost = self.place.unsaved(self.live)
         self.live = self.make_live()
-        self._new_windows, self._closed, self._diagnosed, self._windows = False, True, 0, self._new_diagnosis()
+        self._new_windows, self._closed, self._diagnosed = False, True, 0
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
@@ -241,11 +255,9 @@ class CalibrationWorker(threading.Thread):
 
     def change_settings(self, settings: LiveSettings) -> tuple[bool, str]:
         """Solve, keep and tell as often as other LiveSettings say."""
-        was_off, self.live.settings = not self._diagnosis_period, settings
+        self.live.settings = settings
         self._pacer = SolvePacer(settings.solve_share)
         self._diagnosis.change(self._diagnosis_period)
-        if was_off:   # nothing was kept for it so far
-            self._windows = self._new_diagnosis()
         return True, ''
 
     def change_windows(self, windows: WindowSettings) -> tuple[bool, str]:

@@ -4,8 +4,9 @@ import threading
 import time
 from collections.abc import Callable
 
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.pacing import SolvePacer
-from imu_calibration.diagnosis.live import FAILED, OFF, DiagnosisQuestion, DiagnosisState
+from imu_calibration.diagnosis.live import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
 
 SHARE = 0.2
 """Share of the time that diagnosing takes at most."""
@@ -31,6 +32,8 @@ class DiagnosisThread:
         self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
         self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
+        self._answered: DiagnosisQuestion | None = None
+        self._demand: Demand | None = None
 
     def change(self, period: float) -> None:
         """Ask as often as another period says; 0: no more."""
@@ -50,6 +53,7 @@ class DiagnosisThread:
     def forget(self) -> None:
         """Take back what was said: the session starts anew."""
         self.state, self._wanted, self._urgent = DiagnosisState() if self.period else self.state, False, False
+        self._answered = self._demand = None
         self._session += 1
 
     def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
@@ -67,16 +71,33 @@ class DiagnosisThread:
 
     def _answer(self, question, start, session):
         try:
-            state = question.answer(lambda share: self._go_on(session))
+            answer = question.answer(lambda share: self._go_on(session))
         except _Ended:
             return
         except Exception as error:   # a diagnosis that fails must not end the calibration
-            state = DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}')
+            answer = Answer(DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
         if session == self._session:
-            self.state, self.n_answers = state, self.n_answers + 1
+            self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question, self.n_answers + 1
         end = time.monotonic()
         self._next = end + self.period
         self._pacer.note(start, end)
+
+    def take_demand(self) -> Demand | None:
+        """Return what the last answer demands of the model, once."""
+        demand, self._demand = self._demand, None
+        return demand
+
+    def settle(self, question: DiagnosisQuestion | None) -> None:
+        """Wait until a question is answered; what was answered already, of the same windows, is not asked again."""
+        self._join()
+        if question is not None and self.period and not (self._answered and question.is_the_same_as(self._answered)):
+            self._urgent = True
+            self.ask_when_due(lambda: question, True)
+            self._join()
+
+    def _join(self, timeout=None):
+        if self._thread is not None:
+            self._thread.join(timeout)
 
     def _go_on(self, session):
         if self._ending or session != self._session:
@@ -85,8 +106,7 @@ class DiagnosisThread:
     def end(self, timeout: float = 10.0) -> None:
         """Let the answer be, and wait for the thread."""
         self._ending = True
-        if self._thread is not None:
-            self._thread.join(timeout)
+        self._join(timeout)
 
 
 class _Ended(Exception):

@@ -148,8 +148,16 @@ SIGNS = _of(
 )
 LIVE = _of(
     'imu_calibration',
-    ('an open window counts twice', 'calibration/live.py', 'gathered, store, self.open_windows = self._collector.snapshot(pending)',
-     'gathered, store, self.open_windows = self._collector.snapshot(True)', 'test_live_calibration.py'),
+    ('an open window counts twice', 'calibration/live.py', 'gathered, store = self._collector.snapshot(pending)',
+     'gathered, store = self._collector.snapshot(True)', 'test_live_calibration.py'),
+    ('what is found live never joins the model', 'calibration/live.py', 'collector.take_model(model)', 'pass', 'test_live_diagnosis.py'),
+    ('the model as asked grows live', 'calibration/live.py', 'self.options.as_asked or demand', 'demand', 'test_live_diagnosis.py'),
+    ('windows that are gone are taken anew', 'calibration/live_snapshot.py', 'if self.store.complete:', 'if True:', 'test_live_diagnosis.py'),
+    ('a resumed session forgets what joined', 'calibration/live.py', 'Demand() if saved is None or options.as_asked else', 'Demand() if True else',
+     'test_live_diagnosis.py'),
+    ('what is denied live does not widen', 'calibration/live.py', 'conclude(self.demand.applied(solution)', 'conclude(solution', 'test_live_diagnosis.py'),
+    ('whoever saves does not wait for the answer', 'nodes/diagnosis_thread.py', 'if question is not None and self.period and not', 'if False and not',
+     'test_live_diagnosis.py'),
     ('an earlier run is forgotten', 'calibration/live.py', 'return merge([copied(self.earlier), gathered])', 'return gathered', 'test_live_calibration.py'),
     ('solving again adds the earlier run again', 'calibration/live.py', 'merge([copied(self.earlier), gathered])', 'merge([self.earlier, gathered])',
      'test_live_calibration.py'),

@@ -1,0 +1,67 @@
+"""What a live session has gathered at one moment: it is solved, and asked what it demands, while the session goes on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
+from imu_calibration.calibration.calibrate import solve_gathered
+from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.window_store import WindowStore
+from imu_calibration.preflight.joint_checks import check_units
+from imu_calibration.reference.table import Table
+
+
+@dataclass(frozen=True, eq=False)
+class LiveSnapshot:
+    """What was gathered, in copies that nobody changes."""
+
+    gathered: Gathered
+    """An earlier run included, with the windows to ask."""
+    model: SensorModel
+    """The model whose columns it holds."""
+    table: Table
+    """The reference."""
+    options: CalibrationOptions
+    """What is asked for."""
+    demand: Demand
+    """What joined the model since."""
+    store: WindowStore
+    """The windows of this run, while they are all kept."""
+    session: int
+    """Number of this run."""
+    temperature_c: float | None
+    """The first temperature, degrees Celsius; None: none came."""
+
+    def model_for(self, options: CalibrationOptions) -> SensorModel:
+        """Return the model whose columns options ask for."""
+        model = choose_model(options, self.table)
+        return model.with_reference_temperature(self.temperature_c) if model.needs_temperature and self.temperature_c is not None else model
+
+    def solved(self, options: CalibrationOptions) -> Solved:
+        """
+        Return (Solution, Gathered, the SensorModel whose columns were used) of other options, as a recording would be read for them.
+
+        Where the windows are no longer kept, the columns are those that were gathered.
+        """
+        model, total, moved = self.model, self.gathered, self.model_for(options)
+        check_units(total, model)
+        if not self.store.complete or moved.has_columns_of(model):
+            moved = model
+        for _ in range(PASSES):
+            if moved is not model:
+                model, total = moved, total.anew(self.store.reduced(moved, self.table, self.session))
+            solution = solve_gathered(total, model, options)
+            moved = linearise_again(model, solution)
+            if moved is None or not self.store.complete:
+                break
+        return solution, total, model
+
+    def evidence(self, asking: Callable | None = None) -> EvidentSolution:
+        """Return what the windows demand, solved as `calibrate_by_evidence` solves a recording; `asking` is called with the share done."""
+        if self.store.complete:
+            return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved, asking=asking)
+        return ask_kept(self.solved(self.demand.options(self.options)), self.table, self.options, known=self.demand, asking=asking)
