@@ -1,6 +1,7 @@
 """Shared fixtures of the test suite."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')   # before numpy comes: threads that wait for each other take minutes on a busy machine
@@ -20,6 +21,12 @@ def recordings():
     if not folder.is_dir():
         pytest.skip(f'real recordings not found at {folder}; set IMU_CALIBRATION_DATA')
     return folder
+
+
+def pytest_collection_modifyitems(items):
+    """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
+    long = Counter(item.path for item in items if item.get_closest_marker('slow') or item.get_closest_marker('dds'))
+    items.sort(key=lambda item: -long[item.path])
 
 
 def pytest_terminal_summary(terminalreporter):

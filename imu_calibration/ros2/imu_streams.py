@@ -62,7 +62,7 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     streams = [_Stream(node, name) for name in topics]
     _spin(node, spin_once, 0.2)
     for stream in streams:
-        stream.input.look()   # asks for what the publishers offer
+        stream.ask_for_what_is_offered()
     for _ in range(PATIENCE):
         _spin(node, spin_once, SECONDS)
         if all(stream.count >= ENOUGH for stream in streams):
@@ -86,9 +86,18 @@ class _Stream:
     """One topic that is listened to."""
 
     def __init__(self, node, topic):
-        self.node, self.topic, self.heads, self.gatherer, self.count = node, topic, ImuHeads(), LiveGatherer(), 0
+        self.node, self.topic = node, topic
+        self._begin()
         self.by_wall_clock = not node.count_publishers('/clock')   # else stamps belong to the time that is played
         self.input = BatchInput(node, Imu, topic, add=self._add)
+
+    def _begin(self):
+        self.heads, self.gatherer, self.count = ImuHeads(), LiveGatherer(), 0
+
+    def ask_for_what_is_offered(self):
+        """Subscribe as the publishers offer it; begin anew, for what waited for the first subscription comes twice."""
+        self.input.look()
+        self._begin()
 
     def _add(self, data, sent_ns):
         self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)

@@ -20,19 +20,24 @@ TRUTH = ROOT / 'bags/sample_session/truth.yaml'
 FAULTY = '''
 import sys, rclpy
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.time import Time
 from sensor_msgs.msg import Imu, MagneticField
 rclpy.init()
 node = rclpy.create_node('driver')
 good, bad = node.create_publisher(Imu, 'good/imu/data_raw', 10), node.create_publisher(Imu, 'bad/imu/data_raw', qos_profile_sensor_data)
 other = node.create_publisher(MagneticField, 'strange/imu/data', 10)
 listener = node.create_subscription(Imu, 'bad/imu/data_raw', lambda message: None, QoSProfile(depth=5))
-counter = [0]
+counter, STEP_NS = [0], 5_000_000
+start_ns = node.get_clock().now().nanoseconds
+def publish_due():   # a sensor's clock runs on while a busy machine lets its driver wait
+    while start_ns + counter[0] * STEP_NS <= node.get_clock().now().nanoseconds:
+        publish()
 def publish():
     counter[0] += 1
     wobble = 1e-3 * ((counter[0] * 37) % 11 - 5)
     for publisher, unit, frame, variance in ((good, 9.81, 'imu_link', 1e-4), (bad, 1.0, '', -1e-4)):
         message = Imu()
-        message.header.stamp = node.get_clock().now().to_msg()
+        message.header.stamp = Time(nanoseconds=start_ns + (counter[0] - 1) * STEP_NS).to_msg()
         message.header.frame_id = frame
         message.linear_acceleration.x, message.linear_acceleration.y, message.linear_acceleration.z = wobble, -wobble, unit + wobble
         message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z = wobble, -wobble, 2 * wobble
@@ -41,7 +46,7 @@ def publish():
         message.angular_velocity_covariance[8] = variance
         message.orientation_covariance[0] = -1.0
         publisher.publish(message)
-node.create_timer(0.005, publish)
+node.create_timer(0.005, publish_due)
 print('ready', flush=True)
 rclpy.spin(node)
 '''
