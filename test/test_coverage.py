@@ -11,9 +11,11 @@ from imu_calibration.by_hand.next_pose import HandKnowledge, foretold, hand_cove
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.status import NOTHING
 from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, table_coverage
+from imu_calibration.calibration.coverage_look import line_of
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import NotObservableError
+from imu_calibration.estimation.standard_motions import MOTIONS
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 
@@ -117,6 +119,51 @@ def test_on_a_table_the_picture_shows_what_the_motion_did():
     assert shown.worth.shape == (26,) and (shown.worth >= 0).all() and (shown.worth <= 1).all()
     assert len(shown.seen) > 4 and np.allclose(np.linalg.norm(shown.seen, axis=1), 1)
     assert bool(shown.next.text) == bool(found.result.needed)
+
+
+@pytest.fixture(scope='module')
+def begun():
+    """A table after twenty seconds: (session, result)."""
+    from imu_calibration.calibration.live import LiveCalibration
+
+    from worlds.live_sessions import OPTIONS as TABLE_OPTIONS
+    from worlds.live_sessions import TABLE, make_session
+    imu, joints, _, _ = make_session(3, profile='quick')
+    live, end = LiveCalibration(TABLE, TABLE_OPTIONS), imu.stamp_ns[0] + 20_000_000_000
+    live.push(SampleBlock(imu.select(imu.stamp_ns < end), joints.select(joints.stamp_ns < end)))
+    return live, live.solve(pending=True)
+
+
+def _sd_after(information, prior):
+    """By the rows themselves; the gauge as exact as a millionth of a metre."""
+    values, vectors = np.linalg.eigh(information)
+    gauge = 1e-6 * prior.gauge
+    rows = np.concatenate([np.sqrt(np.clip(values, 0, None))[:, None] * vectors.T, np.diag(1 / prior.sd), gauge])
+    return np.sqrt((np.linalg.inv(np.linalg.qr(rows)[1])**2).sum(axis=1))
+
+
+def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
+    """What they would add to the information is added, one after the other; the first is the next one."""
+    from imu_calibration.estimation.observability import added_information
+    from imu_calibration.estimation.prior import make_prior
+    live, result = begun
+    shown, solution = live.coverage(), result.solution
+    assert result.needed and 0 < shown.seconds < 600 and shown.next.text in {motion.text for motion in MOTIONS}
+    assert line_of(shown) == f'{shown.next.text}, about {shown.seconds:.0f} s left'
+    lengths, prior, first = {motion.text: motion.seconds for motion in MOTIONS}, make_prior(solution.model), shown.next.text
+    if shown.seconds == pytest.approx(lengths[first]):
+        [motion] = [motion for motion in MOTIONS if motion.text == first]
+        more = added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity)
+        before, after = (_sd_after(solution.information + each, prior) for each in (0 * more, more))
+        sd = after * np.maximum(result.calibration.sd / before, 1)
+        assert (sd <= result.tolerances)[np.array(result.model.requested)].all()
+
+
+def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(begun, monkeypatch):
+    live, result = begun
+    monkeypatch.setattr('imu_calibration.calibration.coverage.only_axis', lambda table: np.array([0.6, 0.0, 0.8]))
+    shown = table_coverage(result)
+    assert np.isnan(shown.seconds) and shown.next.text and 'left' not in line_of(shown)
 
 
 rclpy = pytest.importorskip('rclpy')

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.effect_states import GroupState
+from imu_calibration.calibration.from_solution import only_axis
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import added_information
-from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.standard_motions import MOTIONS, rest_with_up
 
@@ -19,6 +20,12 @@ DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.produc
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 ENOUGH = 0.02
 """A cell that gives less than this share of what is missing is no longer worth a pose."""
+MOST_MOTIONS, LEAST_GAIN = 20, 0.01
+"""Standard motions that are looked ahead at most, and the share of what is missing that the best one must take off."""
+GAUGE_SHOWN = 1e-7
+"""m; how exactly the origin is the mean of the sensitive points here."""
+LONGEST = 300.0
+"""s; standard motions that take longer gain too little per second, and are long to work out."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,9 @@ def table_coverage(result: CalibrationResult, frame_id: str = '') -> Coverage:
     """
     Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
 
+    What is next is the standard motion that gains most per second, the seconds are those of it and all that are needed after it. Where these
+    would not do, it is what the solution names for the parameter worst off.
+
     Parameters
     ----------
     result : CalibrationResult
@@ -105,16 +115,50 @@ def table_coverage(result: CalibrationResult, frame_id: str = '') -> Coverage:
     """
     solution = result.solution
     wanted = np.array(result.model.requested, bool)
-    base = solution.information + np.diag(1 / make_prior(solution.model).sd**2)
+    base = solution.information + _known_before(solution.model)
 
-    def left(more):
-        sd = np.sqrt(np.clip(np.diag(inverse_normal(base + more)), 0, None))
-        return excess(sd[wanted], result.tolerances[wanted])
-    gravity = result.gravity
-    rests = [rest_with_up(up) for up in DIRECTIONS]
-    after = np.array([left(added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)) for motion in rests])
-    worth = share_gained(left(0.0), after)
-    return Coverage(worth, _rests_of(result), None, _next_on_table(result), float('nan'), (), _arms(result), frame_id)
+    def expected_sd(information):
+        return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
+    # what the model misses widens standard deviations beyond what the information says, and will go on doing so
+    wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
+
+    def left(information):
+        return excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
+
+    def added(motion):
+        return added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity)
+    after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
+    worth = share_gained(left(base), after)
+    first, seconds = _foretold(base, left, added, _possible_motions(result.table))
+    step = _next_on_table(result) if first is None else _step(first.text)
+    return Coverage(worth, _rests_of(result), None, step, seconds, (), _arms(result), frame_id)
+
+
+def _known_before(model):
+    """Return the information of the prior; the gauge as exact as sums of squares bear it."""
+    prior = make_prior(model)
+    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge
+    return np.diag(1 / prior.sd**2) + gauge.T @ gauge
+
+
+def _possible_motions(table):
+    about = only_axis(table)
+    return [motion for motion in MOTIONS if motion.seconds < LONGEST and (about is None or motion.possible_about(about))]
+
+
+def _foretold(information, left, added, motions):
+    """Return (the first, seconds of all) of the motions that leave nothing; (None, NaN) where these motions do not get there."""
+    first, seconds, missing = None, 0.0, left(information)
+    more = [added(motion) for motion in motions] if missing else []
+    for _ in range(MOST_MOTIONS):
+        if not missing:
+            return first, seconds
+        remaining = [left(information + each) for each in more]
+        best = max(range(len(motions)), key=lambda k: (missing - remaining[k]) / motions[k].seconds, default=None)
+        if best is None or missing - remaining[best] < LEAST_GAIN * missing:
+            break
+        first, seconds, information, missing = first or motions[best], seconds + motions[best].seconds, information + more[best], remaining[best]
+    return None, float('nan')
 
 
 def _rests_of(result):
@@ -131,7 +175,10 @@ def _next_on_table(result):
         return Step('')
     names = list(result.calibration.param_names)
     worst = max(needed, key=lambda name: result.calibration.sd[names.index(name)] / result.tolerances[names.index(name)])
-    text = needed[worst][0]
+    return _step(needed[worst][0])
+
+
+def _step(text):
     motion = next((motion for motion in MOTIONS if motion.text == text), None)
     return Step(text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float))
 

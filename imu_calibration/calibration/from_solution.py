@@ -24,10 +24,10 @@ from imu_calibration.segmentation.window_cutter import dropped
 def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
     return observability.needed_motions(solution, tolerances, table.gravity_value, prior_sd=make_prior(solution.model).sd,
-                                        only_axis=_only_axis(table))
+                                        only_axis=only_axis(table))
 
 
-def _only_axis(table):
+def only_axis(table: Table) -> np.ndarray | None:
     """Return the axis, in the sensor frame, about which a table with a single joint turns; None for other tables."""
     if len(table.joints) != 1 or not table.joints[0].turns:
         return None

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.constants import DEG
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.reference.reference_motion import Reference
 
+REST, WAY = 5.0, 3.0
+"""s; a rest, and what a table or a person takes from one to the next."""
 ALONG = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
 OTHER_MOUNT = 'mount the IMU at another angle on the joint and record the same motion again, beside this recording'
@@ -26,6 +28,11 @@ class Motion:
     """Function of gravity that returns pieces of the motion, each a Reference."""
     axis: tuple | None = None
     """The one axis of the sensor that it turns about; None: it takes several, or other attitudes."""
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes: rests with the way to the next one, and what moves."""
+        return sum(REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY for piece in self.make(STANDARD_GRAVITY))
 
     def possible_about(self, axis_s: np.ndarray) -> bool:
         """Return whether a table can do it that turns the sensor about one axis only, given as a unit vector in the sensor frame."""
