@@ -108,8 +108,9 @@ def test_shares_are_of_the_locked_windows():
 
 @pytest.mark.parametrize('kind', ['knock', 'cable_in_an_arc', 'sticks_when_warm'])
 def test_the_place_is_found(kind):
-    row = row_of(6, kind)
-    assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['named'], row
+    row, known = row_of(6, kind, 'white', Beyond(kind, 6))
+    assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['found'], row
+    assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
 
 
 def test_it_is_said_and_written():
@@ -160,3 +161,13 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
     assert main(['simulate', '--calibration', str(extended), *table, '--profile', 'quick', '--output', str(tmp_path / 'bag2')]) == 0
     assert main(['check', str(tmp_path / 'bag2'), '--calibration', str(extended), *table]) in (0, 3)
     assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(extended), '--anyway', '--output', str(tmp_path / 'bag3')]) in (0, 3)
+
+
+@pytest.mark.slow
+def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_there_stays():
+    """Three quarters of a cube look like its base; a response to force beside another cause is one all the same."""
+    row, _ = row_of(141, 'force_cubed_in_gyro', 'realistic', Beyond('force_cubed_in_gyro', 141))
+    assert row['found'] == [] and row['family'], row
+    recording = record(5, {'gyro_g_sensitivity': None}, through_bag=False, cause=Beyond('gyro_cubic', 5, 0.3))
+    found = diagnose(recording.windows, recording.table, recording.model)
+    assert [finding.effect for finding in found.findings] == ['gyro_g_sensitivity'] and found.unexplained['gyroscope'].proposal is not None

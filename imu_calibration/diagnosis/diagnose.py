@@ -1,10 +1,11 @@
 """From windows to findings: the one function that asks every effect, and puts into words what was found."""
 
+from dataclasses import replace
 from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.diagnosis.beyond.look import look_beyond
+from imu_calibration.diagnosis.beyond.look import look_beyond, superseded
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import candidates_of, sentence
@@ -77,6 +78,11 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
+    rests = look_beyond(found, table, unexplained(attempt, found.explained, named))
+    gone = superseded(found, table, rests)
+    if gone:
+        others = replace(found, named=[question for question in named if question not in gone], doubtful=[*found.doubtful, *gone])
+        return told(windows, table, others, calibrated=calibrated)
     baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
     solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline
@@ -100,7 +106,6 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    rests = look_beyond(found, table, unexplained(attempt, found.explained, named))
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named),
                      tuple(found.not_testable),
                      baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),

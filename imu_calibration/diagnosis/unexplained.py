@@ -50,6 +50,8 @@ class Unexplained:
     """Conditions under which it appears (`beyond.regimes.RestRegime`), at most one for each axis."""
     proposal: Any = None
     """Formula that it follows (`beyond.proposals.Proposal`), or None."""
+    tones: tuple = ()
+    """Fixed frequencies and fixed multiples of a joint's speed in it (`beyond.spectrum.Tone`), the surest first."""
 
 
 def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:

@@ -165,7 +165,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
             lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
-            lines += [f'   {line}' for line in beyond_lines(sensor, rest)]
+        lines += [f'   {line}' if rest.significant else f'{sensor}: {line}' for line in beyond_lines(sensor, rest)]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
@@ -175,6 +175,7 @@ def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     """Return where a rest sits and what formula it follows, as lines."""
     lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
     lines += [f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)' for regime in rest.regimes]
+    lines += [f'spectrum: {tone.text}' for tone in rest.tones]
     return lines + ([f'formula: {rest.proposal.sentence}'] if rest.proposal is not None else [])
 
 

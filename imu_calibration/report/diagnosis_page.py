@@ -13,6 +13,7 @@ from imu_calibration.report.numbers import in_unit, people, text
 from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.residuals import UNIT
+from imu_calibration.report.spectrum_figure import draw_tones
 from imu_calibration.units import for_people
 
 BINS = 16
@@ -41,6 +42,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
                   traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
                   rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], beyond=_beyond(diagnosis),
+                  spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
                   not_testable=list(diagnosis.not_testable),
                   groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))

@@ -95,7 +95,7 @@ KINDS = {
     'warm_g_sensitivity': Kind('gyroscope', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, _axis(r)]),
     'force_cubed_in_gyro': Kind('gyroscope', _of('force'), _power('force', 3)),
     'gyro_cubic': Kind('gyroscope', _of('rate'), _power('rate', 3)),
-    'angular_acceleration_in_gyro': Kind('gyroscope', _of('angular acceleration'), _power('alpha', 1)),
+    'acceleration_under_load': Kind('gyroscope', _of('angular acceleration', 'force'), lambda s, r: s.alpha[:, _axis(r)] * s.force[:, _axis(r)]),
     'scale_under_load': Kind('gyroscope', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]),
     'coriolis_in_accelerometer': Kind('accelerometer', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]),
     'gyro_scale_settling': Kind('gyroscope', _of('rate', 'time'), _settling('rate')),
@@ -139,3 +139,16 @@ class Beyond(Cause):
         """Axes that carry a tenth of it at least."""
         strength = np.sqrt((self.signal**2).mean(axis=0))
         return {axis for axis, s in zip('xyz', strength) if s > 0.3 * strength.max()}
+
+
+class Machine(Cause):
+    """A mains hum in accelerometer z, and teeth of the outer joint's gear that gyroscope x feels; `size` 1: 1 mg and 0.2 deg/s."""
+
+    hum_hz, teeth = 23.7, 12.4
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return both: the hum drifts in phase, the teeth do not."""
+        hum, mesh = np.zeros((2, len(world.time), 3))
+        hum[:, 2] = MG * np.sin(2 * np.pi * self.hum_hz * world.time + np.sin(world.time / 20))
+        mesh[:, 0] = 0.2 * DEG * np.sin(self.teeth * world.joints[:, 0])
+        return self.size * hum, self.size * mesh

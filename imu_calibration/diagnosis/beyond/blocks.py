@@ -10,6 +10,7 @@ from imu_calibration.diagnosis.traces import all_samples
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
@@ -107,7 +108,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
               'window': number, 'locked': attempt.locked[number]}
     references = References(attempt.recording.model, table, motion, temperature_c=temperature)
     found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
-    for sensor, residual in _residuals(windows, table, attempt).items():
+    for sensor, residual in residuals(windows, table, attempt.recording.model, values=attempt.recording.values).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
         variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])[place] / count[:, None]
@@ -139,10 +140,9 @@ def _busier(windows, sensor, floor, kinds, judged):
     return found
 
 
-def _residuals(windows, table, attempt):
-    """Return sensor -> residual of every sample at the values of the reduction, shape (n, 3): rows within blocks would be too coarse for it."""
+def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse for it."""
     motion, temperature, rows = all_samples(windows)
-    model, values = attempt.recording.model, attempt.recording.values
     predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
     outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
     return {sensor: output - made[rows] for sensor, output, made in zip(SENSORS, outputs, predicted)}

@@ -1,0 +1,167 @@
+"""Tones in the rest: at a fixed frequency, or at a fixed multiple of a joint's speed."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import detrend
+from scipy.stats import binom
+
+from imu_calibration.constants import DEG
+from imu_calibration.diagnosis.beyond.blocks import residuals
+from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.investigation import Investigation
+from imu_calibration.units import for_people, significant
+
+STEP = 0.1
+"""Between the frequencies that are asked about, cycles per second or per turn; a stretch is as long as tells two of them apart, at most."""
+PER_TURN = 128
+"""Places per turn at which a turning joint's rest is taken."""
+LEAST_CYCLES = 3.0
+"""Of a tone in a stretch that can show it."""
+HIGHEST = 0.45
+"""Highest frequency in that of the samples."""
+CLEAR, BY_CHANCE = 4.0, 0.05
+"""Power above its surroundings that counts in a stretch, and how often noise reaches it there: e^-4, and more where few frequencies tell what is around."""
+SIGNIFICANT = 1e-4
+"""Chance of a tone by noise, times the number of frequencies, axes and joints."""
+MOSTLY = 0.5
+"""Share of the stretches that show a tone, at least: what moves with the motion shows in some of them."""
+SLOWEST = 1.0 * DEG
+"""A joint that turns slower at times has no orders, rad/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tone:
+    """One line in the spectrum of a sensor's rest."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    axis: str
+    """Axis of the sensor."""
+    joint: str | None
+    """Joint whose turns are counted; None: seconds."""
+    frequency: float
+    """Cycles per second, or per turn of the joint."""
+    amplitude: float
+    """m/s^2 or rad/s."""
+    p_value: float
+    """Chance by noise, times the number of what was asked."""
+    share: float
+    """Share of the stretches that show it."""
+    frequencies: np.ndarray
+    """All frequencies that were asked about, shape (n,)."""
+    power: np.ndarray
+    """Mean power of the axis there, over that around it, shape (n,)."""
+
+    @property
+    def text(self) -> str:
+        """What it is, in words."""
+        factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
+        where = f'on axis {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
+        if self.joint is None:
+            return f'a tone of {self.frequency:.1f} Hz {where}, whatever moves: electrical, or a resonance'
+        return f'{self.frequency:.1f} times per turn of {self.joint} {where}, at every speed: its bearing, gear, motor or encoder'
+
+    def to_mapping(self) -> dict:
+        """Return the tone as plain data."""
+        return {'axis': self.axis, 'joint': self.joint, 'frequency': self.frequency, 'amplitude': self.amplitude, 'p_value': self.p_value,
+                'share': self.share, 'text': self.text}
+
+
+def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]]:
+    """
+    Return sensor -> the tones in what is left beside the findings, the surest first.
+
+    The rest of every stretch of at most ten seconds, or of at most ten turns of a joint that keeps turning, is taken apart into frequencies. One
+    counts where its power is four times the median around it; a tone counts in most stretches, which noise does by chance (binomial law).
+    Rests and motions both tell of seconds; what stays at a multiple of a speed stands still in turns and wanders in seconds.
+    """
+    attempt = found.attempt
+    values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
+    left = residuals(found.used, table, attempt.recording.model, values=values)
+    edges = np.cumsum([len(window) for window in found.used])[:-1]
+    tones = {}
+    for sensor in SENSORS:
+        parts = np.split(left[sensor], edges)
+        asked = [(None, None), *enumerate(table.joint_names)]
+        told = [replace(tone, p_value=tone.p_value * len(AXES) * len(asked)) for joint, name in asked
+                for tone in of_stretches(sensor, _stretches(found.used, parts, joint), name)]
+        tones[sensor] = tuple(sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value))
+    return tones
+
+
+def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Yield (rest at equal steps, shape (n, 3), step in seconds or turns, highest frequency) of stretches that can show a tone."""
+    for window, rest in zip(windows, parts):
+        if len(window) < 16:
+            continue
+        step = float(np.median(np.diff(window.time)))
+        if joint is None:
+            # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
+            yield from ((piece, step, HIGHEST / step) for piece in _cut(rest, round(1 / (STEP * step))))
+        elif len(window.motion) == len(window) and _keeps_turning(window.motion.rate[:, joint]):
+            turns = window.motion.position[:, joint] / (2 * np.pi)
+            order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
+            even = np.arange(turns[order][0], turns[order][-1], 1 / PER_TURN)
+            if len(even) < 16:
+                continue
+            taken = np.stack([np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1)
+            fastest = float(np.abs(window.motion.rate[:, joint]).max()) * step / (2 * np.pi)
+            yield from ((piece, 1 / PER_TURN, min(HIGHEST / fastest, HIGHEST * PER_TURN)) for piece in _cut(taken, round(PER_TURN / STEP)))
+
+
+def _keeps_turning(rate):
+    return rate.min() > SLOWEST or rate.max() < -SLOWEST
+
+
+def _cut(rest, longest):
+    """Return a rest in pieces of equal length, at most `longest`."""
+    return np.array_split(rest, -(-len(rest) // longest))
+
+
+def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None) -> Iterator[Tone]:
+    """Yield the Tone of each axis that stands out most, where one does; its p-value counts frequencies only."""
+    every = list(stretches)
+    if not every:
+        return
+    grid = STEP * np.arange(round(1 / (STEP * every[0][1])) // 2 + 1)
+    hits, ratios, plain, excess = np.zeros((4, len(grid), 3))
+    count = np.zeros(len(grid), int)
+    for rest, step, highest in every:
+        inside = (grid * len(rest) * step >= LEAST_CYCLES) & (grid <= highest)
+        power, around, inside = _powers(rest, round(1 / (STEP * every[0][1])), inside)
+        at = np.flatnonzero(inside)
+        count[at] += 1
+        hits[at] += power[at] > CLEAR * around[at]
+        ratios[at] += power[at] / around[at]
+        plain[at] += power[at] / np.maximum(np.median(power, axis=0), 1e-300)
+        excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))   # of a line under a Hann window
+    if not count.any():
+        return
+    chance = np.where(hits > MOSTLY * count[:, None], binom.sf(hits - 1, count[:, None], BY_CHANCE) * np.count_nonzero(count), 1.0)
+    for axis in range(3):
+        mean = ratios[:, axis] / np.maximum(count, 1)
+        # The highest peak among what stands out: what is around it is known by octaves only.
+        best = int(np.argmax(np.where(chance[:, axis] < SIGNIFICANT, plain[:, axis] / np.maximum(count, 1), -1.0)))
+        if chance[best, axis] < SIGNIFICANT:
+            yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])), float(chance[best, axis]),
+                       float(hits[best, axis] / count[best]), grid[count > 0], mean[count > 0])
+
+
+def _powers(rest, size, inside):
+    """Return (power, power around it by octaves, both shape (n, 3), which frequencies have enough around them)."""
+    window = np.hanning(len(rest))
+    power = np.abs(np.fft.rfft(detrend(rest, axis=0) * window[:, None], size, axis=0))**2 / (window**2).sum()
+    around, inside = np.ones_like(power), inside.copy()
+    octave = np.zeros(len(power), int)
+    octave[1:] = np.log2(np.arange(1, len(power))).astype(int)
+    for number in range(octave.max() + 1):
+        rows = inside & (octave == number)
+        if rows.sum() < 8:
+            inside[rows] = False
+        else:
+            around[rows] = np.maximum(np.median(power[rows], axis=0) / np.log(2), 1e-300)
+    return power, around, inside

@@ -1,0 +1,55 @@
+"""Tones in the rest: what they are fixed to, and what is none."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.diagnosis.beyond.spectrum import find_tones, of_stretches
+from imu_calibration.report.spectrum_figure import draw_tones
+from imu_calibration.selection.investigation import investigate
+
+from worlds.hiding import record
+from worlds.physics_beyond import Machine
+
+STEP = 0.01
+
+
+def stretches(amplitudes, frequency=23.7, noise=1.0):
+    """Return stretches of noise in which axis y carries a tone of each amplitude, in a phase of its own."""
+    rng, time = np.random.default_rng(3), STEP * np.arange(400)
+    return [(noise * rng.normal(size=(400, 3)) + np.outer(size * np.sin(2 * np.pi * frequency * time + k), [0, 1, 0]), STEP, 45.0)
+            for k, size in enumerate(amplitudes)]
+
+
+def test_a_tone_is_found_where_it_is_with_its_amplitude():
+    tone, = of_stretches('gyroscope', stretches([0.8] * 30), None)
+    assert tone.axis == 'y' and tone.frequency == pytest.approx(23.7, abs=0.11) and tone.amplitude == pytest.approx(0.8, rel=0.1)
+    assert tone.p_value < 1e-20 and tone.share > 0.9
+
+
+@pytest.mark.parametrize('amplitudes', [[0.0] * 40, [30.0] * 5 + [0.0] * 35, [0.8] * 4])
+def test_noise_what_some_motions_do_and_too_few_stretches_are_no_tone(amplitudes):
+    """A large line in an eighth of the stretches is that of their motion; four stretches are few."""
+    assert not [tone for tone in of_stretches('gyroscope', stretches(amplitudes), None) if tone.share <= 0.5 or tone.p_value * 3 < 1e-4]
+
+
+def test_noise_that_is_not_white_is_no_tone():
+    rng = np.random.default_rng(1)
+    walks = [(np.cumsum(rng.normal(size=(600, 3)), axis=0), STEP, 45.0) for _ in range(40)]
+    assert not list(of_stretches('gyroscope', walks, None))
+
+
+def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
+    recording = record(5, None, 'realistic', through_bag=False, cause=Machine())
+    found = investigate(recording.windows, recording.table, recording.model)
+    tones = find_tones(found, recording.table)
+    (hum,), (teeth,) = tones['accelerometer'], tones['gyroscope']
+    assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(Machine.hum_hz, abs=0.1)
+    assert hum.amplitude == pytest.approx(9.8e-3, rel=0.1) and '23.7 Hz on axis z' in hum.text
+    assert (teeth.joint, teeth.axis) == ('outer', 'x') and teeth.frequency == pytest.approx(Machine.teeth, abs=0.2)
+    assert 'times per turn of outer on axis x' in teeth.text and teeth.to_mapping()['joint'] == 'outer'
+
+    class Rest:
+        tones = (teeth, hum)
+    assert 'Spectrum of what stays unexplained in the gyroscope' in draw_tones('gyroscope', Rest)
+    Rest.tones = ()
+    assert draw_tones('gyroscope', Rest) == ''
