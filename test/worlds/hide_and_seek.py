@@ -1,9 +1,9 @@
 """
 Hide and seek: effects are hidden in sessions made by physics, and `diagnose` has to find them.
 
-Run as ``python test/hide_and_seek.py`` (or ``make hide-and-seek``): about an hour on two free cores. Prints a confusion matrix and the
-figures and draws them into docs/. ``--seeds 3``, ``--minutes 20``, ``--fast`` and ``--parts effects,none`` run less; what was run stands
-beside every figure.
+Run as ``python test/worlds/hide_and_seek.py`` (or ``make hide-and-seek``): some hours on two free cores. Prints a confusion matrix and the
+figures, draws them into docs/, and lists the sessions of which the record in the repository tells another thing. ``--seeds 3``, ``--minutes 20``,
+``--fast`` and ``--parts effects,none`` run less, and draw into out/; what was run stands beside every figure.
 """
 
 import argparse
@@ -25,14 +25,19 @@ from imu_calibration.selection.explained_share import sensors_of  # noqa: E402
 from imu_calibration.selection.gain import heldout_gain  # noqa: E402
 from imu_calibration.selection.investigation import investigate  # noqa: E402
 
+from worlds import hide_and_seek_record as record_kept  # noqa: E402
+from worlds.beyond_catalogue import rows_of_seed  # noqa: E402
 from worlds.hide_and_seek_figures import write_figures  # noqa: E402
 from worlds.hide_and_seek_report import report  # noqa: E402
 from worlds.hiding import Sizes, all_effects, options_of, record  # noqa: E402
+from worlds.physics_beyond import KINDS  # noqa: E402
 from worlds.physics_draw import OUTSIDE  # noqa: E402
 
 FIRST_SEED = 7000
 """Seeds from here on were never used while the search was developed."""
-PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power')
+PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power', 'beyond', 'grades')
+GRADES = ('consumer', 'tactical', 'navigation')
+"""Grades of the sensor beside the industrial one of all other parts."""
 DEG = np.pi / 180
 TRAPS = {
     'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0}, 'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG},
@@ -81,16 +86,16 @@ def oracle(recording, effect):
     return pair[0].heldout_rms_after / pair[1].heldout_rms_after if alike else None
 
 
-def effects_of_seed(seed, noise, effects, factor=5.0, profile='random', table='three_axis', part='effects'):
+def effects_of_seed(seed, noise, effects, factor=5.0, profile='random', table='three_axis', part='effects', **options):
     """Hide each effect in one session; the session that hides nothing gives the sizes."""
-    options = {'profile': profile, 'table': table}
+    labels, options = dict(options), {'profile': profile, 'table': table, **options}
     empty = record(seed, None, noise, **options)
     sizes = Sizes(empty)
     rows = []
     for effect in effects:
         hidden = {effect: sizes.hidden(effect, seed, factor)}
-        recording = record(seed, hidden, noise, **options, **options_of(effect))
-        row = seek(recording, hidden, part=part, seed=seed, noise=noise)
+        recording = record(seed, hidden, noise, **options | options_of(effect))
+        row = seek(recording, hidden, part=part, seed=seed, noise=noise, **labels)
         if part == 'effects' and seed % 4 == 0:
             row['oracle_ratio'] = oracle(recording, effect)
         rows.append(row)
@@ -102,9 +107,14 @@ def separating_of_seed(seed, noise, effects):
     return effects_of_seed(seed, noise, effects, profile='separating', table='centrifuge', part='separating')
 
 
-def none_of_seed(seed, noise):
+def none_of_seed(seed, noise, part='none', **options):
     """Hide nothing."""
-    return [seek(record(seed, None, noise), None, part='none', seed=seed, noise=noise)]
+    return [seek(record(seed, None, noise, **options), None, part=part, seed=seed, noise=noise, **options)]
+
+
+def grade_of_seed(seed, noise, effects, grade):
+    """Hide nothing, and each effect, in sensors of another grade."""
+    return [*none_of_seed(seed, noise, part='grades', grade=grade), *effects_of_seed(seed, noise, effects, part='grades', grade=grade)]
 
 
 def outside_of_seed(seed, noise, names):
@@ -158,6 +168,8 @@ def tasks_of(options):
         'pairs': [(pair_of_seed, (seed, 'white')) for seed in range(first + 200, first + 200 + n_seeds)],
         'traps': [(traps_of_seed, (seed, tuple(TRAPS))) for seed in seeds[:max(n_seeds // 5, 1)]],
         'separating': [(separating_of_seed, (seed, 'white', SEPARATED)) for seed in seeds[:max(n_seeds // 5, 1)]],
+        'beyond': [(rows_of_seed, (seed, 'realistic', tuple(KINDS))) for seed in range(first + 2000, first + 2000 + max(n_seeds // 2, 1))],
+        'grades': [(grade_of_seed, (seed, 'realistic', bundle, grade)) for seed in seeds[:max(n_seeds // 10, 1)] for grade in GRADES for bundle in bundles],
         'power': [(power_of_seed, (seed, 'white', POWER, POWER_SIZES)) for seed in range(first + 300, first + 300 + max(n_seeds // 3, 1))],
     }
     placed = [(k / len(some[part]), task) for part in PARTS if part in options.parts for k, task in enumerate(some[part])]
@@ -185,18 +197,26 @@ def main(arguments=None):
     parser.add_argument('--minutes', type=float, help='start nothing new after this time')
     parser.add_argument('--fast', action='store_true', help='one seed, white noise')
     parser.add_argument('--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session')
-    parser.add_argument('--docs', type=Path, default=Path(__file__).resolve().parents[2] / 'docs', help='where pictures go')
+    parser.add_argument('--docs', type=Path, help='where pictures and figures go; default docs/ for a run in full, else beside the record')
     parser.add_argument('--from-record', action='store_true', help='only print and draw what the record holds')
+    parser.add_argument('--keep', action='store_true', help='take the rows into the record of the repository')
     options = parser.parse_args(arguments)
+    part_of_it = options.fast or options.effects or options.minutes or set(options.parts) != set(PARTS)
+    docs = options.docs or (options.record.parent if part_of_it else Path(__file__).resolve().parents[2] / 'docs')
     if options.fast:
         options.seeds, options.noise = 1, ['white']
     rows = []
     if options.from_record:
-        rows = [json.loads(line) for line in options.record.read_text().splitlines()]
+        rows = record_kept.read(options.record)
     else:
         rows = _work(tasks_of(options), options)
-    report(rows, options.docs)
-    write_figures(rows, options.docs)
+    report(rows, docs)
+    write_figures(rows, docs)
+    kept = record_kept.read()
+    changed = record_kept.differences(rows, kept)
+    print(f'\nbeside the record in the repository ({len(kept)} sessions), of {len(rows)} sessions another thing is told of {len(changed)}', *changed, sep='\n  ')
+    if options.keep:
+        record_kept.keep(rows)
     return 0
 
 

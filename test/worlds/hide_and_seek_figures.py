@@ -5,9 +5,10 @@ from datetime import date
 
 import numpy as np
 
-from worlds.hide_and_seek_report import both_found, first_is_right, strictly_first
+from worlds import beyond_catalogue
+from worlds.hide_and_seek_report import both_found, class_sizes, first_is_right, strictly_first
 
-BEGIN, END = '<!-- figures: begin -->', '<!-- figures: end -->'
+MARKS = ('<!-- {}: begin -->', '<!-- {}: end -->')
 
 
 def write_figures(rows, docs):
@@ -16,15 +17,26 @@ def write_figures(rows, docs):
     for row in rows:
         parts.setdefault(row['part'], []).append(row)
     _replace(docs / 'hide-and-seek.md', _table(rows, parts))
+    if 'beyond' in parts:
+        _replace(docs / 'hide-and-seek.md', beyond_table(parts['beyond']), 'beyond')
     _replace(docs.parent / 'README.md', _sentence(rows, parts))
 
 
-def _replace(path, text):
-    if path.exists() and BEGIN in path.read_text():
-        whole = re.sub(f'{BEGIN}.*{END}', lambda match: f'{BEGIN}\n{text}\n{END}', path.read_text(), flags=re.DOTALL)
+def _replace(path, text, what='figures'):
+    begin, end = (mark.format(what) for mark in MARKS)
+    if path.exists() and begin in path.read_text():
+        whole = re.sub(f'{begin}.*{end}', lambda match: f'{begin}\n{text}\n{end}', path.read_text(), flags=re.DOTALL)
         beside = path.with_suffix('.new')
         beside.write_text(whole)
         beside.replace(path)
+
+
+def beyond_table(rows):
+    """Return the table of the worlds beyond the catalogue."""
+    seeds = sorted({row['seed'] for row in rows})
+    lines = [f'{len(rows)} worlds of {len({row["kind"] for row in rows} - {beyond_catalogue.NOTHING})} kinds, {", ".join(sorted({row["noise"] for row in rows}))} noise, '
+             f'seeds {seeds[0]} to {seeds[-1]}, {date.today().isoformat()}:', '', '| what | required | measured |', '| --- | --- | --- |']
+    return '\n'.join(lines + [f'| {what} | {required} | {measured} |' for what, required, measured in beyond_catalogue.figures(rows)])
 
 
 def _count(values):
@@ -40,6 +52,8 @@ def _table(rows, parts):
         lines.append(f'| hidden effect first, or in the class of the first finding, {noise} noise | 97 % | {_count(map(first_is_right, some))} '
                      f'(strictly first {_count(map(strictly_first, some))}; nothing else named {_count(len(row["found"]) == 1 for row in some)}) |')
     if effects:
+        sizes = class_sizes(effects)
+        lines.append(f'| of the right ones, told with mates that the recording cannot tell apart |  | {_count(sizes > 1)} |')
         names = sorted({row['hidden'][0] for row in effects})
         shares = {name: np.mean([first_is_right(row) for row in effects if row['hidden'][0] == name]) for name in names}
         worst = min(names, key=shares.get)
@@ -69,7 +83,7 @@ def _table(rows, parts):
     ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
     if ratios:
         lines.append(f'| held-out rms over that of a fit with the right effect alone, median (1 where nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |')
-    seconds = [row['seconds'] for row in rows if 'seconds' in row]
+    seconds = [row['seconds'] for row in rows if 'seconds' in row] or [np.nan]
     lines.append(f'| processor time per diagnosis, five minutes at 100 Hz | 5 s | median {np.median(seconds):.1f} s, 95 % below '
                  f'{np.quantile(seconds, 0.95):.1f} s, largest {np.max(seconds):.1f} s |')
     return '\n'.join(lines)

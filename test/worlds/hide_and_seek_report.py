@@ -5,6 +5,8 @@ from datetime import date
 
 import numpy as np
 
+from worlds import beyond_catalogue
+
 
 def report(rows, docs):
     """Print the figures of a record and draw its confusion matrix and power curves into `docs`."""
@@ -20,6 +22,9 @@ def report(rows, docs):
     _pairs(parts['pairs'])
     _traps(parts['traps'])
     _oracle(parts['effects'])
+    _classes(parts['effects'])
+    _grades(parts['grades'])
+    _beyond(parts['beyond'])
     _seconds(rows)
     for row in parts['failed']:
         print(f"FAILED {row['what']}: {row['why']}")
@@ -28,6 +33,8 @@ def report(rows, docs):
         draw_confusion(parts['effects'], docs / 'hide_and_seek_confusion.png')
     if parts['power']:
         _power(parts['power'], docs / 'hide_and_seek_power.png')
+    if parts['beyond']:
+        beyond_catalogue.draw(parts['beyond'], docs / 'hide_and_seek_beyond.png')
 
 
 def first_is_right(row):
@@ -129,6 +136,36 @@ def _traps(rows):
         for row in rows:
             if row['found']:
                 print(f"  {row['trap']} seed {row['seed']}: {row['found']}")
+
+
+def class_sizes(rows):
+    """Return how many effects each right first finding is told to be one of, shape (n,)."""
+    return np.array([1 + len(row['classes'][0]) for row in rows if first_is_right(row)])
+
+
+def _classes(rows):
+    sizes = class_sizes(rows)
+    if len(sizes):
+        print(f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two: {_share(sizes[sizes > 1] > 2)}')
+
+
+def _grades(rows):
+    for grade in sorted({row['grade'] for row in rows}):
+        some = [row for row in rows if row['grade'] == grade]
+        hidden, empty = [row for row in some if row['hidden']], [row for row in some if not row['hidden']]
+        print(f'\ngrade {grade}: first finding right or in its class {_share(map(first_is_right, hidden))}; nothing hidden: a finding '
+              f'{_share(bool(row["found"]) for row in empty)}, unexplained {_share(row["unexplained"] for row in empty)}')
+        for row in hidden:
+            if not first_is_right(row):
+                print(f'  {row["hidden"][0]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
+
+
+def _beyond(rows):
+    if rows:
+        print(f'\ncauses outside the catalogue, {len({row["kind"] for row in rows}) - 1} kinds, {len(rows)} worlds')
+        for what, required, measured in beyond_catalogue.figures(rows):
+            print(f'  {what}: {measured} (required: {required})')
+        print(*beyond_catalogue.missed(rows), sep='\n')
 
 
 def _oracle(rows):
