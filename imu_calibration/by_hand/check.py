@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandData, gather_by_hand
+from imu_calibration.by_hand.equations import between_middles
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.by_hand.proof import PER_TURN, TURNS_LEAST
 from imu_calibration.by_hand.workflow import read_by_hand
@@ -71,7 +72,7 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
-        missed = (np.array([[_missed(turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)] for turn in turns])
+        missed = (np.array([[_missed(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)] for turn in turns])
                   for imu in (before, after))
         angles = _entry(*missed, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
@@ -88,8 +89,9 @@ def _entry(before, after, *, unit, seconds):
     return found | {'unit': unit, 'windows': len(before), 'seconds': seconds}
 
 
-def _missed(turn, rates, up):
+def _missed(poses, turn, rates, up):
     """Return the angle between gravity after a turn and where these rates carry it from before, rad."""
     known = np.isfinite(rates).all(axis=1)   # the first readings may lack an angular acceleration
-    carried = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji @ up[turn.first]
+    mat_ji = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji
+    carried = between_middles(poses, turn, mat_ji) @ up[turn.first]
     return np.arctan2(np.linalg.norm(np.cross(carried, up[turn.last])), carried @ up[turn.last])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
-from imu_calibration.by_hand.equations import TurnData, tangent
+from imu_calibration.by_hand.equations import TurnData, between_middles, tangent
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.effects.base import SENSORS, Effect
@@ -157,7 +157,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
                    for e in moving]
         stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
         found = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked))
-        carried = found.mat_ji @ hand.state.up[i]
+        carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
         row = np.zeros((2, space.size + 1))
         row[:, 12:21] = by_psi @ found.by_matrix.reshape(3, 9)

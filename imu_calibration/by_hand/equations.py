@@ -44,6 +44,8 @@ class Poses:
     """Sensor -> noise within the intervals."""
     period: float = 0.0
     """Time from sample to sample, s."""
+    half_turn: np.ndarray | None = None
+    """By how much the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +134,7 @@ def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequenc
     across = tangent(state.up)
     rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
     for key, turn in enumerate(turns):
-        rows.append(_gravity_turn_rows(model, state, turn, key, memory, across) if turn.rotation is None
+        rows.append(_gravity_turn_rows(model, state, turn, key, memory, across, poses) if turn.rotation is None
                     else _known_turn_rows(model, state, turn))
     return System(*(np.concatenate(parts) for parts in zip(*rows)))
 
@@ -192,16 +194,24 @@ def _integrated(model, state, data, bias, key, memory):
     return turn.mat_ji, turn
 
 
+def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndarray:
+    """Return the matrix of a turn, (3, 3), from the middle of the pose before it to that of the one after."""
+    if poses.half_turn is None:
+        return mat_ji
+    return small_rotation(-poses.half_turn[turn.last]) @ mat_ji @ small_rotation(-poses.half_turn[turn.first])
+
+
 def turned(model: HandModel, values: np.ndarray, data: TurnData) -> np.ndarray:
     """Return the matrix that carries directions from the beginning to the end of a turn, as these parameters integrate it, shape (3, 3)."""
     bias, matrix = values[GYRO_BIAS], unpack(values)[3]
     return integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)).mat_ji
 
 
-def _gravity_turn_rows(model, state, data, key, memory, across):
-    """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows."""
+def _gravity_turn_rows(model, state, data, key, memory, across, poses):
+    """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows, from middle to middle."""
     count, i, j = len(state.up), data.first, data.last
     mat_ji, turn = _integrated(model, state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    mat_ji = between_middles(poses, data, mat_ji)
     carried = mat_ji @ state.up[i]
     across_i, across_j = across[i], across[j]
     by_psi = across_j.T @ skew(carried)

@@ -9,6 +9,9 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.samples import ImuSamples
 
+CREEPS = 3.0
+"""Mean square of the slopes of forces across gravity, over what noise gives them, from which on poses creep."""
+
 
 def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None) -> Poses:
     """
@@ -25,9 +28,27 @@ def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperatur
     sems = [np.sqrt(noise[sensor].mean_variance(kinds, count)) for sensor in SENSORS]
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
+    length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
+    creep = _creep(parts['accelerometer'], length, noise['accelerometer'])
     warm = None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
-    return Poses(means[0], means[1], sems[0], sems[1], start=start, stop=stop, time=time, temperature_c=warm, noise=noise,
-                 period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+    return Poses(means[0], means[1] - creep, sems[0], sems[1], start=start, stop=stop, time=time, temperature_c=warm, noise=noise,
+                 half_turn=0.5 * length[:, None] * creep, period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+
+
+def _creep(forces, length, noise):
+    """
+    Return the rates at which the attitude creeps in each pose, as far as gravity shows them, rad/s, shape (k, 3).
+
+    ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses together are no more than noise.
+    """
+    rates, excess = np.zeros((len(forces), 3)), 0.0
+    for pose, (force, seconds) in enumerate(zip(forces, length)):
+        since = np.linspace(-0.5, 0.5, len(force)) * seconds
+        slope, up = since @ force / (since @ since), force.mean(axis=0)
+        rates[pose] = np.cross(slope, up) / (up @ up)
+        across = np.cross(up, rates[pose])
+        excess += across @ across * (since @ since) / np.mean(noise.low_variance)
+    return rates if excess > CREEPS * 2 * len(forces) else np.zeros_like(rates)
 
 
 def noise_statistics(poses: Poses) -> dict:

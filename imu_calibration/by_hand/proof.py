@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
-from imu_calibration.by_hand.equations import COMPONENTS, TurnData, build_system, turned
+from imu_calibration.by_hand.equations import COMPONENTS, TurnData, between_middles, build_system, turned
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX
 from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.by_hand.poses import distinct_attitudes
@@ -102,6 +102,6 @@ def _missed(model, values, poses, turns, gyroscope):
         mixed[part] = gyroscope[part]
     true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
-    carried = np.array([turned(model, mixed, turn) @ up[turn.first] for turn in turns]).reshape(-1, 3)
+    carried = np.array([between_middles(poses, turn, turned(model, mixed, turn)) @ up[turn.first] for turn in turns]).reshape(-1, 3)
     last = up[[turn.last for turn in turns]].reshape(-1, 3)
     return np.arctan2(np.linalg.norm(np.cross(carried, last), axis=1), (carried * last).sum(axis=1))
