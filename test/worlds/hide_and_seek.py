@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from itertools import combinations
 from pathlib import Path
 
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
@@ -29,13 +30,13 @@ from worlds import hide_and_seek_record as record_kept  # noqa: E402
 from worlds.beyond_catalogue import rows_of_seed  # noqa: E402
 from worlds.hide_and_seek_figures import write_figures  # noqa: E402
 from worlds.hide_and_seek_report import report  # noqa: E402
-from worlds.hiding import Sizes, all_effects, options_of, record  # noqa: E402
+from worlds.hiding import NOT_SIZED, Sizes, all_effects, options_of, record  # noqa: E402
 from worlds.physics_beyond import KINDS  # noqa: E402
 from worlds.physics_draw import OUTSIDE  # noqa: E402
 
 FIRST_SEED = 7000
 """Seeds from here on were never used while the search was developed."""
-PARTS = ('effects', 'none', 'outside', 'pairs', 'traps', 'separating', 'power', 'beyond', 'grades')
+PARTS = ('effects', 'none', 'outside', 'pairs', 'sizes', 'traps', 'separating', 'power', 'beyond', 'grades')
 GRADES = ('consumer', 'tactical', 'navigation')
 """Grades of the sensor beside the industrial one of all other parts."""
 DEG = np.pi / 180
@@ -52,6 +53,8 @@ SEPARATED = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'accel_s
 """Effects with near relatives, sought again in sessions made to separate them."""
 POWER = ('accel_quadratic', 'gyro_g_sensitivity', 'time_offset', 'gyro_thermal_bias', 'table_tilt')
 POWER_SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+SIZES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Times the smallest detectable size, with sizes that are known of no instrument."""
 
 
 def seek(recording, hidden, **labels):
@@ -59,7 +62,7 @@ def seek(recording, hidden, **labels):
     start = time.process_time()
     diagnosis = diagnose(recording.windows, recording.table, recording.model)
     row = {**labels, 'hidden': sorted(hidden or ()), 'seconds': time.process_time() - start,
-           'found': [f.effect for f in diagnosis.findings], 'classes': [list(f.indistinguishable_from) for f in diagnosis.findings],
+           'found': [f.effect for f in diagnosis.findings], 'implausible': [f.implausible for f in diagnosis.findings], 'classes': [list(f.indistinguishable_from) for f in diagnosis.findings],
            'unexplained': any(rest.significant for rest in diagnosis.unexplained.values()), 'errors_in_sd': {}}
     for finding in diagnosis.findings:
         if finding.effect in recording.truth and finding.effect in (hidden or ()):
@@ -122,14 +125,18 @@ def outside_of_seed(seed, noise, names):
     return [seek(record(seed, {name: None}, noise), {name: None}, part='outside', seed=seed, noise=noise) for name in names]
 
 
-def pair_of_seed(seed, noise):
-    """Hide two effects at once."""
-    rng = np.random.default_rng(seed)
-    names = [name for name in all_effects() if name != 'earth_rate']
-    first, second = (str(name) for name in rng.choice(names, 2, replace=False))
-    sizes = Sizes(record(seed, None, noise))
-    hidden = {name: sizes.hidden(name, seed, 5.0) for name in (first, second)}
-    return [seek(record(seed, hidden, noise), hidden, part='pairs', seed=seed, noise=noise)]
+def pairs_of_seed(seed, noise, pairs):
+    """Hide two effects at once, each pair in one session."""
+    sizes, rows = Sizes(record(seed, None, noise)), []
+    for pair in pairs:
+        hidden = {name: sizes.hidden(name, seed, 5.0) for name in pair}
+        rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part='pairs', seed=seed, noise=noise, beside=sizes.beside(hidden)))
+    return rows
+
+
+def all_pairs(effects):
+    """Return all pairs of the effects whose size can be chosen."""
+    return list(combinations([name for name in effects if name not in NOT_SIZED], 2))
 
 
 def traps_of_seed(seed, names):
@@ -141,14 +148,14 @@ def traps_of_seed(seed, names):
     return rows
 
 
-def power_of_seed(seed, noise, effects, factors):
-    """Hide effects around the smallest detectable size."""
+def sizes_of_seed(seed, noise, effects, factors, part='sizes'):
+    """Hide effects at several times the smallest detectable size; those of part 'power' are around it."""
     sizes = Sizes(record(seed, None, noise))
     rows = []
-    for effect in effects:
+    for effect in sorted(set(effects) - NOT_SIZED):
         for factor in factors:
             hidden = {effect: sizes.hidden(effect, seed, factor)}
-            rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part='power', factor=factor, seed=seed, noise=noise))
+            rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part=part, factor=factor, seed=seed, noise=noise))
     return rows
 
 
@@ -165,15 +172,21 @@ def tasks_of(options):
         'effects': [(effects_of_seed, (seed, noise, bundle)) for seed in seeds for noise in options.noise for bundle in bundles],
         'none': [(none_of_seed, (seed, noise)) for seed in range(first + 100, first + 100 + 3 * n_seeds) for noise in options.noise],
         'outside': [(outside_of_seed, (seed, 'realistic', tuple(OUTSIDE))) for seed in seeds[:max(n_seeds // 2, 1)]],
-        'pairs': [(pair_of_seed, (seed, 'white')) for seed in range(first + 200, first + 200 + n_seeds)],
+        'pairs': [(pairs_of_seed, (first + 200 + k, 'realistic', pairs)) for k, pairs in enumerate(_dealt(all_pairs(names), max(n_seeds // 2, 1)))],
+        'sizes': [(sizes_of_seed, (seed, 'realistic', bundle, SIZES)) for seed in range(first + 400, first + 400 + max(n_seeds // 5, 1)) for bundle in bundles],
         'traps': [(traps_of_seed, (seed, tuple(TRAPS))) for seed in seeds[:max(n_seeds // 5, 1)]],
         'separating': [(separating_of_seed, (seed, 'white', SEPARATED)) for seed in seeds[:max(n_seeds // 5, 1)]],
         'beyond': [(rows_of_seed, (seed, 'realistic', tuple(KINDS))) for seed in range(first + 2000, first + 2000 + max(n_seeds // 2, 1))],
         'grades': [(grade_of_seed, (seed, 'realistic', bundle, grade)) for seed in seeds[:max(n_seeds // 10, 1)] for grade in GRADES for bundle in bundles],
-        'power': [(power_of_seed, (seed, 'white', POWER, POWER_SIZES)) for seed in range(first + 300, first + 300 + max(n_seeds // 3, 1))],
+        'power': [(sizes_of_seed, (seed, 'white', POWER, POWER_SIZES, 'power')) for seed in range(first + 300, first + 300 + max(n_seeds // 3, 1))],
     }
     placed = [(k / len(some[part]), task) for part in PARTS if part in options.parts for k, task in enumerate(some[part])]
     return [task for _, task in sorted(placed, key=lambda pair: pair[0])]
+
+
+def _dealt(things, hands):
+    """Return things dealt out to hands in turn."""
+    return [tuple(things[k::hands]) for k in range(min(hands, len(things)))]
 
 
 def run(task):

@@ -6,7 +6,8 @@ from datetime import date
 import numpy as np
 
 from worlds import beyond_catalogue
-from worlds.hide_and_seek_report import both_found, class_sizes, first_is_right, strictly_first
+from worlds.hide_and_seek_report import class_sizes, first_is_right, strictly_first
+from worlds.hide_and_seek_sections import both_found, separable, wrong_names
 
 MARKS = ('<!-- {}: begin -->', '<!-- {}: end -->')
 
@@ -76,8 +77,13 @@ def _table(rows, parts):
     if outside:
         lines.append(f'| cause outside the catalogue: the rest is significant | 95 % | {_count(row["unexplained"] for row in outside)} |')
         lines.append(f'| cause outside the catalogue: nothing named | 80 % | {_count(not row["found"] for row in outside)} |')
-    if 'pairs' in parts:
-        lines.append(f'| two effects at once: both found | 85 % | {_count(map(both_found, parts["pairs"]))} |')
+    pairs = [row for row in parts.get('pairs', []) if separable(row)]
+    if pairs:
+        lines.append(f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these sessions cannot separate: both named | 90 % | {_count(map(both_found, pairs))} |')
+        lines.append(f'| the same: a wrong name | 2 % | {_count(bool(wrong_names(row)) for row in pairs)} |')
+    for factor in sorted({row['factor'] for row in parts.get('sizes', []) if row['factor'] > 5}):
+        some = [row for row in parts['sizes'] if row['factor'] == factor]
+        lines.append(f'| {factor:g} times the smallest detectable size: first right | 95 % | {_count(map(first_is_right, some))} |')
     if 'traps' in parts:
         lines.append(f'| traps that give a finding | none | {_count(bool(row["found"]) for row in parts["traps"])} |')
     ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]

@@ -6,6 +6,7 @@ from datetime import date
 import numpy as np
 
 from worlds import beyond_catalogue
+from worlds.hide_and_seek_sections import print_pairs, print_sizes
 
 
 def report(rows, docs):
@@ -19,7 +20,8 @@ def report(rows, docs):
     _separating(parts['separating'])
     _nothing(parts['none'], 'nothing hidden')
     _outside(parts['outside'])
-    _pairs(parts['pairs'])
+    print_pairs(parts['pairs'])
+    print_sizes(parts['sizes'])
     _traps(parts['traps'])
     _oracle(parts['effects'])
     _classes(parts['effects'])
@@ -114,20 +116,6 @@ def _outside(rows):
         some = [row for row in rows if row['hidden'][0] == name]
         print(f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named '
               f'{_share(not row["found"] for row in some)} {[row["found"] for row in some if row["found"]]}')
-
-
-def both_found(row):
-    """Return whether each hidden effect is a finding or in the class of one."""
-    known = [set([found] + mates) for found, mates in zip(row['found'], row['classes'])]
-    return all(any(name in members for members in known) for name in row['hidden'])
-
-
-def _pairs(rows):
-    if rows:
-        print(f'\npairs: both found in {_share(map(both_found, rows))}')
-        for row in rows:
-            if not both_found(row):
-                print(f"  {row['hidden']}: {row['found']} {row['classes']}")
 
 
 def _traps(rows):
