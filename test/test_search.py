@@ -1,5 +1,6 @@
 """The guards of the search, each in a case in which it alone stands between the tool and a false claim."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,12 +8,13 @@ import pytest
 
 from imu_calibration.diagnosis import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
 from imu_calibration.selection.explained_share import Explained, pruned
-from imu_calibration.selection.noise_beside_effects import _needed_smooth, natural_processes
+from imu_calibration.selection.noise_beside_effects import _needed_smooth, natural_processes, plausible_processes
 from imu_calibration.selection.normal_matrices import white_means
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import LEAST_GAIN, Search
@@ -180,6 +182,26 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
 def test_every_bias_moves_by_half_the_white_noise_of_a_second():
     (process,) = natural_processes(NoiseModel(np.full(3, 0.04), np.ones(3)), 0.01)
     assert process.sd == pytest.approx(0.5 * np.sqrt(0.04 * 0.01)) and process.time == 100.0
+
+
+def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
+    """Natural is 0.01; the found one in its own time, up to three times as much, offsets of windows never."""
+    for found, most in ((0.005, 0.01), (0.02, 0.02), (0.5, 0.03)):
+        noise = NoiseModel(np.full(3, 0.04), np.ones(3), 0.2, (BiasProcess(max(found, 0.01), 15.0),))
+        (process,) = plausible_processes(noise, 0.01, sensor='gyroscope')
+        assert process.sd == pytest.approx(most) and process.time == 15.0
+        assert noise.at_rest_only(process).offset_sd == 0.0
+    measured = replace(noise, known=(BiasProcess(1e-4, 40.0),))
+    assert plausible_processes(measured, 0.01, sensor='gyroscope') == measured.known
+    quiet = NoiseModel(np.full(3, 4e-8), np.ones(3), bias_processes=(BiasProcess(2e-4, 15.0),))
+    assert plausible_processes(quiet, 0.01, sensor='accelerometer')[0].sd == 2e-4
+
+
+def test_a_wander_far_beyond_the_natural_one_has_its_price():
+    """Two units of likelihood less for eight times the natural size are a drift beside a natural wander, not a wander."""
+    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used, restricted: 100.0 - 2.0 * (shape[1] == 8.0 and shape[2] == 100.0))
+    assert BiasProcessSearch(likelihood, 1.0).best([], True) == ((0.0, 1.0, 100.0), 100.0)
+    assert BiasProcessSearch(likelihood, 4.0).best([], True)[0] == (0.0, 8.0, 100.0)
 
 
 def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():

@@ -2,12 +2,16 @@
 
 from typing import Callable, Sequence
 
+import numpy as np
+
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 
-TIMES = (100.0, 300.0)
-"""Correlation times that are tried, s."""
+TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0)
+"""Correlation times that are tried, s; that of the natural process first."""
 NATURAL = 0.5
 """Every bias is taken to move by at least this many times the white noise of one second, with the first of these correlation times."""
+SPREAD = 0.8
+"""Standard deviation of the logarithm of how much more than naturally biases move: what is far beyond it is hardly a wander."""
 RATIOS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 """Standard deviations that are tried, in units of the typical noise of a window mean."""
 
@@ -30,7 +34,7 @@ class BiasProcessSearch:
     def best(self, used: Sequence[int], restricted: bool = True) -> tuple[tuple, float]:
         """Return (shape, loss) of the best noise beside the parameters `used`, standard deviations in units of the typical noise."""
         def loss(shape):
-            return self.likelihood.loss(shape, used, restricted)
+            return self.likelihood.loss(shape, used, restricted) + self.price(shape[1])
 
         offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
         shapes = [(offset, self.least, TIMES[0])]
@@ -42,11 +46,15 @@ class BiasProcessSearch:
         shape = min(shapes, key=loss)
         return shape, loss(shape)
 
+    def price(self, bias: float) -> float:
+        """Return minus twice the log of what is believed of a standard deviation, beside that of the natural one."""
+        return (np.log(max(bias / self.least, 1.0)) / SPREAD)**2 if self.least else 0.0
+
     def polished(self, shape: tuple, used: Sequence[int]) -> dict:
         """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
         offset, bias, time = shape
         offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
-        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used), bias), self.least)
+        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used) + self.price(x), bias), self.least)
         unit = self.likelihood.typical
         return {'offset_sd': offset * unit, 'bias_processes': self.likelihood.processes(bias * unit, time)}
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import WindowEvidence
-from imu_calibration.selection.noise_beside_effects import natural_processes
+from imu_calibration.selection.noise_beside_effects import plausible_processes
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
@@ -22,7 +22,7 @@ class Explained:
     """
     What noise alone leaves, and what the chosen effects leave, in held-out windows.
 
-    Noise alone has no offsets of windows, and the bias moves as every bias does.
+    Noise alone has no offsets of windows, and the bias moves as it was found to, as far as biases do.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Explained:
 
     def __init__(self, evidence: WindowEvidence, search: Search):
         self.search, recording = search, evidence.space.recording
-        noise = {s: own.at_rest_only(*natural_processes(own, recording.period)) for s, own in evidence.noise.items()}
+        noise = {s: own.at_rest_only(*plausible_processes(own, recording.period, sensor=s)) for s, own in evidence.noise.items()}
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold)
         self.n_means = 3.0 * len(recording.windows)
         self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()

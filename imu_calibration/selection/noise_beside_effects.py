@@ -13,8 +13,12 @@ from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasPr
 from imu_calibration.selection.normal_matrices import normal_matrix, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
-SMOOTH_PENALTY = 7.0
+SMOOTH_PENALTY = 10.0
 """Fall of minus twice the log likelihood per parameter that an effect smooth in time must win over a bias process."""
+PLAUSIBLE = 3.0
+"""A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one."""
+STABLE = {'accelerometer': 3e-4, 'gyroscope': 0.0}
+"""Whatever the white noise, a wander of up to this much passes for noise, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug."""
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
@@ -48,6 +52,15 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
     """Return how a bias moves at least: as is known, else by the white noise of the sensor and the time between samples, s."""
     return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0]),)
+
+
+def plausible_processes(noise: NoiseModel, period: float, *, sensor: str) -> tuple[BiasProcess, ...]:
+    """Return how a bias moves as far as that passes for noise: as was found in the recording, naturally at least, and no more than such biases do."""
+    natural = natural_processes(noise, period)
+    if noise.known or not noise.bias_processes:
+        return natural
+    most = max(PLAUSIBLE * natural[0].sd, STABLE[sensor])
+    return tuple(replace(process, sd=min(process.sd, most)) for process in noise.bias_processes)
 
 
 def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:

@@ -205,7 +205,8 @@ def main(arguments=None):
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
     parser.add_argument('--effects', help='names joined by commas; default all')
     parser.add_argument('--parts', default=','.join(PARTS), type=lambda text: text.split(','))
-    parser.add_argument('--noise', default='white,realistic', type=lambda text: text.split(','))
+    parser.add_argument('--noise', default='white,realistic', type=lambda text: text.split(','),
+                        help="white, realistic and names of worlds.wanders, joined by commas; '@navigation' behind for another grade than industrial")
     parser.add_argument('--processes', type=int, default=2)
     parser.add_argument('--minutes', type=float, help='start nothing new after this time')
     parser.add_argument('--fast', action='store_true', help='one seed, white noise')

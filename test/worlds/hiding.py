@@ -41,7 +41,8 @@ class Recording:
 
 def record(seed, hidden=None, noise='white', through_bag=True, **options):
     """Return the Recording of a session made by physics (`physics.make_session`), written to a bag and read again."""
-    session = physics.make_session(seed, hidden, noise, **options)
+    kind, _, grade = noise.partition('@')
+    session = physics.make_session(seed, hidden, kind, **({'grade': grade} if grade else {}) | options)
     table = Table.from_mapping(session.table)
     gatherer = MotionGatherer(table)
     windows = []

@@ -17,6 +17,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.noise_beside_effects import natural_processes
 
 BLOCK = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
@@ -112,7 +113,9 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
         variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])[place] / count[:, None]
-        found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, floor.bias_processes)
+        # A step, or what heats up, is a wander to a filter that has learnt from it: the place is sought beside what every bias does.
+        processes = natural_processes(floor, attempt.recording.period)
+        found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, processes)
     return found
 
 
