@@ -134,5 +134,5 @@ class Uncertainty:
         """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
         temperature = np.full(1, self._model.temperature_ref_c + dt)
         ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature)
-        rows = [columns_at_point(self._model, sensor, None, motion=None, ref=ref)[0] for sensor in SENSORS]
+        rows = [columns_at_point(self._model, sensor, ref)[0] for sensor in SENSORS]
         return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])

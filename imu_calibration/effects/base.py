@@ -1,6 +1,5 @@
 """What an effect is: one physical cause of sensor output, declared once."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Callable
@@ -188,7 +187,7 @@ class Effect:
         """Return the standard deviations of the prior, shape (size,)."""
         return np.array(np.broadcast_to(np.asarray(self.prior_sd, float), (self.size,)))
 
-    def amplitudes(self, values: Sequence[Any] | np.ndarray) -> np.ndarray:
+    def amplitudes(self, values: Any) -> Any:
         """Return the values without the time constant."""
         return values[:-1] if self.time_constant else values
 

@@ -1,6 +1,6 @@
 """The catalogue of effects: declared once for simulation, calibration, compensation, diagnosis and planning."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -41,11 +41,11 @@ class Catalogue:
         """Travel by what was added."""
         return Catalogue, (self.added,)
 
-    def effects(self, joint_names: tuple[str, str, str] | JointNames = JOINTS) -> dict[tuple[str, str], Effect]:
+    def effects(self, joint_names: Sequence[str] = JOINTS) -> dict[tuple[str, str], Effect]:
         """Return every effect by (sensor, name) for a table with these joints."""
         return _own_effects(JointNames.of(joint_names)) | {effect.key: effect for effect in self.added}
 
-    def find(self, sensor: str, name: str, joint_names: JointNames = JOINTS) -> Effect:
+    def find(self, sensor: str, name: str, joint_names: Sequence[str] = JOINTS) -> Effect:
         """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
@@ -53,7 +53,7 @@ class Catalogue:
             raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
         return effects[sensor, name]
 
-    def owner_of(self, name: str, joint_names: tuple[str, str, str] | JointNames = JOINTS) -> str:
+    def owner_of(self, name: str, joint_names: Sequence[str] = JOINTS) -> str:
         """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:

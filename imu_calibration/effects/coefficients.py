@@ -1,6 +1,8 @@
 """How the values of an effect multiply its columns: callables ``(values, point) -> {group name: (n_columns, 3)}`` that can be sent."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,7 @@ class Amplitudes:
     time_constant: bool = False
     """Whether the last value is a time constant."""
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         own = values[self.effect]
         amplitudes = own[:-1] if self.time_constant else own
@@ -41,9 +43,9 @@ class AlongAxis:
 
     effect: str
     group: str
-    function: object
+    function: Callable
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         return {self.group: self.function(input_axes(values)) * values[self.effect][None, :]}
 
@@ -55,7 +57,7 @@ class Products:
     effect: str
     group: str
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         block = values[self.effect].reshape(3, 3).T
         return {self.group: np.concatenate([np.zeros((3, 3), block.dtype), block])}
@@ -68,7 +70,7 @@ class OfOthers:
     effect: str
     group: str
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         block = np.zeros((3, 3), values[self.effect].dtype)
         block[~np.eye(3, dtype=bool)] = values[self.effect]
@@ -82,7 +84,7 @@ class OfMatrix:
     effect: str
     group: str
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients."""
         matrix = values['matrix'].reshape(3, 3)
         return {self.group: matrix.T if self.effect == 'matrix' else (matrix * values[self.effect][:, None]).T}
@@ -94,7 +96,7 @@ class LeverArms:
 
     effect: str
 
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, float]) -> dict[str, np.ndarray]:
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return the coefficients; one arm stands for three."""
         matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[self.effect].reshape(-1, 3), (3, 3))
         return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, array_function, may_fail, names_in, products, read
+from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, Sum, array_function, may_fail, names_in, products, read
 from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference
 
@@ -64,7 +65,7 @@ class ColumnGroup:
     def _places(self):
         return [(name, field, (slice(None), *index)) for name in sorted(self.names) for field, *index in [PLACES[name]] if field]
 
-    def columns(self, ref: Reference, point: dict[str, float]) -> np.ndarray:
+    def columns(self, ref: Reference, point: dict[str, Any]) -> np.ndarray:
         """
         Return the columns, shape (n, width).
 
@@ -99,6 +100,6 @@ class ColumnGroup:
                              'passes through zero, and take no root or logarithm of what may be negative')
         return result
 
-    def products(self, known: dict[str, dict[tuple[str], float]]) -> list[dict[tuple[str, ...], float]]:
+    def products(self, known: dict[str, Sum]) -> list[Sum]:
         """Return each column as a sum of products (`expressions.products`)."""
         return [products(tree, known) for tree in self._trees]

@@ -14,7 +14,7 @@ from imu_calibration.reference.table import Table
 
 
 def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
-                     values: np.ndarray | None = None) -> Reference:
+                     values: dict[str, np.ndarray] | None = None) -> Reference:
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -56,15 +56,18 @@ class References:
     """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
 
     def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
-        self.model, self.table, self.motion, self.temperature_c, self._known = model, table, motion, temperature_c, {}
+        self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
+        self._known: dict[tuple, Reference] = {}
 
     def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None) -> Reference:
         """Return the reference of `sensor`, with other values for one effect where given."""
         acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
-        moved = effect is not None and np.any(values != self.model.point_of(effect))
-        key = (acting, *((effect.name, *values) if moved else ()))
+        change, moved = None, ()
+        if effect is not None and values is not None:
+            change = {effect.name: values}
+            moved = (effect.name, *values) if np.any(values != self.model.point_of(effect)) else ()
+        key = (acting, *moved)
         if key not in self._known:
-            change = None if effect is None else {effect.name: values}
             self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
                                                 values=change)
         return self._known[key]
@@ -129,9 +132,7 @@ def _steps(effect, at, forward):
         yield at + step, below, (at + step - below)[index]
 
 
-def columns_at_point(model: SensorModel, sensor: str, table: Table | None, *, motion: JointMotion | None,
-                     temperature_c: np.ndarray | None = None, ref: Reference | None = None) -> np.ndarray:
+def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndarray:
     """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
-    ref = warped_reference(model, sensor, table, motion=motion, temperature_c=temperature_c) if ref is None else ref
     layout = model.layout(sensor)
     return np.concatenate([group.columns(ref, layout.point) for group in layout.groups.values()], axis=1)

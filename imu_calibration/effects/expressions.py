@@ -9,6 +9,7 @@ import ast
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from imu_calibration.errors import InputError
 
 MOST_JOINTS = 7
 """Joints that a column can speak of."""
-QUANTITIES = {
+QUANTITIES: dict[str, dict[str, tuple]] = {
     'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
     'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
@@ -40,6 +41,10 @@ UNBOUNDED = ('sqrt', 'exp', 'expm1', 'log')
 """Functions without a finite value everywhere."""
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 SIGNS = (ast.UAdd, ast.USub)
+
+
+Sum = dict[tuple[str, ...], float]
+"""Products of factors -> their coefficients."""
 
 
 def read(text: str) -> ast.expr:
@@ -133,7 +138,12 @@ def names_in(tree: ast.expr) -> set[str]:
 def may_fail(tree: ast.expr) -> bool:
     """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
     divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant) for node in ast.walk(tree) if isinstance(node, ast.BinOp))
-    return divides or any(node.func.id in UNBOUNDED for node in ast.walk(tree) if isinstance(node, ast.Call))
+    return divides or any(called(node) in UNBOUNDED for node in ast.walk(tree) if isinstance(node, ast.Call))
+
+
+def called(node: ast.Call) -> str:
+    """Return the name of the function; `read` takes no other calls."""
+    return node.func.id if isinstance(node.func, ast.Name) else ''
 
 
 def array_function(trees: Sequence[ast.expr]) -> Callable:
@@ -153,7 +163,7 @@ def _abs(x):
     return np.where(np.real(x) < 0, -x, x) if np.iscomplexobj(x) else np.abs(x)
 
 
-def products(tree: ast.expr, known: dict[str, dict[tuple[str], float]]) -> dict[tuple[str, ...], float]:
+def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
     """
     Return a column as a sum of products, {factors: coefficient}, factors a sorted tuple of Python expressions in plain floats.
 
@@ -170,7 +180,7 @@ def products(tree: ast.expr, known: dict[str, dict[tuple[str], float]]) -> dict[
     """
     match node := tree:
         case ast.Constant():
-            return {(): float(node.value)}
+            return {(): float(node.value)}   # type: ignore[arg-type]   # `read` takes no others
         case ast.Name():
             if node.id not in known:
                 raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), which is not known there; "
@@ -180,12 +190,19 @@ def products(tree: ast.expr, known: dict[str, dict[tuple[str], float]]) -> dict[
             return scaled(products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0)
         case ast.Call():
             argument = as_text(products(node.args[0], known))
-            inline = node.func.id == 'sign' and argument.isidentifier()   # a call costs more than all the arithmetic
-            return {(f'(({argument} > 0) - ({argument} < 0))' if inline else f'{node.func.id}({argument})',): 1.0}
+            inline = called(node) == 'sign' and argument.isidentifier()   # a call costs more than all the arithmetic
+            return {(f'(({argument} > 0) - ({argument} < 0))' if inline else f'{called(node)}({argument})',): 1.0}
+        case ast.BinOp():
+            return _of_two(node, known)
+    raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')   # `read` lets none through
+
+
+def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
+    """Return the sum of products of an operation on two sums."""
     left = products(node.left, known)
     if isinstance(node.op, ast.Pow):
-        result = {(): 1.0}
-        for _ in range(node.right.value):
+        result: Sum = {(): 1.0}
+        for _ in range(cast(ast.Constant, node.right).value):   # type: ignore[arg-type]   # `read` takes whole powers
             result = _multiplied(result, left)
         return result
     right = products(node.right, known)

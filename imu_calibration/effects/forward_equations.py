@@ -1,9 +1,11 @@
 """From parameters to outputs: coefficients of the columns, their derivative, and the prediction of both sensors."""
 
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.effects.columns import columns_at_point
+from imu_calibration.effects.columns import columns_at_point, warped_reference
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.reference_motion import Reference
@@ -62,14 +64,17 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
 
 
 def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
-                  point: dict[str, float]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+                  point: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return {group: coefficients (w, 3)} of one effect and {group: derivative by its own values (w, 3, size)}, by complex steps."""
-    found = effect.coefficients(of_sensor, point)
+    coefficients = effect.coefficients
+    if coefficients is None:
+        raise ValueError(f'{effect.name} has no coefficients')
+    found = coefficients(of_sensor, point)
     slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
     for k in range(effect.size):
         moved = of_sensor[effect.name].astype(complex)
         moved[k] += 1e-30j
-        for group, block in effect.coefficients({**of_sensor, effect.name: moved}, point).items():
+        for group, block in coefficients({**of_sensor, effect.name: moved}, point).items():
             slopes[group][..., k] = np.imag(block) / 1e-30
     return found, slopes
 
@@ -84,10 +89,10 @@ def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: Joi
     exact = model.at(values)
     outputs = []
     for sensor in SENSORS:
-        output = columns_at_point(exact, sensor, table, motion=motion, temperature_c=temperature_c) @ coefficients_at_point(exact, sensor,
-                                                                                                                            values)
+        ref = warped_reference(exact, sensor, table, motion=motion, temperature_c=temperature_c)
+        output = columns_at_point(exact, sensor, ref) @ coefficients_at_point(exact, sensor, values)
         outputs.append(clip(exact, sensor, values, output=output))
-    return tuple(outputs)
+    return outputs[0], outputs[1]
 
 
 def coefficients_at_point(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
@@ -112,4 +117,4 @@ def sensor_output(model: SensorModel, sensor: str, values: np.ndarray, *, ref: R
         True specific force, rate and angular acceleration in the sensor frame.
 
     """
-    return columns_at_point(model, sensor, None, motion=None, ref=ref) @ coefficients_at_point(model, sensor, values)
+    return columns_at_point(model, sensor, ref) @ coefficients_at_point(model, sensor, values)

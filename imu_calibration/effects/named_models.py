@@ -1,11 +1,11 @@
 """Models with a name, the models that are taken when nobody asks, and models as users write them."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.errors import InputError
-from imu_calibration.reference.joint import JointNames
 from imu_calibration.reference.table import Table
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ DEFAULT = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
 """What is asked of a recording on a table when nobody says more."""
 
 
-def parse_effects(sensor: str, text: str, joint_names: JointNames = JOINTS, *, catalogue: Catalogue = CATALOGUE) -> tuple[str, ...]:
+def parse_effects(sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *, catalogue: Catalogue = CATALOGUE) -> tuple[str, ...]:
     """
     Return effect names from a named model or names joined by '+'.
 
@@ -58,8 +58,12 @@ def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     names = table.joint_names
     said = {'axis_non_orthogonality': names.angle_sd and names.angles, 'encoder_zero': names.angle_sd and names.zeros,
             'axis_offset': names.place_sd and names.places}
-    return tuple(name for name in ('table_tilt', *said, 'earth_rate') if said.get(name, True) and (
-        CATALOGUE.find('reference', name).moot is None or CATALOGUE.find('reference', name).moot(table) is None))
+    return tuple(name for name in ('table_tilt', *said, 'earth_rate') if said.get(name, True) and not _is_moot(name, table))
+
+
+def _is_moot(name: str, table: Table) -> bool:
+    moot = CATALOGUE.find('reference', name).moot
+    return moot is not None and moot(table) is not None
 
 
 def with_common_arm(model: 'SensorModel') -> 'SensorModel':

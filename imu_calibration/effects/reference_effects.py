@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def _bent(values, point):
 def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
-    of_table = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True, 'against': ('angle',)}
+    of_table: dict[str, Any] = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True, 'against': ('angle',)}
     return (
         Effect(
             **of_table, name='table_tilt', role=Role.TILT, components=('x', 'y'), shape=(2,),

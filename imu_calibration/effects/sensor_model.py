@@ -47,7 +47,7 @@ class SensorModel:
     """Names of the gyroscope's effects."""
     reference: tuple = ()
     """Names of the effects of table and clock."""
-    joint_names: JointNames = JOINTS
+    joint_names: JointNames = JOINTS   # type: ignore[assignment]   # made one at once
     """Joints of the table; a plain sequence of names is taken for turning joints of which no two neighbours are parallel."""
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
@@ -126,7 +126,7 @@ class SensorModel:
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Return prior values and prior standard deviations, both shape (n_params,)."""
-        return tuple(np.concatenate(parts) for parts in zip(*((e.prior_values(), e.prior_sds()) for e in self.effects)))
+        return np.concatenate([e.prior_values() for e in self.effects]), np.concatenate([e.prior_sds() for e in self.effects])
 
     def start(self) -> np.ndarray:
         """Return the values to start from: the prior's, or the point of the columns."""
@@ -159,7 +159,8 @@ class SensorModel:
 
     def without(self, sensor: str, *names: str) -> 'SensorModel':
         """Return the model without some effects of a sensor."""
-        return replace(self, **{sensor: tuple(known for known in getattr(self, sensor) if known not in names)})
+        left: dict[str, Any] = {sensor: tuple(known for known in getattr(self, sensor) if known not in names)}
+        return replace(self, **left)
 
     def without_arms(self) -> 'SensorModel':
         """Return the model without lever arms."""
@@ -210,7 +211,10 @@ class SensorModel:
 
     def columns_of(self, sensor: str, role: Role) -> slice:
         """Return the slice of the columns that the effect in a place of a sensor's equation multiplies."""
-        return self.layout(sensor).rows[self.find(sensor, role).groups[0].name]
+        effect = self.find(sensor, role)
+        if effect is None:
+            raise KeyError(f'the {sensor} has no {role}')
+        return self.layout(sensor).rows[effect.groups[0].name]
 
     def point_of(self, effect: Effect) -> np.ndarray:
         """Return the values at which `effect`'s columns are taken: its prior's when nothing is known yet."""

@@ -20,9 +20,9 @@ MANY = 100.0
 """Tolerances in the prior's standard deviation, where nobody says more."""
 
 
-def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | None, tolerance: float | str, text: str,
+def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tolerance: float, text: str,
          tolerance_reason: str = '', prior_sd: float | None = None, largest: float | None = None,
-         time_constant: float = 300.0) -> Effect | None:
+         time_constant: float = 300.0) -> Effect:
     """
     Return an effect ``output_i += value_i column``, with one value for each axis.
 
@@ -60,7 +60,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | Non
     """
     if sensor not in SENSORS:
         raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it")
-    numbers = {'tolerance': tolerance, 'prior_sd': prior_sd, 'largest': largest, 'time_constant': time_constant}
+    numbers: dict[str, Any] = {'tolerance': tolerance, 'prior_sd': prior_sd, 'largest': largest, 'time_constant': time_constant}
     for key, value in numbers.items():
         if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf):
             raise InputError(f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it")
@@ -81,7 +81,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str | Non
         del definition['time_constant']
     spread = MANY * tolerance if prior_sd is None else prior_sd
     needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
-    shape = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
+    shape: dict[str, Any] = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
     if settles:
         shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
                  'prior': (0.0, 0.0, 0.0, time_constant), 'prior_sd': (spread, spread, spread, 10 * time_constant / 3)}
