@@ -200,7 +200,7 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
     assert status['accelerometer.matrix.xx'] != 'held' and status['accelerometer.bias.z'] != 'held'
     needs = found.advice[0]['needs']
     assert set(found.advice[0]['parameters']) >= {f'accelerometer.matrix.{n}' for n in ('yx', 'zx', 'zy')}
-    assert needs.startswith('hold it still with') and sum(axis in needs.split(' with ')[1].split(' up')[0] for axis in 'xyz') >= 2
+    assert 'hold it still with' in needs and sum(axis in needs.split(' with ')[1].split(' up')[0] for axis in 'xyz') >= 2
 
 
 def test_turns_about_one_axis_leave_the_others_weak_or_held():
@@ -210,7 +210,8 @@ def test_turns_about_one_axis_leave_the_others_weak_or_held():
     status = dict(zip(found.param_names, found.statuses))
     assert status['gyroscope.matrix.xx'] == 'determined'
     assert status['accelerometer.matrix.xx'] != 'determined'
-    assert 'turn it by 180 deg' in found.advice[-1]['needs']
+    axis = found.advice[-1]['needs'].split(' deg about its ')[1].split(' axis')[0]
+    assert 'y' in axis or 'z' in axis   # a turn about x would show nothing new
 
 
 def test_too_few_attitudes_are_refused_with_their_number():

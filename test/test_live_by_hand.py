@@ -115,7 +115,7 @@ def test_before_any_motion_it_asks_for_attitudes():
 
 
 def test_the_direction_that_is_missing_is_named():
-    """Faces up one after the other: the face that is asked for has not been up."""
+    """Faces up one after the other: those that have not been up are named beside the step of the picture."""
     from scipy.spatial.transform import Rotation
     ups = [FACES[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
     attitudes = [Rotation.align_vectors([[0, 0, 1]], [up])[0] for up in ups]
@@ -124,13 +124,14 @@ def test_the_direction_that_is_missing_is_named():
     for block in blocks(imu):
         live.push(block)
         asked[live.found.attitudes] = live.status(), unseen(live.found)
+        assert f'next: {live.coverage().next.text}' in live.status().message
     assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACES)
     assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACES) - {'+z'}
     assert set(asked[2][1]) == set(FACES) - {'+z', '+x'}
     assert asked[6][1] == []
     status = asked[2][0]
     assert status.values['directions of gravity not seen'].split() == asked[2][1]
-    assert f'hold it still with {asked[2][1][0]} up' in status.message and '2 poses in 2 attitudes, 1 turn' in status.message
+    assert f'faces not seen yet: {", ".join(asked[2][1])}' in status.message and '2 poses in 2 attitudes, 1 turn' in status.message
 
 
 def test_after_a_solution_the_motion_that_helps_most_is_named(session):
@@ -139,7 +140,10 @@ def test_after_a_solution_the_motion_that_helps_most_is_named(session):
     run(live, few)
     live.solve(pending=True)
     status, groups = live.status(), {(g.sensor, g.effect): g for g in live.groups()}
-    assert status.word == 'weak' and 'next: hold it still with' in status.message
+    shown = live.coverage().next
+    assert status.values['next'] == shown.text and shown.up is not None   # the terminal, the status and the picture say one step
+    assert shown.text in {item['needs'] for item in live.result.hand.advice}
+    assert status.word == 'weak' and 'hold it still with' in status.message.split('next: ')[1]
     assert groups['accelerometer', 'matrix'].status != 'determined' and 'hold it still' in groups['accelerometer', 'matrix'].needs
 
 

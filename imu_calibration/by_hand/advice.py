@@ -1,109 +1,197 @@
-"""What to do next when a calibration by hand leaves a parameter weak: the pose or turn that would help most."""
+"""
+Which attitude to hold next, by hand: the one planner behind the plan, the terminal, the status, the picture and what a calibration asks for.
 
-import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+The worth of a step is what it takes off what is missing (the logarithms of standard deviations over tolerances), its price the seconds that it takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imu_calibration.by_hand.model import GYRO_MATRIX, HandModel, unpack
-from imu_calibration.calibration.coverage import DIRECTIONS
-from imu_calibration.effects.base import AXES
-from imu_calibration.reference.reference_motion import skew
+from imu_calibration.by_hand.equations import Poses
+from imu_calibration.by_hand.hand_step import TURNED, HandStep, shortest_turn, turn_rows
+from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
+from imu_calibration.by_hand.options import ByHandSettings
+from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
+from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.base import SENSORS
+
+if TYPE_CHECKING:
+    from imu_calibration.by_hand.calibrate import HandCalibration
+
+TREMBLING, CREEPING = 1.5e-3, 5e-4
+"""m/s^2, rad/s (0.03 deg/s); what noise and a hand that trembles and creeps leave in the means of such a pose, before that is known."""
+MARGIN = 0.85
+"""Of the tolerance, aimed at: the scatter of some twenty poses and turns, which enters every standard deviation, is known to a sixth."""
+MOST_STEPS = 60
+LEAST_GAIN = 1e-3
+"""Poses that take less than this off what is missing do not end; something else must come, such as the gravity."""
+WEIGHTS = (0.0, 1.0)
+"""How much the seconds of a step count where it is chosen: `foretold` tries both."""
+SERVES = 0.5
+"""Share of the best gain per second for one sensor from which the next step of the whole plan is said for it too."""
 
 
 @dataclass(frozen=True, eq=False)
-class HandStep:
-    """A pose or a turn that a person can do."""
+class HandKnowledge:
+    """What is known by hand so far, and what one more pose is expected to be worth."""
 
-    rows: np.ndarray
-    """Equations that it adds, in standard deviations, shape (k, n_params)."""
-    words: str
-    """What to do."""
-    up: np.ndarray
-    """Direction of the sensor that points up, before a turn, unit vector."""
-    turn: str | None = None
-    """Axis of the sensor about which it is turned by half a turn; None: it is held still."""
+    model: HandModel
+    """The parameters."""
+    values: np.ndarray
+    """Their values, or the nominal ones, shape (n,)."""
+    information: np.ndarray
+    """Of the data so far, shape (n, n)."""
+    tolerances: np.ndarray
+    """What is aimed at, shape (n,)."""
+    pose_sd: float
+    """What one pose is good for, m/s^2."""
+    drift_sd: float
+    """The same for the bias of the gyroscope, rad/s."""
+    turn_sd: float
+    """The same for a turn, rad."""
+    up: np.ndarray | None
+    """What is up now, shape (3,); None: nobody knows."""
+
+    def after(self, ups: np.ndarray) -> np.ndarray:
+        """Return the information after going to each of some directions and resting there, shape (k, n, n)."""
+        bias, matrix, *_ = unpack(self.values)
+        forces = bias + self.model.gravity * ups @ matrix.T
+        # temperature and time as at the reference point: one more pose there says nothing of thermal effects
+        count = len(ups)
+        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=np.full(count, self.model.model.temperature_ref_c))[1]
+        rows = self.rows(norms, [turn_rows(self.up, to) for to in ups])
+        return self.information + np.einsum('kri,krj->kij', rows, rows)
+
+    def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray]) -> np.ndarray:
+        """Return what poses say of the parameters, in standard deviations, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        rows = np.zeros((len(norms), 6, self.model.size))
+        rows[:, 0] = norms / self.pose_sd
+        rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
+        rows[:, 4:6, GYRO_MATRIX] = np.array(turns) / self.turn_sd
+        return rows
+
+    def sd(self, information: np.ndarray) -> np.ndarray:
+        """Return the standard deviations with some information; leading axes are kept."""
+        inverse = np.linalg.inv(information + np.diag(1 / self.model.priors**2))
+        return np.sqrt(np.diagonal(inverse, axis1=-2, axis2=-1))
+
+    def missing(self, information: np.ndarray, only: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the `excess` of all or some parameters that stays with some information; leading axes are kept."""
+        return excess(self.sd(information)[..., only], self.tolerances[only])
+
+    def best(self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0) -> tuple[HandStep, np.ndarray, np.ndarray]:
+        """
+        Return (the step that gives most per second, the share of what is missing that each of `DIRECTIONS` would give, the information after the step).
+
+        only : sequence of int, optional
+            Parameters that it is for; all where not given.
+        weight : float
+            Power with which seconds count; 0: not at all.
+
+        """
+        information = self.after(DIRECTIONS)
+        worth = share_gained(float(self.missing(self.information, only)), self.missing(information, only))
+        if self.up is not None:
+            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # it is there already
+        steps = [HandStep(up, *shortest_turn(self.up, up)) if self.up is not None else HandStep(up) for up in DIRECTIONS]
+        place = int(np.argmax(worth / np.array([step.seconds for step in steps])**weight))
+        return steps[place], worth, information[place]
+
+    def then(self, step: HandStep) -> HandKnowledge:
+        """Return what is known after a step."""
+        return replace(self, information=self.after(step.up[None])[0], up=step.up)
 
 
-def missing_motion(model: HandModel, factor: np.ndarray, values: np.ndarray, *, statuses: Sequence[str], tolerances: np.ndarray,
-                   pose_sd: float, turn_sd: float) -> tuple[dict, ...]:
+def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     """
-    Name the standard pose or turn that lowers the worst sd of each sensor most.
+    Return the steps that are still needed: of the plans that count the seconds of each step and that do not, the one that is sooner at its end.
 
-    The declared standard motions (26 directions up; turns of 180 deg about each sensor axis held level, in two attitudes)
-    are added to the equations one at a time and the predicted sd over tolerance is compared.
+    What gives most in each second is not the sooner plan always: it begins with small turns, which leave more to be done.
+    """
+    plans = [_rollout(knowledge, weight) for weight in WEIGHTS]
+    return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
+
+
+def _rollout(knowledge, weight):
+    """Return (the steps, one best after the other, what is missing in the end)."""
+    steps: list[HandStep] = []
+    while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
+        step, worth, _ = knowledge.best(weight=weight)
+        if worth.max() < LEAST_GAIN:
+            break
+        steps.append(step)
+        knowledge = knowledge.then(step)
+    return steps, round(float(knowledge.missing(knowledge.information)), 9)
+
+
+def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
+    """
+    Return {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for each sensor that is not fully determined.
+
+    That is the next step of the whole plan, which the picture shows, where it serves a sensor; else what serves it best.
+    """
+    knowledge, lacking = knowledge_after(hand), {}
+    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.sd, hand.tolerances, strict=True):
+        if status != DETERMINED:
+            lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
+    parts = {sensor: [hand.model.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
+    plan = foretold(knowledge)[:1] if parts else []
+
+    def gain(part, step):
+        return float(knowledge.missing(knowledge.information, part) - knowledge.missing(knowledge.then(step).information, part)) / step.seconds
+    found = []
+    for sensor, part in parts.items():
+        own = knowledge.best(part)[0]
+        best = next((step for step in plan if gain(part, step) >= SERVES * gain(part, own)), own)
+        found.append({'parameters': lacking[sensor], 'needs': best.words})
+    return tuple(found)
+
+
+def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHandSettings, *, noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+                       poses: Poses | None = None) -> HandKnowledge:
+    """
+    Return the HandKnowledge before the first solution: only the poses count, at nominal values and with the scatter of the settings.
 
     Parameters
     ----------
     model : HandModel
-    factor : array, shape (n, n)
-        Weighted equations so far.
-    values : array, shape (n,)
-    statuses : sequence of str
-    tolerances : array, shape (n,)
-    pose_sd, turn_sd : float
-        Accuracy expected of one more pose (m/s^2) and turn (rad).
-
-    Returns
-    -------
-    tuple of dict
-        {'parameters': {name: sd over tolerance}, 'needs': sentence} for each sensor that is not fully determined.
+    tolerances : ndarray, shape (n,)
+    settings : ByHandSettings
+    noise : tuple
+        What the sensors' own noise adds to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
+    poses : Poses, optional
+        Those so far.
 
     """
-    advice = []
-    groups = ((model.index_of('accelerometer'), pose_steps(model, values, pose_sd)),
-              (model.index_of('gyroscope'), turn_steps(model, turn_sd)))
-    for index, candidates in groups:
-        lacking = [k for k in index if statuses[k] != 'determined']
-        if not lacking:
-            continue
-        before = _predicted(factor, model.priors, tolerances)
-        scores = [(_score(_predicted(np.vstack([factor, step.rows]), model.priors, tolerances)[lacking]), step.words) for step in candidates]
-        best = min(scores, key=lambda s: s[0])
-        advice.append({'parameters': {model.param_names[k]: float(before[k]) for k in lacking}, 'needs': best[1]})
-    return tuple(advice)
+    scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
+    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances,
+                              *(float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True)), None)
+    if poses is None:
+        return knowledge
+    ups = ups_of(poses)
+    turns = [turn_rows(start, end) for start, end in zip(ups[:-1], ups[1:], strict=True)]
+    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], [np.zeros((2, 9)), *turns])   # nothing leads to the first pose
+    return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 
 
-def _score(ratio):
-    """Return one number for how bad a set of sd over tolerance is; the excess in each parameter counts, the worst most."""
-    return float(np.sum(np.maximum(ratio, 1.0)**2))
+def knowledge_after(hand: HandCalibration) -> HandKnowledge:
+    """Return the HandKnowledge of a solution: its information, less what its standard deviations have grown by beyond noise."""
+    model, statistics, poses = hand.model, hand.statistics, hand.poses
+    published = [hand.param_names.index(name) for name in model.param_names]
+    expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
+    known = expected < 0.5 * model.priors
+    wider = max(1.0, float(np.max(np.where(known, hand.sd[published] / expected, 0.0))))
+    sds = (np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd']),
+           np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd']), max(statistics['turn_scatter_sd'], 1e-4))
+    return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances[published],
+                         *(float(wider * sd) for sd in sds), ups_of(poses)[-1])
 
 
-def _predicted(rows, priors, tolerances):
-    factor = np.linalg.qr(np.vstack([rows, np.diag(1 / priors)]), mode='r')
-    return np.linalg.norm(np.linalg.inv(factor), axis=1) / tolerances
-
-
-def pose_steps(model: HandModel, values: np.ndarray, sd: float) -> Iterator[HandStep]:
-    """Yield the standard poses, each known to `sd` (m/s^2)."""
-    bias, matrix, *_ = unpack(values)
-    for up in DIRECTIONS:
-        # temperature and time as at the reference point: one more pose there says nothing of thermal effects
-        rows = model.norm_rows(values, (bias + model.gravity * matrix @ up)[None], time=np.zeros(1), temperature_c=np.full(1, model.model.temperature_ref_c))[1]
-        yield HandStep(rows / sd, f'hold it still with {direction_words(up)} up', up)
-
-
-def direction_words(up: np.ndarray) -> str:
-    """Return a standard direction for people: '+x -z'."""
-    return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
-
-
-def turn_steps(model: HandModel, sd: float) -> Iterator[HandStep]:
-    """Yield half turns about each axis held level, gravity first along either of the other two, each known to `sd` (rad)."""
-    for axis, first in itertools.permutations(range(3), 2):
-        about, up = np.eye(3)[axis], np.eye(3)[first]
-        carried = -up  # after half a turn about a level axis
-        across = np.array([about, np.cross(about, up)])
-        rows = np.zeros((2, model.size))
-        rows[:, GYRO_MATRIX] = (across @ skew(carried) @ rotation_slopes(about)).reshape(2, 9)
-        yield HandStep(rows / sd, f'turn it by 180 deg about its {AXES[axis]} axis held level, {AXES[first]} up before the turn, '
-                   'still before and after', up, AXES[axis])
-
-
-def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
-    """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
-    cross = skew(about)
-    # integral over the turn of the rotation still to come, C(angle - t)
-    to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross
-    return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)
+def ups_of(poses: Poses | None) -> np.ndarray:
+    """Return the directions that were up, unit vectors, shape (k, 3)."""
+    return np.zeros((0, 3)) if poses is None else poses.force / np.linalg.norm(poses.force, axis=1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -59,8 +60,6 @@ class HandCalibration:
     """Reference, m/s^2."""
     gauge: dict
     """Conventions of origin and axes."""
-    advice: tuple
-    """({'parameters': {name: sd over tolerance}, 'needs': motion}, ...) for what is not determined."""
     statistics: dict
     """Counts, noise, scatter, chi-square: plain numbers."""
     poses: Poses
@@ -77,6 +76,11 @@ class HandCalibration:
     """`TurnData` that were not left out."""
     model_error: ModelError
     """What the covariance grew by, beyond noise and scatter, in the order of `model`."""
+
+    @cached_property
+    def advice(self) -> tuple[dict, ...]:
+        """({'parameters': {name: sd over tolerance}, 'needs': the next step}, ...) for what is not determined."""
+        return missing_motion(self)
 
     @property
     def sd(self) -> np.ndarray:
@@ -207,9 +211,6 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     used, poses = poses, data.poses   # as they are: what was left out, or moved, is for everybody to see
     goals = model.tolerances(options.tolerances)
     status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
-    pose_sd = float(np.sqrt(np.mean(poses.force_sem**2) + found.scatter.variance[0]))
-    turn_sd = float(np.sqrt(found.scatter.variance[2] + np.mean([t.noise_variance for t in turns]))) if turns else settings.turn_scatter
-    advice = missing_motion(model, found.factor, found.state.values, statuses=status, tolerances=goals, pose_sd=pose_sd, turn_sd=turn_sd)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()}, **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
@@ -217,7 +218,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
     return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
                            tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
-                           np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), advice, statistics, poses, found.state, model,
+                           np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), statistics, poses, found.state, model,
                            found.factor.T @ found.factor, used, turns, found.model_error)
 
 

@@ -1,26 +1,18 @@
-"""Poses and turns of a hand, planned: the same gain per second as on a table, from the equations of a calibration by hand."""
+"""Poses and turns of a hand, planned as a whole by the planner that also says the next one (`advice`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from imu_calibration.by_hand.advice import HandStep, pose_steps, turn_steps
-from imu_calibration.by_hand.model import GYRO_BIAS, HandModel
+from imu_calibration.by_hand.advice import foretold, knowledge_at_first
+from imu_calibration.by_hand.hand_step import HOLD, TURN_RATE, HandStep
+from imu_calibration.by_hand.model import HandModel
+from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.estimation.noise_model import NoiseModel
-
-POSE_SECONDS, TURN_SECONDS = 6.0, 9.0
-"""What a person takes to bring the IMU to a pose and hold it still for three seconds; to turn it, still before and after."""
-STILL = 3.0
-"""Seconds for which a pose is held."""
-LEVEL_SD = 2e-3
-"""How well the direction of gravity closes a turn by hand, rad: what the poses before and after leave."""
-MOST_STEPS = 80
-LEAST_GAIN = 5e-3
-"""A step must lower the sum of logarithms of excess over tolerance by so much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,51 +52,29 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
         Samples per second.
 
     """
-    information = np.diag(1 / model.priors**2)
-    candidates = [(step, seconds, step.rows.T @ step.rows) for step, seconds in _candidates(model, noise, rate)]
-    added = np.array([own for _, _, own in candidates])
-    times = np.array([seconds for _, seconds, _ in candidates])
-    chosen, history, total = [], [_excess(information, tolerances)], 0.0
-    while len(chosen) < MOST_STEPS and history[-1].max() > 1.0:
-        left = np.array([_left(_excess(information + own, tolerances)) for own in added])
-        gain = _left(history[-1]) - left
-        best = int(np.argmax(gain / times))
-        if gain[best] < LEAST_GAIN:
-            break
-        information = information + added[best]
-        chosen.append(candidates[best][0])
-        history.append(_excess(information, tolerances))
-        total += float(times[best])
-    return HandPlan(tuple(chosen), total, model.param_names, history[-1] * tolerances, tolerances, np.array(history))
-
-
-def _candidates(model, noise, rate) -> Iterator[tuple[HandStep, float]]:
-    samples = STILL * rate
-    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / samples + sum(p.sd**2 for p in noise[s].bias_processes)))
+    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / (HOLD * rate) + sum(p.sd**2 for p in noise[s].bias_processes)))
                          for s in ('accelerometer', 'gyroscope'))
-    resting = np.zeros((3, model.size))
-    resting[:, GYRO_BIAS] = np.eye(3) / rate_sd
-    for step in pose_steps(model, model.nominal, force_sd):
-        yield HandStep(np.concatenate([step.rows, resting]), step.words, step.up), POSE_SECONDS
-    angle_sd = float(np.hypot(LEVEL_SD / np.sqrt(2), np.sqrt(noise['gyroscope'].low_variance.mean() * TURN_SECONDS / rate)))
-    for step in turn_steps(model, angle_sd):
-        yield step, TURN_SECONDS
-
-
-def _excess(information, tolerances):
-    return np.sqrt(np.diag(np.linalg.inv(information))) / tolerances
-
-
-def _left(excess):
-    return float(np.maximum(np.log(excess), 0.0).sum())
-
+    turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
+    knowledge = knowledge_at_first(model, tolerances, ByHandSettings(), noise=(force_sd, rate_sd, turn_sd))
+    steps = foretold(knowledge)
+    history = [knowledge.sd(knowledge.information)]
+    for step in steps:
+        knowledge = knowledge.then(step)
+        history.append(knowledge.sd(knowledge.information))
+    return HandPlan(tuple(steps), sum(step.seconds for step in steps), model.param_names, history[-1], tolerances, np.array(history) / tolerances)
 
 
 def hand_plan_to_mapping(plan: HandPlan, provenance: dict[str, Any]) -> dict[str, Any]:
     """Return what plan.yaml holds of a plan by hand: plain data, SI."""
     return {'format': 'imu_calibration/plan/1', 'seconds': round(plan.seconds, 3), 'lower_bound_seconds': None,
-            'motions': [{'kind': 'turn' if step.turn else 'pose', 'text': step.words, 'up': [float(f'{c:.6g}') for c in step.up]}
-                        for step in plan.steps],
+            'motions': [_step(step) for step in plan.steps],
             'parameters': {name: {'sd': float(f'{sd:.6g}'), 'tolerance': float(f'{tolerance:.6g}'), 'met': bool(sd <= tolerance)}
                            for name, sd, tolerance in zip(plan.param_names, plan.sd, plan.tolerances, strict=True)},
             'missing': list(plan.missing), 'provenance': provenance}
+
+
+def _step(step):
+    found = {'kind': 'turn' if step.is_turn else 'pose', 'text': step.words, 'seconds': round(step.seconds, 3), 'up': [float(f'{c:.6g}') for c in step.up]}
+    if step.is_turn:
+        found |= {'turn_axis': [float(f'{c:.6g}') for c in step.axis], 'turn_deg': round(float(np.degrees(step.angle)), 1)}
+    return found

@@ -75,6 +75,7 @@ class LiveByHand:
         if saved is not None:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
+        self._shown: tuple[tuple, Coverage] | None = None
         self.found = NOTHING
         self.result: HandResult | None = None
         self._search(self._store)
@@ -223,11 +224,15 @@ class LiveByHand:
 
     def coverage(self) -> Coverage:
         """Return the Coverage: which attitudes are worth having, where to go next."""
-        return hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
+        known = (self.found, self.result, self.options.gravity)
+        if self._shown is None or any(a is not b for a, b in zip(known, self._shown[0], strict=True)):
+            self._shown = known, hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
+        return self._shown[1]
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
         """Return the SessionStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result.calibration if self.result else None, gravity_unknown=self.options.gravity is None, hints=hints)
+        status = hand_status(self.found, self.result.calibration if self.result else None, gravity_unknown=self.options.gravity is None,
+                             step=self.coverage().next.text, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 

@@ -59,7 +59,7 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
 
 
-def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unknown: bool,
+def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unknown: bool, step: str,
                 hints: dict[str, str] | None = None) -> SessionStatus:
     """
     Return the SessionStatus.
@@ -71,12 +71,14 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
         The last solution.
     gravity_unknown : bool
         Whether the standard gravity stands in for the local one.
+    step : str
+        What to do next in the words of the planner (`advice`), '' where no pose brings anything.
     hints : dict, optional
         As for `errors.with_hint`.
 
     """
     not_seen = unseen(found)
-    word, needs = _needs(found, not_seen, calibration, gravity_unknown, hints or {})
+    word, needs = _needs(found, not_seen, calibration, gravity_unknown=gravity_unknown, step=step, hints=hints or {})
     values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
               **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
               'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
@@ -98,17 +100,16 @@ def unseen(found: Findings) -> list[str]:
     return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
 
 
-def _needs(found, not_seen, calibration, gravity_unknown, hints):
+def _needs(found, not_seen, calibration, *, gravity_unknown, step, hints):
     if found.attitudes < POSES_LEAST or calibration is None:
-        still = f'hold it still with {not_seen[0]} up' if not_seen else 'hold it still in an attitude between two faces'
-        more = f' (not seen yet: {", ".join(not_seen)})' if len(not_seen) > 1 else ''
-        return Progress.WAITING, [f'{still}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
+        more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
+        return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
     lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
     if not lacking:
         return Progress.DETERMINED, []
     if gravity_unknown and set(lacking) <= set(SCALES):
         return Progress.WEAK, [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
-    return Progress.WEAK, list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+    return Progress.WEAK, [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 
 
 def _plural(count, noun):

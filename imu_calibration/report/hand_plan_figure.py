@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.by_hand.advice import HandStep
+from imu_calibration.by_hand.hand_step import HandStep, direction_words
 from imu_calibration.reference.rotations import align
 from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, draw
 
@@ -31,8 +31,7 @@ def _paint(figure, steps, rows):
         axis.set_axis_off()
         if place < len(steps):
             _box(axis, steps[place].up)
-            turn = steps[place].turn
-            axis.set_title(f'{place + 1}' + ('' if turn is None else f': half a turn about {turn}'), fontsize=8, color=INK)
+            axis.set_title(f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK)
             axis.set_aspect('equal')
             axis.set_xlim(-1.7, 1.7)
             axis.set_ylim(-1.5, 1.6)

@@ -42,17 +42,17 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
 def hand_plan_report(plan: HandPlan, model: SensorModel, provenance: dict[str, Any]) -> str:
     """Return the report of a plan for hands, in words and pictures."""
     count, met = len(plan.param_names), len(plan.param_names) - len(plan.missing)
-    rows = [{'until': f'{number}', 'kind': 'turn' if step.turn else 'pose', 'words': step.words}
+    rows = [{'until': f'{number}', 'kind': 'turn' if step.is_turn else 'pose', 'words': step.words}
             for number, step in enumerate(plan.steps, start=1)]
     sense = f'no pose and no turn by hand brings these within their tolerance: {", ".join(plan.missing)}' if plan.missing else \
-        'do the steps in this order; between any two of them move as you like'
+        'do the steps in this order, each by the turn that is named'
     return _page(model, {name: k for k, name in enumerate(plan.param_names)}, plan.sd, plan.tolerances,
                  word='good' if not plan.missing else 'weak', sense=sense, facts=_facts(provenance),
                  tiles=[_tile('time', text(plan.seconds), 's', f'{len(plan.steps)} poses and turns'),
                         _tile('within tolerance', f'{met} of {count}', '', 'parameters')],
                  headline=f'{met} of {count} parameters within tolerance after {len(plan.steps)} poses and turns',
                  motion=draw_steps(plan.steps), reading=READING[:1], count='step',
-                 caption='The IMU as a box, x its longest side, z its thinnest; a turn starts from what is drawn.',
+                 caption='The IMU as a box, x its longest side, z its thinnest; as it is held at the end of each step.',
                  progress=draw_steps_progress(plan), rows=rows)
 
 

@@ -149,6 +149,16 @@ def _quick(builder, rng):
     run(builder, rng, tasks, reference_every=100)
 
 
+def _six_faces(builder, _rng):
+    """What is usually driven: every axis up and down, and turned both ways at one speed."""
+    builder.rest(3.0)
+    for task in poses(FACES, 3.0):
+        task(builder)
+    for axis in np.eye(3):
+        spin_vertical(builder, axis, SPEEDS_DEG[1], dwell=2.0)
+    rest_at_zero(builder, 3.0)
+
+
 def _static_only(builder, rng):
     run(builder, rng, poses(np.concatenate([FACES, EDGES, CORNERS]), 8.0))
 
@@ -253,6 +263,8 @@ _REGISTRY = {
                           n_joints=3, adapts=True),
     'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
     'quick': _Entry('the least that determines everything, about 2 min', _quick, n_joints=3, adapts=True),
+    'six_faces': _Entry('every axis up and down, and turned both ways at one speed, about 1 min: leaves similar effects alike', _six_faces,
+                        n_joints=3, adapts=True),
     'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
     'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
     'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
