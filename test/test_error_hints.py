@@ -93,5 +93,5 @@ def test_the_live_session_by_hand_says_the_parameter_of_its_node():
     class Solved:
         param_names, status, undetermined = ('accelerometer.matrix.xx',), ('weak',), ()
     found = Findings([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
-    assert hand_status(found, Solved, gravity_unknown=True, hints=HINTS['calibration_node']).message.endswith(
+    assert hand_status(found, Solved, gravity_unknown=True, step='', hints=HINTS['calibration_node']).message.endswith(
         "next: give the local gravity, which scales the accelerometer as a whole (parameter 'gravity')")
