@@ -154,6 +154,10 @@ class Loop(Station):
         """Return what the planner says."""
         return self.status['planner_node: drive'].message
 
+    def told(self, key):
+        """Return a figure of the planner, '' before it is told."""
+        return next((pair.value for pair in self.status['planner_node: drive'].values if pair.key == key), '')
+
     def value(self, key):
         """Return a figure of the planner."""
         return next(pair.value for pair in self.status['planner_node: drive'].values if pair.key == key)
@@ -218,3 +222,23 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
         loop.processes.end(loop.simulator)
         loop.until(lambda: 'nothing was heard of the joints' in loop.drive(), 'the silence')
         assert loop.value('state') == 'stopped'
+
+
+@pytest.mark.dds
+def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_leaves_nothing_moving(tmp_path):
+    from sensor_msgs.msg import JointState
+    with Loop(tmp_path / 'out.txt') as loop:
+        loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0,
+                   wait_for_subscribers=1)
+        places = []
+        loop.node.create_subscription(JointState, 'joint_states', lambda m: places.append((m.header.stamp.sec, *m.position)), 1000)
+        loop.until(lambda: places and places[-1][0] > 1.8e9 + 64, 'the end of the six faces', 60.0)
+        loop.ask('start')
+        loop.until(lambda: loop.told('separating') == 'True' and loop.value('state') == 'moving', 'the separating motion', 120.0)
+        assert {loop.value('found').split()[-1], *loop.value('mates').split()} == {'accel_quadratic', 'accel_scale_asymmetry'}
+        assert loop.value('separations') == '1'
+        loop.until(lambda: np.ptp([row[1:] for row in places[-20:]], axis=0).max() > 0.02, 'motion')
+        assert loop.processes.end(loop.planner) == 0
+        loop.until(lambda: np.ptp([row[1:] for row in places[-100:]], axis=0).max() == 0.0, 'rest')
+    said = (tmp_path / 'out.txt').read_text()
+    assert 'planning the motion that separates them' in said and 'Traceback' not in said
