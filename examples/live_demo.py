@@ -29,7 +29,7 @@ FACTOR = 4.0
 HIDDEN, PROFILE = 'soft_spring', 'six_faces'
 """What is wrong with the IMU, by its physics; the first motion."""
 SIMULATOR = {'table_file': TABLE, 'seed': 1, 'imu_seed': 5, 'imu_rate': 100.0, 'joint_rate': 100.0, 'time_factor': FACTOR, 'truth': True,
-             'hide': HIDDEN, 'hide_size': 1.8}
+             'hide': HIDDEN, 'hide_size': 2.0}
 START = 1_800_000_000.0
 PATIENCE = 240.0
 
@@ -189,9 +189,9 @@ def events(drive):
     """Yield (time, words) of what the planner learnt of causes and began because of it."""
     told = None
     for at, text, values in drive:
-        named = ' or '.join(name for name in (values.get('found', '') + ' ' + values.get('mates', '')).split())
-        what = ('asks the diagnosis' if text.startswith('asking') else f'tells apart: {named}' if values.get('separating') == 'True' else
-                f'named: {named}' if values['state'] == 'done' and named else '')
+        told_apart, found = (values.get(key, '').replace(' ', ', ') for key in ('told apart', 'found'))
+        what = ('asks the diagnosis' if text.startswith('asking') else f'tells apart {told_apart}' if values.get('separating') == 'True' else
+                f'named: {found}' if values['state'] == 'done' and found else '')
         if what and what != told:
             yield at, what
         told = what or told
@@ -216,9 +216,12 @@ def picture(path, watcher, calibration, errors):
     for name, points in lines.items():
         known.semilogy(*zip(*points, strict=True), color='tab:blue' if name.startswith('accel') else 'tab:orange', lw=0.8)
     known.axhline(1.0, color='k', lw=1)
-    for at, words in events(watcher.drive):
+    end = max(at for at, _, _ in watcher.drive)
+    for row, (at, words) in enumerate(events(watcher.drive)):
         known.axvline(at - start, color='tab:red', lw=1)
-        known.text(at - start, 0.98, f' {words}', color='tab:red', va='top', fontsize=8, rotation=90, transform=known.get_xaxis_transform())
+        side = 'left' if at - start < 0.5 * (end - start) else 'right'
+        known.text(at - start, 0.93 - 0.09 * row, f' {words} ', color='tab:red', ha=side, fontsize=8, transform=known.get_xaxis_transform(), in_layout=False,
+                   bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5})
     known.set(xlabel='s since the planner started', ylabel='standard deviation / tolerance',
               title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: every accelerometer (blue) and gyroscope (orange) parameter')
     found = [effect.name for effect in calibration.model.effects if effect.sensor == 'accelerometer' and effect.name not in ('bias', 'matrix')]

@@ -5,8 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imu_calibration.planning.motions import MotionKind
-from imu_calibration.planning.places import rest_at
+from imu_calibration.planning.places import rest_at, up_at
 from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 
@@ -46,3 +47,10 @@ def test_spins_come_in_both_senses_and_rests_in_many_attitudes():
     senses = {(int(np.argmax(np.abs(rate))), float(np.sign(rate[np.argmax(np.abs(rate))]))) for rate in rates}
     assert senses == {(joint, sense) for joint in range(3) for sense in (1.0, -1.0)}
     assert len({tuple(motion.place) for motion in repertoire.motions if motion.kind is MotionKind.POSE}) >= 20
+
+
+def test_what_points_up_at_a_place_is_what_the_accelerometer_feels_there():
+    table = random_table(np.random.default_rng(3), 3)
+    for place in np.random.default_rng(4).uniform(-3, 3, (5, 3)):
+        force = reference_motion(table, rest_at(place[None])).force_s[0]
+        np.testing.assert_allclose(up_at(table, place), force / np.linalg.norm(force), atol=1e-12)

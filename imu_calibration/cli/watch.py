@@ -99,7 +99,7 @@ class NodeWatcher:
                 self.others.add(node)
 
     def _draw(self, array):
-        self.picture = next((marker.text for marker in array.markers if marker.text), '')
+        self.picture = next((marker.text for marker in array.markers if marker.ns == 'text'), self.picture)   # the planner adds its own
 
     def spin(self, seconds: float) -> None:
         """Listen for so long."""

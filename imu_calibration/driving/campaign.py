@@ -89,6 +89,8 @@ class Campaign:
         self.findings: list[Suspect] | None = None
         """What the last diagnosis named, the strongest first; None before the first."""
         self.separations = 0
+        self.told_apart: tuple[str, ...] = ()
+        """The class whose members were to be told apart last."""
         self._is_asked = False
         self._left: list[float] = []
 
@@ -114,7 +116,7 @@ class Campaign:
                     self._separator = self._make_separator(finding)
                 except ImuCalibrationError as error:
                     return f'{what}, and no motion is known that separates them: {error}'
-                self.separations += 1
+                self.separations, self.told_apart = self.separations + 1, (finding.effect, *finding.mates)
                 self._left.clear()
                 return f'{what}: planning the motion that separates them'
         return ''

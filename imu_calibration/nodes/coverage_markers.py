@@ -25,6 +25,16 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     return MarkerArray(markers=made)
 
 
+def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
+    """Return what the planner adds to the picture: an arrow to what will be up after the motion that is driven, and that motion in words."""
+    made = [_arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW), _marker('driven', 1, Marker.TEXT_VIEW_FACING, scale=(0.0, 0.0, 0.08))]
+    made[1].text = text
+    _at(made[1], (0.0, 0.0, -1.5 * RADIUS))
+    for marker in made:
+        marker.header.frame_id, marker.header.stamp = frame_id or 'imu_link', stamp
+    return MarkerArray(markers=made)
+
+
 def _marker(name, number, kind, *, color=WHITE, alpha=1.0, scale=(1.0, 1.0, 1.0)):
     marker = Marker(ns=name, id=number, action=Marker.ADD, color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=alpha))
     marker.type = kind

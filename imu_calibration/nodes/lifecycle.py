@@ -8,6 +8,7 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from imu_calibration.errors import ImuCalibrationError, shortened
@@ -28,7 +29,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     ----------
     make_node : callable
         Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, what
-        it returns is printed;
+        it returns is printed; a class with a method `halt` has it called at the first signal, while the context still lives and messages can be sent;
         an attribute `failed` says whether it ended because it could not go on, and has said so.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
@@ -49,13 +50,20 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
               'and see --help', file=sys.stderr)
         return 1
     # rclpy's handlers, installed by init, end the wait and call these; without them Python would also raise KeyboardInterrupt in mid-write.
-    asked_to_end = []
+    asked_to_end, node, halts = [], None, hasattr(make_node, 'halt')
+
+    def asked(number, _):
+        asked_to_end.append(number)
+        if halts and node is not None:
+            node.halt()
+        if halts:
+            rclpy.try_shutdown()
     for number in SIGNALS:
-        signal.signal(number, lambda number, frame: asked_to_end.append(number))
+        signal.signal(number, asked)
     told = sys.unraisablehook   # what rclpy leaves half made when the context ends is no news either
     sys.unraisablehook = lambda unraisable: None if asked_to_end else told(unraisable)
-    rclpy.init(args=arguments)
-    node = None
+    # Who has to say something at the end keeps the context until it is said.
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO if halts else None)
     try:
         if asked_to_end:   # before rclpy could take note of it
             return 0

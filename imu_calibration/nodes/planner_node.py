@@ -2,7 +2,8 @@
 planner_node: moves a table or an arm so that calibration_node can determine every parameter, and no further.
 
 in: joint_states (sensor_msgs/JointState), imu/calibration (std_msgs/String, from calibration_node), /diagnostics (its diagnosis).
-out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed; /diagnostics.
+out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed; /diagnostics;
+imu/coverage (visualization_msgs/MarkerArray): the motion that is driven, beside calibration_node's picture.
 services: ~/start (all motions that are needed), ~/next (one motion), ~/stop (at any moment). Nothing moves before ~/start or ~/next.
 """
 
@@ -21,6 +22,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_from_text
@@ -31,6 +33,7 @@ from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
 from imu_calibration.driving.separating import separator_of
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
+from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.hints import HINTS
@@ -39,10 +42,13 @@ from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker
+from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.noise import expected_noise, require_grade
+from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
 from imu_calibration.reference.motion_limits import limits_of
+from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file
 from imu_calibration.settings import setting
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -95,12 +101,13 @@ class PlannerNode(Node):
                                            settings.reference_model or None, tolerances,
                                            noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
         self._lock, self._stamp, self._documents, self._told = threading.RLock(), 0.0, [], {}
+        self._is_halted = False
         self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
         self._names = tuple(self._table.joint_names)
         self.driver = Driver(self._names, limits_of(self._table), driver_settings)
         self._command = make_command(self, settings.command, self._refused)
         self.worker = PlannerWorker(self.driver, self._make_campaign,
-                                    peers=Peers(self._measure, self._latest, self._diagnose, self._command.send, self._stop_joints, self._say),
+                                    peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say),
                                     lock=self._lock)
         self.worker.stamp = lambda: self._stamp
         self._joints = MatchedInput(self, JointState, 'joint_states', callback=self._joint_state, single=False, raw=False)
@@ -111,15 +118,22 @@ class PlannerNode(Node):
         for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
         self.create_timer(PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; nothing moves before ~/start')
 
     def close(self) -> str:
         """Stop what moves; return what became of it."""
-        was_driving = self.driver.is_driving
+        unstopped = self.driver.is_driving   # the context is gone, and nothing can be sent any more
         self.worker.end()
-        return 'stopped in mid-motion' if was_driving else ''
+        return 'the joints finish the motion that they are in' if unstopped else 'stopped in mid-motion' if self._is_halted else ''
+
+    def halt(self) -> None:
+        """Stop what moves; called at the first signal, while that can still be said."""
+        if self.driver.is_driving:
+            self._is_halted = True
+            self.worker.halt('the node is ending')
 
     def _make_campaign(self) -> Campaign:
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
@@ -132,6 +146,13 @@ class PlannerNode(Node):
         if calibration is None:
             raise InputError('a calibration must be known before causes are told apart, none came; publish imu/calibration')
         return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options)
+
+    def _send(self, points: TrajectoryPoints) -> None:
+        self._command.send(points)
+        calibration = self._latest()
+        self._driven = driven_markers(up_at(self._table, points.position[-1]), f'motion {self.driver.motions}: {self.worker.motion.words}',
+                                      frame_id=calibration.frame_id if calibration else '', stamp=self.get_clock().now().to_msg())
+        self._coverage.publish(self._driven)
 
     # What arrives.
 
@@ -178,6 +199,8 @@ class PlannerNode(Node):
         self._say(ERROR, self.driver.reason)
 
     def _stop_joints(self) -> None:
+        if not self.context.ok():
+            return
         self._command.stop(self._names)
         self._diagnostics.publish_now()
 
@@ -251,6 +274,8 @@ class PlannerNode(Node):
 
     def _statuses(self) -> list:
         driver, worker = self.driver, self.worker
+        if self._driven is not None:   # again, since calibration_node's picture begins with clearing everything
+            self._coverage.publish(self._driven)
         name, excess = worker.worst
         values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}', 'it takes [s]': f'{worker.seconds:.1f}',
                   'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside, 'furthest outside': name,
@@ -258,7 +283,8 @@ class PlannerNode(Node):
         if worker.campaign is not None and worker.campaign.findings is not None:
             values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
                        'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),
-                       'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating}
+                       'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating,
+                       'told apart': ' '.join(worker.campaign.told_apart)}
         faults = self._joints.faults() + self._calibrations.faults()
         text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
         return [make_status(_LEVELS.get(driver.state, WARN if faults else OK), 'drive', text, values=values)]

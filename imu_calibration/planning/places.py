@@ -27,6 +27,11 @@ def rest_at(position: np.ndarray) -> JointMotion:
     return JointMotion(np.zeros(len(position)), position, zero, zero, zero)
 
 
+def up_at(table: Table, position: np.ndarray) -> np.ndarray:
+    """Return which direction of the sensor frame points up where the joints rest at a position, unit vector, shape (3,)."""
+    return reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0] @ np.array([0.0, 0.0, 1.0])
+
+
 def candidates(limits: MotionLimits) -> np.ndarray:
     """Return positions to choose from, the first that nearest to zero, shape (n, n_joints)."""
     lower, upper = reachable(limits)
