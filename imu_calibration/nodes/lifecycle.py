@@ -63,7 +63,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     told = sys.unraisablehook   # what rclpy leaves half made when the context ends is no news either
     sys.unraisablehook = lambda unraisable: None if asked_to_end else told(unraisable)
     # Who has to say something at the end keeps the context until it is said.
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO if halts else None)
+    rclpy.init(args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {}))
     try:
         if asked_to_end:   # before rclpy could take note of it
             return 0
