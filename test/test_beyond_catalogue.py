@@ -165,9 +165,11 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
 
 @pytest.mark.slow
 def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_there_stays():
-    """Three quarters of a cube look like its base; a response to force beside another cause is one all the same."""
-    row, _ = row_of(141, 'force_cubed_in_gyro', 'realistic', Beyond('force_cubed_in_gyro', 141))
-    assert row['found'] == [] and row['family'], row
-    recording = record(5, {'gyro_g_sensitivity': None}, through_bag=False, cause=Beyond('gyro_cubic', 5, 0.3))
-    found = diagnose(recording.windows, recording.table, recording.model)
-    assert [finding.effect for finding in found.findings] == ['gyro_g_sensitivity'] and found.unexplained['gyroscope'].proposal is not None
+    """Three quarters of a cube look like its base, and a scale that settles while it warms up like a thermal one; what is there stays, alone or beside another cause."""
+    for kind in ('force_cubed_in_gyro', 'gyro_scale_settling'):
+        row, _ = row_of(141, kind, 'realistic', Beyond(kind, 141))
+        assert row['found'] == [] and row['family'], row
+    for effect, cause in (('gyro_g_sensitivity', Beyond('gyro_cubic', 5, 0.3)), ('gyro_thermal_scale', None)):
+        recording = record(5, {effect: None}, through_bag=False, **({'cause': cause} if cause else {}))
+        found = diagnose(recording.windows, recording.table, recording.model)
+        assert [finding.effect for finding in found.findings] == [effect] and (found.unexplained['gyroscope'].proposal is None) == (cause is None)

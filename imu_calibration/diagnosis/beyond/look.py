@@ -57,21 +57,32 @@ def superseded(found: Investigation, table: Table, rests: dict[str, Unexplained]
     Return the findings that a formula does without: they stood in for the part of it that looks like them.
 
     A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside a wrong name. So each
-    finding of a sensor that has a formula is left out once, and counts where the windows held out miss it.
+    finding of a sensor that has a formula is left out once, and counts where the windows held out miss it. What follows the temperature is left out without a
+    formula too: what settles while the sensor warms up looks like it, so well that hardly a rest stays.
     """
-    asked = [(question, rests[question.sensor].proposal) for question in found.named if question.sensor in rests and rests[question.sensor].proposal is not None]
+    asked = [question for question in found.named
+             if question.sensor in rests and (rests[question.sensor].proposal is not None or 'temperature' in question.effect.needs)]
     if not asked:
         return []
     blocks, search = rest_blocks(found.used, table, found.attempt, explained=found.explained), found.attempt.search
-    space, point = found.attempt.space, {'temperature_ref_c': found.attempt.recording.model.temperature_ref_c}
+    space = found.attempt.space
     gone = []
-    for question, proposal in asked:
+    for question in asked:
         own = blocks[question.sensor]
-        rows = [np.broadcast_to(own.means(group.columns(own.ref, point))[:, None], (len(own.time), 1, 3)) for effect in proposal.effects for group in effect.groups]
-        formula = np.concatenate(rows, axis=1)
         kept, left_out = (BlockFits(own, search.used(choice), prior_sd=space.prior_sd, prior_mean=space.prior_mean)
                           for choice in (found.named, [other for other in found.named if other is not question]))
+        proposal = rests[question.sensor].proposal or propose(own, found.attempt, left_out)
+        if proposal is None:
+            continue
+        formula = _columns(own, proposal, found.attempt.recording.model.temperature_ref_c)
         alone, beside = (left_out.fit(columns).excess - kept.fit(columns).excess for columns in (None, formula))
         if beside < NOT_NEEDED * alone:
             gone.append(question)
     return gone
+
+
+def _columns(blocks, proposal, temperature_ref_c):
+    """Return the columns of the formulas over the blocks, shape (b, k, 3)."""
+    groups = [group for effect in proposal.effects for group in effect.groups]
+    means = [blocks.means(group.columns(blocks.ref, {'temperature_ref_c': temperature_ref_c})) for group in groups]
+    return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
