@@ -88,9 +88,10 @@ class StampedDerivative:
     Slope of a straight line through the last samples of a vector, updated one sample or one block at a time.
 
     The samples count as equally spaced, as those of a sensor with a clock of its own are, whatever the jitter of their stamps; the
-    stamps say where some are missing: where a step is about a whole number of periods, else a stamp was late. A hole shorter than the window is bridged by a straight line; after a longer one, or when
-    the clock is set back by more than a second, the window starts anew. A sample that is doubled or came late does not enter the
-    window and gets the derivative of the newest one. While the window is less than half full the derivative is zero.
+    stamps say where some are missing: where a step is about a whole number of periods, else a stamp was late. A hole shorter than the
+    window is bridged by a straight line; after a longer one, or when the clock is set back by more than a second, the window starts anew.
+    A sample that is doubled or came late does not enter the window and gets the derivative of the newest one. While the window is less
+    than half full the derivative is zero.
 
     Parameters
     ----------

@@ -14,8 +14,8 @@ class GyroBiasUpdate:
     """
     The bias that is left after compensation, as a Gauss-Markov process that every stop measures.
 
-    Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at a stop the Kalman update with the mean of the
-    corrected rate. Without stops the update fades away and its uncertainty returns to S: the calibration's own, or what the stops
+    Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at a stop the Kalman update with the mean
+    of the corrected rate. Without stops the update fades away and its uncertainty returns to S: the calibration's own, or what the stops
     have shown if that is more.
 
     Parameters

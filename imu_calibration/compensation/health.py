@@ -137,23 +137,28 @@ class CalibrationHealth:
         axis = int(np.argmax(rate_off))
         values = {'stops': n_stops, 'seconds of the last stop': f'{stop.seconds:.1f}',
                   'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate), 'rate at rest [sd]': f'{rate_off.max():.1f}',
-                  'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}', 'gravity off [sd]': f'{force_off:.1f}'}
+                  'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}',
+                  'gravity off [sd]': f'{force_off:.1f}'}
         lines = []
         if rate_off[axis] > LIMIT:
-            lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd')
+            lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
+                         f'{rate_off[axis]:.0f} times its sd')
         if force_off > LIMIT:
-            lines.append(f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what places differ by')
+            lines.append(f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what '
+                         'places differ by')
         if bias_update is not None:
             bias, variance = bias_update
             values |= {'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
                        'bias update, sd [deg/s]': ', '.join(f'{value / DEG:.4f}' for value in np.sqrt(variance))}
         if not lines:
-            return HealthState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {rate_off.max():.1f} and {force_off:.1f} sd', values)
+            off = f'{rate_off.max():.1f} and {force_off:.1f} sd'
+            return HealthState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {off}', values)
         measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
         harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
             force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
         if harms:
-            return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again', values)
+            return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
+                               values)
         if bias_update is not None and force_off <= LIMIT:
             return HealthState(FOLLOWED, '; '.join(lines) + ': taken off as long as stops show it', values)
         return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)

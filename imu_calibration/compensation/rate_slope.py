@@ -146,7 +146,8 @@ class RateSlope:
 
     def follow(self, before: 'RateSlope') -> None:
         """Go on where another one stops, after `prepare`."""
-        self._stamps, self._due, self._newest, self._reading, self._count = before._stamps, before._due, before._newest, before._reading, before._count
+        self._stamps, self._due, self._count = before._stamps, before._due, before._count
+        self._newest, self._reading = before._newest, before._reading
         if self._tracker is not None and before._tracker is not None:
             self._tracker.seed(before._tracker)
 

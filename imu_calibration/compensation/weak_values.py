@@ -11,8 +11,8 @@ def applied_values(calibration: FittedErrors) -> np.ndarray:
     """
     Return the parameters that compensation uses, shape (n_params,).
 
-    A value v with standard deviation s is nearer to the truth than the prior's p where ``(v - p)^2 > s^2``. The weakest of those that are not goes
-    to its prior first, and everything that is correlated with it to what it is there; then the rest are looked at again.
+    A value v with standard deviation s is nearer to the truth than the prior's p where ``(v - p)^2 > s^2``. The weakest of those that are
+    not goes to its prior first, and everything that is correlated with it to what it is there; then the rest are looked at again.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ class Joint:
     limits: JointLimits = field(default=JointLimits())
     """How far and how fast it may go."""
     sag: float = 0.0
-    """Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`): an estimate, which no description holds."""
+    """Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`): estimated, no description holds it."""
     wobble: tuple[tuple[int, complex], ...] = ()
     """How it leans as it turns: (turns of the lean for one of the joint, amplitude, rad), an estimate too."""
 
@@ -112,7 +112,7 @@ class JointNames(Sequence):
 
     @classmethod
     def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
-        """Return `names` as they are, or those of a chain of turning joints of which no two neighbours are parallel, unless `errors` says."""
+        """Return `names` as they are, or, unless `errors` says, those of turning joints no two neighbours of which are parallel."""
         if isinstance(names, cls):
             return names
         names = tuple(names)

@@ -32,7 +32,8 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
 
     """
     of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
-    return replace(table, joints=tuple(replace(joint, sag=of_joint[joint.source]) if joint.turns and of_joint.get(joint.source) else joint for joint in table.joints))
+    return replace(table, joints=tuple(replace(joint, sag=of_joint[joint.source]) if joint.turns and of_joint.get(joint.source) else joint
+                                       for joint in table.joints))
 
 
 def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:

@@ -32,7 +32,8 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
         passed.append(frame)
         frame, quaternion = parents[frame]
         if frame in passed:
-            raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or say where up is", key='up')
+            raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or say where up is",
+                             key='up')
         mats.append(_matrix(quaternion))
     for matrix in reversed(mats):
         up = matrix.T @ up

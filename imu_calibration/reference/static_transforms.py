@@ -57,10 +57,11 @@ class StaticTransforms:
         absent = [f"'{name}'" for name in (target, source) if name not in known]
         names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
         return f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})' if absent else \
-            f"'{target}' and '{source}' are in trees that nothing static connects (roots: {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})"
+            f"'{target}' and '{source}' are in trees that nothing static connects (roots: {self._to_root(target)[-1][0]}, " \
+            f'{self._to_root(source)[-1][0]})'
 
     def _to_root(self, frame):
-        """Return (ancestor, origin of `frame` in it, matrix from `frame` to it) from the frame itself up to its root; a ring ends where it closes."""
+        """Return (ancestor, origin of `frame` in it, matrix from `frame` to it) from the frame up to its root; a ring ends once closed."""
         steps, seen = [(frame, np.zeros(3), np.eye(3))], {frame}
         while (step := self._parents.get(steps[-1][0])) is not None and step[0] not in seen:
             parent, xyz, mat = step

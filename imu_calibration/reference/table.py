@@ -54,7 +54,8 @@ class Table:
     def __post_init__(self) -> None:
         joints = tuple(self.joints)
         _require_joints(joints)
-        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'), 'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
+        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'),
+                                   'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
         if self.mount_xyz is not None:
             checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():

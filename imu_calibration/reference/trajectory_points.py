@@ -38,8 +38,8 @@ class TrajectoryPoints:
         shape = (len(self.time), len(self.joint_names))
         for name, values in self.columns().items():
             if values.shape != shape:
-                raise InputError(f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape {values.shape}; '
-                                 'give all or none')
+                raise InputError(f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape '
+                                 f'{values.shape}; give all or none')
             if not np.all(np.isfinite(values)):
                 raise InputError(f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points')
         if not np.all(np.diff(self.time, prepend=0.0) > 0):

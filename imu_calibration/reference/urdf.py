@@ -100,8 +100,8 @@ def _read(text):
             ElementTree.SubElement(bare, element.tag, element.attrib).extend(child for child in element if child.tag in _READ[element.tag])
         return Robot.from_xml_string(ElementTree.tostring(bare))
     except (ElementTree.ParseError, ParseError, ValueError, AssertionError, KeyError, TypeError) as error:
-        raise InputError(f'a robot description must be a URDF, this is none: {" ".join(str(error).split())[:200]}; give the .urdf or .xacro of the '
-                         'robot') from error
+        raise InputError(f'a robot description must be a URDF, this is none: {" ".join(str(error).split())[:200]}; give the .urdf or '
+                         '.xacro of the robot') from error
 
 
 def _chain(robot, link):
@@ -121,14 +121,14 @@ def _chain(robot, link):
         if joint.type == 'fixed':
             continue
         if joint.type not in _MOVING:
-            raise InputError(f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is {joint.type}; "
-                             'use a description that begins behind it')
+            raise InputError(f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
+                             f'{joint.type}; use a description that begins behind it')
         joints.append(Joint(joint.name, tuple(joint.axis or (1.0, 0.0, 0.0)), type=_MOVING[joint.type], mimic=_mimic(robot, joint),
                             limits=_limits(joint), **placement.fields))
         placement = _Placement(np.zeros(3), np.eye(3))
     if not joints:
-        raise InputError(f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to the root "
-                         f"'{link}'; name the link that carries the IMU, or calibrate by hand")
+        raise InputError(f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to "
+                         f"the root '{link}'; name the link that carries the IMU, or calibrate by hand")
     return joints, placement
 
 

@@ -86,7 +86,8 @@ class BlockCleaner:
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
         """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
         self._clean()
-        return {name: replace(check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0)) for name, check in self._checks.items()}
+        return {name: replace(check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0))
+                for name, check in self._checks.items()}
 
     @property
     def stamping(self) -> StampLine | None:

@@ -73,7 +73,8 @@ class CountedClock:
         self._next = number[-1] + 1
         if len(number) >= BLOCK // 2 or not self._points:   # the few samples of a shorter one may all be late
             late = stamp - self._period * number
-            self._points.append((float(number.mean()), float((late.min() if self._arrivals else late.mean()) + self._period * number.mean())))
+            usual = late.min() if self._arrivals else late.mean()
+            self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
         if self._block is not None:
             self._tell(self._block)
             self._follow()

@@ -73,7 +73,7 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
         shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), least)
         calm = np.all(variance <= ratio ** 2 * limit, axis=1)
         quiet &= _covered(calm, width)
-        if width > 1 and resting is None:   # from one sample to the next into another attitude: quiet spans end there and begin there, and none goes across
+        if width > 1 and resting is None:   # from one sample to the next into another attitude: no quiet span goes across
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across

@@ -31,10 +31,10 @@ class SpikeFilter:
     """
     Passes samples on without spikes; the outcome does not depend on how the stream is cut into pieces.
 
-    A reading is a spike when it departs by more than `LARGE` sds of the noise and much more than its neighbours depart from each other: from the
-    cubic through the four nearest, which follows fast motion, or, where one of those is wrong as well, from the median of the nine around it
-    (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second differences;
-    white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
+    A reading is a spike when it departs by more than `LARGE` sds of the noise and much more than its neighbours depart from each other:
+    from the cubic through the four nearest, which follows fast motion, or, where one of those is wrong as well, from the median of the
+    nine around it (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second
+    differences; white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
     """
 
     def __init__(self) -> None:
@@ -90,7 +90,8 @@ class SpikeFilter:
         if len(row):
             first = np.clip(at[row] - REACH, 0, len(values) - 2 * REACH - 1)
             window, column = first[:, None] + np.arange(2 * REACH + 1), column[:, None]
-            # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike shows in three second differences, two in six
+            # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike shows in three second
+            # differences, two in six
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - NEAR, 0, len(values) - 2 * NEAR - 1)
@@ -129,7 +130,7 @@ def _without_breaks(samples):
 
 
 def _off_the_cubic(around, place, limit):
-    """Compare with the cubic through two neighbours on either side; `place` of the reading `around` which they are, the middle but at the ends."""
+    """Compare with the cubic through two neighbours on either side; the reading's `place` in `around` is the middle but at the ends."""
     a, b, x, c, d = around[:, NEAR - 2:NEAR + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
     rough = np.abs(predicted - 0.5 * (b + c)) + 0.5 * np.abs(d - 2 * c + 2 * b - a)

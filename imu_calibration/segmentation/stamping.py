@@ -1,8 +1,8 @@
 """
 How the stamps of one stream relate to its sampling.
 
-An IMU samples by a clock of its own; its stamps are often made when messages arrive: eight at once from a USB packet, late by whatever the bus
-took, in whole milliseconds, or not at all. Where the stamps stay near a line through the number of the sample, counting says when each
+An IMU samples by a clock of its own; its stamps are often made when messages arrive: eight at once from a USB packet, late by whatever the
+bus took, in whole milliseconds, or not at all. Where the stamps stay near a line through the number of the sample, counting says when each
 was taken (`COUNTED`); where they run away from every such line the sampling itself is irregular, and the stamps are all there is.
 """
 
@@ -73,7 +73,8 @@ class StampLine:
         if self.word == IRREGULAR:
             return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
         if self.at_once >= 1.5:
-            return f'stamps are those of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn through them'
+            return f'stamps are those of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn ' \
+                'through them'
         return (f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
                 'through them')
 
@@ -113,7 +114,8 @@ def _regular(step: np.ndarray, usual: float) -> StampLine | None:
     if usual <= 0 or regular_share(step, usual) < 1 - IRREGULAR_SHARE:
         return None
     number = np.rint(step / usual)
-    number[(step <= LATE * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE))] = 1.0   # late, and the next is the earlier
+    # late, and the next is the earlier
+    number[(step <= LATE * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE))] = 1.0
     used = (step > 0) & (number <= MOST_LOST)
     return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
 
@@ -134,7 +136,7 @@ def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
 
 
 def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
-    """Return the line of stamps that stay near one: through the earliest of them when they are times of arrival, else through their middle."""
+    """Return the line of stamps that stay near one: through the earliest where they are times of arrival, else through their middle."""
     number = np.arange(len(stamp_ns))
     residual = (stamp_ns - stamp_ns[0]) - period * number
     residual = residual - np.polynomial.Polynomial.fit(number, residual, 1)(number)

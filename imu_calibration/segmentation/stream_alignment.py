@@ -60,7 +60,9 @@ class MotionChunks:
     @property
     def end_time(self) -> float:
         """Session time at the newest IMU sample, s."""
-        return self.time_origin if self._imu.newest_ns is None or self._start_ns is None else self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
+        if self._imu.newest_ns is None or self._start_ns is None:
+            return self.time_origin
+        return self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
 
     def add(self, imu: ImuSamples | None = None, joints: JointSamples | None = None, temperature: TemperatureSamples | None = None) -> None:
         """Take cleaned samples, each stream in the order of its stamps."""

@@ -23,8 +23,8 @@ class StreamCheck:
     Cleans one stream; the outcome does not depend on how it is cut into pieces.
 
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays), 'backward stamp' (a sample that came
-    late), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of
-    which starts a new epoch.
+    late), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps,
+    each of which starts a new epoch.
     Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, whole milliseconds, jitter) its samples get times
     of their own first (see `sample_times`).
     """

@@ -26,5 +26,7 @@ class WindowSettings:
     dynamic_minimum: float = setting(0.3, 's', 'shortest dynamic stretch', (0.05, 600.0), live=True)
     gap: float = setting(0.1, 's', 'a longer hole in either stream ends a window; also never below five IMU periods', (0.001, 60.0),
                          'too small: every lost message cuts a window', live=True)
-    chunk: float = setting(20.0, 's', 'the joints are smoothed in pieces of this length', (2.0, 600.0), fixed='the pieces count from the first sample on')
-    overlap: float = setting(2.0, 's', 'margin on both sides of a piece, so that its ends do not show', (0.2, 60.0), fixed='the pieces count from the first sample on')
+    chunk: float = setting(20.0, 's', 'the joints are smoothed in pieces of this length', (2.0, 600.0),
+                           fixed='the pieces count from the first sample on')
+    overlap: float = setting(2.0, 's', 'margin on both sides of a piece, so that its ends do not show', (0.2, 60.0),
+                             fixed='the pieces count from the first sample on')
