@@ -8,12 +8,12 @@ import pytest
 
 from imu_calibration.diagnosis import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
-from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.explained_share import Explained, pruned, with_steps_of_encoders
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, natural_processes, plausible_processes
 from imu_calibration.selection.normal_matrices import white_means
 from imu_calibration.selection.questions import Question
@@ -195,6 +195,20 @@ def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
     assert plausible_processes(measured, 0.01, sensor='gyroscope') == measured.known
     quiet = NoiseModel(np.full(3, 4e-8), np.ones(3), bias_processes=(BiasProcess(2e-4, 15.0),))
     assert plausible_processes(quiet, 0.01, sensor='accelerometer')[0].sd == 2e-4
+
+
+def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sensor():
+    """Steps of 1 mrad at both ends of 5 s beside 0.1 mrad/s of white noise at 100 Hz; at rest nothing turns."""
+    rng = np.random.default_rng(9)
+    turned = rng.uniform(0.0, 1.0, (20000, 2))
+    read = np.round(turned / 1e-3) * 1e-3
+    scatter = np.var(np.diff(read - turned, axis=1) / 5.0) + 1e-8 / 500
+    recording = SimpleNamespace(kind=np.array(['spin', 'static']), count=np.full(2, 500.0), period=0.01, windows=[SimpleNamespace(duration=5.0)] * 2)
+    ones = np.ones(3)
+    noise = with_steps_of_encoders(NoiseModel(1e-8 * ones, ones, moving={'spin': MovingFactors(ones, ones)}), recording, step=1e-3)
+    moving, still = noise.mean_variance(recording.kind, recording.count)
+    np.testing.assert_allclose(moving, scatter, rtol=0.05)
+    np.testing.assert_allclose(still, 1e-8 / 500)
 
 
 def test_a_wander_far_beyond_the_natural_one_has_its_price():

@@ -76,6 +76,7 @@ SEARCH = _of(
     ('the same for what is smooth in time', 'explained_share.py', 'LEAST_SHARE_SMOOTH = 0.9', 'LEAST_SHARE_SMOOTH = 0.1', 'test_search.py'),
     ('a cause of the table need not show in both sensors', 'explained_share.py', 'return min(value / (value', 'return max(value / (value', 'test_search.py'),
     ('biases do not move by nature', 'bias_process_search.py', 'NATURAL = 0.5', 'NATURAL = 0.0', 'test_search.py'),
+    ('encoders have no steps where turns are read', 'explained_share.py', 'means=factors.means + variance', 'means=factors.means + 0.0 * variance', 'test_search.py'),
     ('whatever a bias was found to do passes for noise', 'noise_beside_effects.py', 'PLAUSIBLE = 3.0', 'PLAUSIBLE = 800.0', 'test_search.py'),
     ('a wander of any size costs nothing', 'bias_process_search.py', '/ SPREAD)**2 if self.least', '/ SPREAD)**2 * 0.0 if self.least', 'test_search.py'),
     ('a smooth effect need not beat the wander of the bias', 'noise_beside_effects.py', 'SMOOTH_PENALTY = 10.0', 'SMOOTH_PENALTY = -50.0',
