@@ -1,6 +1,6 @@
 """Draws docs/coverage.png: what imu/coverage shows of a calibration by hand at its beginning, on the way and at its end, from the markers that are published."""
 
-from dataclasses import replace
+import textwrap
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -8,7 +8,9 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
-from imu_calibration.by_hand.next_pose import foretold, hand_coverage, knowledge_of, shortest_turn
+from imu_calibration.by_hand.advice import foretold
+from imu_calibration.by_hand.hand_step import HandStep
+from imu_calibration.by_hand.next_pose import knowledge_of
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.status import NOTHING
 from imu_calibration.calibration.coverage import DIRECTIONS, Bar, Coverage, Step
@@ -21,19 +23,23 @@ MINIMUM = 8.0
 
 def states():
     """Yield a Coverage at the beginning, after six poses and at the end of a session that does what the picture says."""
-    options = HandOptions(gravity=9.81)
-    knowledge, seen = knowledge_of(NOTHING, None, options), [np.array([0.0, 0.0, 1.0])]
-    yield replace(hand_coverage(NOTHING, None, options), seen=np.array(seen), up=seen[0])
-    steps = foretold(knowledge)
-    for index in steps[:6]:
-        knowledge = replace(knowledge, information=knowledge.after(DIRECTIONS[index:index + 1])[0], up=DIRECTIONS[index])
-        seen.append(DIRECTIONS[index])
-    left = foretold(knowledge)
-    target = DIRECTIONS[left[0]]
-    text = hand_coverage(NOTHING, None, options).next.text.split(' with ')[0]
-    yield Coverage(knowledge.best()[1], np.array(seen), seen[-1], Step(text + ' where the arrow points', target, *shortest_turn(seen[-1], target)), 5.0 * len(left))
+    up = np.array([0.0, 0.0, 1.0])
+    knowledge, seen = knowledge_of(NOTHING, None, HandOptions(gravity=9.81)).then(HandStep(up)), [up]
+    yield shown(knowledge, seen)
+    for step in foretold(knowledge)[:6]:
+        knowledge = knowledge.then(step)
+        seen.append(step.up)
+    yield shown(knowledge, seen)
+    seen += [step.up for step in foretold(knowledge)]
     done = (Bar('accelerometer bias', 0.5, 'determined'),)
-    yield Coverage(np.zeros(len(DIRECTIONS)), np.array([*seen, *DIRECTIONS[left]]), DIRECTIONS[left[-1]], Step(''), 0.0, done)
+    yield Coverage(np.zeros(len(DIRECTIONS)), np.array(seen), seen[-1], Step(''), 0.0, done)
+
+
+def shown(knowledge, seen):
+    """Return the Coverage of what is known, as calibration_node makes it."""
+    steps = foretold(knowledge)
+    first, seconds = steps[0], sum(step.seconds for step in steps)
+    return Coverage(knowledge.best()[1], np.array(seen), seen[-1], Step(first.words, first.up, first.axis, first.angle), seconds)
 
 
 def draw(axes, coverage):
@@ -53,7 +59,7 @@ def draw(axes, coverage):
         elif marker.type == Marker.LINE_STRIP:
             axes.plot(*points.T, color=color, linewidth=2.5)
         elif marker.type == Marker.TEXT_VIEW_FACING:
-            axes.set_title(marker.text, fontsize=9)
+            axes.set_title(textwrap.fill(marker.text, 46), fontsize=9)
     axes.set_box_aspect((1, 1, 1))
     axes.set(xlim=(-0.42, 0.42), ylim=(-0.42, 0.42), zlim=(-0.42, 0.42))
     axes.view_init(elev=22, azim=40)

@@ -236,3 +236,12 @@ def test_the_layout_for_foxglove_shows_picture_parameters_and_residuals():
     assert found['version'] == 1 and set(kinds) == {'ThreeDee', 'DiagnosticsSummary', 'Plot'}
     assert kinds['ThreeDee']['topics'] == {'/imu/coverage': {'visible': True}} and kinds['DiagnosticsSummary']['topicToRender'] == '/diagnostics'
     assert text.count('/imu/residual.linear_acceleration.') == 3 and text.count('/imu/residual.angular_velocity.') == 3
+
+
+def test_the_picture_of_the_readme_can_be_drawn(monkeypatch, tmp_path):
+    """The same cells, arrows and lines as docs/coverage.png: nothing else runs the example."""
+    monkeypatch.syspath_prepend(ROOT / 'examples')
+    import coverage_picture
+    first, on_the_way, last = coverage_picture.states()
+    assert first.seconds > on_the_way.seconds > 0 and 'hold it still with' in on_the_way.next.text and len(on_the_way.seen) == 7
+    assert last.done and not last.next.text
