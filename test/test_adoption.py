@@ -8,7 +8,7 @@ import pytest
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.errors import DocumentError
 from imu_calibration.nodes import adoption
-from imu_calibration.nodes.adoption import adopt
+from imu_calibration.nodes.adoption import adopt, again
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 
 from worlds.compensation_cases import random_calibration
@@ -29,6 +29,19 @@ def test_what_speaks_against_itself_is_refused_unless_told():
     with pytest.raises(DocumentError, match='the residuals are large'):
         adopt(text, 'a file', SETTINGS, frames=None)
     assert 'its verdict is bad' in adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None).caveats[0]
+
+
+def test_a_refused_sensor_is_left_as_it_comes_beside_one_that_is_shown_to_be_helped():
+    helps = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
+    text = calibration_to_text(replace(GOOD, proof={'accelerometer': helps | {'after': 0.2, 'ci95': [1.5, 2.5]}, 'gyroscope': helps}))
+    adopted, whole = (adopt(text, 'a file', replace(SETTINGS, anyway=flag), frames=None) for flag in (False, True))
+    assert adopted.used.refused.keys() == {'accelerometer'} and adopted.caveats[0].startswith('the accelerometer is left as it comes: on 12 windows')
+    assert not whole.used.refused and 'that it helps is not shown' in whole.caveats[0] and adopted.says_more_than(whole)
+    sample = (0, 0.1, 0.2, 0.3, 1.0, 2.0, 9.0)
+    corrected, both = (each.compensation.correct(*sample) for each in (adopted, whole))
+    np.testing.assert_allclose(corrected[3:], sample[4:], rtol=0, atol=1e-12)
+    assert np.abs(np.subtract(both[3:], sample[4:])).max() > 1e-3 and np.abs(np.subtract(corrected[:3], sample[1:4])).max() > 1e-4
+    assert again(adopted, SETTINGS, None).used is adopted.used
 
 
 def test_whatever_a_document_does_becomes_one_line(monkeypatch):

@@ -43,8 +43,12 @@ def test_verdict_and_proof_travel_in_the_document():
 ), ids=('bad', 'bad without a reason', 'worse', 'not shown', 'nothing held out', 'implausible'))
 def test_what_speaks_against_a_calibration_is_said(calibration, words):
     assert words in '; '.join(trust.objections(calibration))
+    assert trust.refused_sensors(calibration)
+
+
+def test_a_refusal_names_what_insists():
     with pytest.raises(DocumentError, match='calibrate again') as refusal:
-        trust.refuse_untrusted(calibration)
+        trust.usable(replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',)))
     assert '--anyway' in refusal.value.told({'anyway': '--anyway'}) and '\n' not in str(refusal.value)
 
 

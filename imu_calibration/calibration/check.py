@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.document import Calibration
@@ -30,11 +31,16 @@ class CheckResult:
         return bool(self.proof) and not disproved(self.proof)
 
     @property
+    def helped(self) -> dict[str, Any]:
+        """The entries of the proof of those sensors that it is shown to help."""
+        return {sensor: entry for sensor, entry in self.proof.items() if not disproved({sensor: entry})}
+
+    @property
     def lines(self) -> list[str]:
         """The answer in sentences, the gravest first."""
         if not self.proof:
             return [f'whether it helps cannot be told: {self.why}']
-        return disproved(self.proof) or proven(self.proof)
+        return disproved(self.proof) + proven(self.helped)
 
 
 def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FORMAT = 'imu_calibration/1'
 UNKNOWN = 'unknown'
 """What the provenance says of the uncertainty of imported values."""
-_WHERE_KNOWN = ('verdict', 'verdict_reasons', 'proof')
+_WHERE_KNOWN = ('verdict', 'verdicts', 'verdict_reasons', 'proof')
 """Parts of a document that are left out while nobody knows them."""
 
 
@@ -54,6 +54,8 @@ class Calibration:
     """Software version, bag names and hashes, options."""
     verdict: str = ''
     """'good', 'weak' or 'bad' (see `verdict`); '' in files from before it was written down."""
+    verdicts: dict[str, str] = field(default_factory=dict)
+    """Sensor -> the same of its parameters alone; {} where nobody judged them apart."""
     verdict_reasons: tuple = ()
     """What speaks for or against it, a line each, and what to do next."""
     proof: dict = field(default_factory=dict)
@@ -186,7 +188,7 @@ def to_mapping(calibration: Calibration) -> dict:
         document['joint_errors'] = errors
     document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
     document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
-    for name in ('statistics', 'conditions', 'verdict', 'verdict_reasons', 'proof', 'provenance'):
+    for name in ('statistics', 'conditions', 'verdict', 'verdicts', 'verdict_reasons', 'proof', 'provenance'):
         part = getattr(calibration, name)
         if part or name not in _WHERE_KNOWN:
             document[name] = _plain(part)

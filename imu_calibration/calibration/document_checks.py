@@ -70,6 +70,10 @@ def _is_joint_errors(value):
                                            for name in ('turning', 'zeros', 'angles'))
 
 
+def _is_word(value):
+    return value in ('good', 'weak', 'bad')
+
+
 _NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
 _PROOF = {'before': _is_size, 'after': _is_size, 'ci95': lambda value: _is_range(value, _is_size), 'unit': _is_text, 'windows': _is_count}
 
@@ -86,7 +90,7 @@ KNOWN = {
     'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
-    'verdict': lambda value: value in ('good', 'weak', 'bad'), 'verdict_reasons': _is_list_of(_is_text),
+    'verdict': _is_word, 'verdicts': {sensor: _is_word for sensor in SENSORS}, 'verdict_reasons': _is_list_of(_is_text),
     'proof': {sensor: _is_proof for sensor in SENSORS},
 }
 """Part of a document -> what it must be, when it is there: a function, or a mapping whose entries are told in the same way."""

@@ -35,7 +35,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
             'undetermined': tuple(document.get('undetermined_directions') or ()), 'verdict': document.get('verdict') or '',
             'verdict_reasons': tuple(document.get('verdict_reasons') or ()),
-            **{name: dict(document.get(name) or {}) for name in ('gauge', 'statistics', 'conditions', 'proof', 'provenance')}}
+            **{name: dict(document.get(name) or {}) for name in ('gauge', 'statistics', 'conditions', 'verdicts', 'proof', 'provenance')}}
 
 
 def _model(document):

@@ -11,10 +11,12 @@ def beyond_known(share: float, section: str) -> str:
             f'{LOOK_FOR.get(section, "such sensors are known for: look for saturation, a loose mount, a wrong scale")}')
 
 
-def implausible(calibration: Calibration) -> list[str]:
-    """Return one line for each parameter group that lies outside what is known of any grade of instrument."""
+def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
+    """Return one line for each parameter group, of a sensor or of any, that lies outside what is known of any grade of instrument."""
     lines = []
     for effect in calibration.model.effects:
+        if sensor not in (None, effect.sensor):
+            continue
         amplitudes = effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])
         if effect.surpasses(amplitudes):
             grade, largest, source = effect.plausible[-1]

@@ -11,6 +11,7 @@ from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceError
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.trust import usage
 from imu_calibration.calibration.verdict import BAD, Verdict
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.segmentation.window import Window
@@ -82,7 +83,8 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> t
 
     `hints` as for `errors.with_hint`.
     """
-    return result.verdict.word, result.verdict.lines(hints)
+    said = usage(result.calibration)
+    return result.verdict.word, [*[said] * bool(said), *result.verdict.lines(hints)]
 
 
 def exit_code(calibration: Calibration) -> int:

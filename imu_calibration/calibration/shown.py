@@ -1,6 +1,6 @@
 """A calibration for people: every parameter with its standard deviation, in their units, and the verdict."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -25,11 +25,17 @@ def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
 
 
+def verdict_text(verdict: str, verdicts: Mapping[str, str]) -> str:
+    """Return a verdict in words, sensor by sensor where they differ; '' without one."""
+    differ = len(set(verdicts.values())) > 1
+    return f'{verdict} ({", ".join(f"{sensor} {word}" for sensor, word in verdicts.items())})' if differ else str(verdict)
+
+
 def summary(calibration: 'Calibration') -> str:
     """Return one line: the frame, the verdict, and how many parameters have which status."""
     counts = {status: sum(own == status for own in calibration.status) for status in Status}
     parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
-    return f'<Calibration of {calibration.frame_id or "an IMU"}: {calibration.verdict or "no verdict"}, {parts}>'
+    return f'<Calibration of {calibration.frame_id or "an IMU"}: {verdict_text(calibration.verdict, calibration.verdicts) or "no verdict"}, {parts}>'
 
 
 def as_text(calibration: 'Calibration') -> str:

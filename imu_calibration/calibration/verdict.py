@@ -9,9 +9,10 @@ import numpy as np
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
 from imu_calibration.calibration.proof_words import disproved, proven
+from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import with_hint
 from imu_calibration.units import for_people, significant
@@ -56,6 +57,8 @@ class Reason:
     """What to do about it; empty when nothing has to be done."""
     key: str | None = None
     """What has to be given for it, a key of `errors.KEYS`."""
+    sensors: tuple[str, ...] = SENSORS
+    """Whose parameters it concerns."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,13 @@ class Verdict:
     """GOOD, WEAK or BAD."""
     reasons: tuple
     """Reason, ..."""
+    sensors: dict[str, Judgement]
+    """Sensor -> the same of its parameters alone."""
+
+    @property
+    def text(self) -> str:
+        """The verdict in words, sensor by sensor where they differ."""
+        return verdict_text(self.word, self.sensors)
 
     def lines(self, hints: dict[str, str] | None = None) -> list[str]:
         """Return reasons and next steps, a line each; `hints` as for `errors.with_hint`."""
@@ -91,27 +101,44 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         Largest standard deviation of a determined parameter.
 
     """
-    against = _disproved(calibration) + _implausible(calibration) + _strange_causes(calibration) + _misfits(calibration) + _blind(calibration) + _undetermined(calibration)
-    word = BAD if any(r.word == BAD for r in against) else WEAK if against else GOOD
+    against = grave_reasons(calibration) + _strange_causes(calibration) + _undetermined(calibration)
+    words = {sensor: _worst([reason for reason in against if sensor in reason.sensors]) for sensor in SENSORS}
     favour = [] if against else [_all_well(calibration, tolerances)]
     order = (BAD, WEAK)
     against = sorted(against, key=lambda r: order.index(r.word))
-    return Verdict(word, tuple(favour + against + _notes(calibration, tolerances)))
+    return Verdict(_worst(against), tuple(favour + against + _notes(calibration, tolerances)), words)
+
+
+def _worst(against):
+    return BAD if any(reason.word == BAD for reason in against) else WEAK if against else GOOD
+
+
+def grave_reasons(calibration: Calibration) -> list[Reason]:
+    """Return what makes a verdict bad; it follows from what a document says."""
+    return _disproved(calibration) + _implausible(calibration) + _misfits(calibration) + _blind(calibration)
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
     found = judge(calibration, tolerances)
-    return replace(calibration, verdict=str(found.word), verdict_reasons=tuple(found.lines()), judgement=found)
+    return replace(calibration, verdict=str(found.word), verdicts={sensor: str(word) for sensor, word in found.sensors.items()},
+                   verdict_reasons=tuple(found.lines()), judgement=found)
 
 
 def _disproved(calibration):
-    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause") for line in disproved(calibration.proof)]
+    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
+            for sensor, entry in calibration.proof.items() for line in disproved({sensor: entry})]
 
 
 def _implausible(calibration):
-    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description')
-            for line in implausible(calibration)]
+    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description', sensors=_whose([section]))
+            for section in SECTIONS for line in implausible(calibration, section)]
+
+
+def _whose(sections):
+    """Return the sensors that something of these sections concerns; table and clock concern both."""
+    found = set(sections)
+    return tuple(sensor for sensor in SENSORS if sensor in found) if found <= set(SENSORS) else SENSORS
 
 
 def _strange_causes(calibration):
@@ -119,7 +146,8 @@ def _strange_causes(calibration):
     found = calibration.statistics.get('implausible') or {}
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
     return [Reason(WEAK, f'{name} {beyond_known(share, catalogue.get(name, ""))}; it is not in the model, and the standard deviations allow for it',
-                   f"see 'imu_calibration diagnose'; where {name} is what you expect, name it in the model") for name, share in found.items()]
+                   f"see 'imu_calibration diagnose'; where {name} is what you expect, name it in the model", sensors=_whose([catalogue.get(name, '')]))
+            for name, share in found.items()]
 
 
 def _ratios(calibration, sensor):
@@ -135,7 +163,7 @@ def _quiet(calibration):
 
 def _misfits(calibration):
     return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: the model leaves something out',
-                   "run 'imu_calibration diagnose' to find the cause")
+                   "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
             for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if ratio > MISFIT]
 
 
@@ -145,7 +173,7 @@ def _blind(calibration):
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
         matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
         if own and matrix_held and DETERMINED not in own:
-            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor)))
+            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor), sensors=(sensor,)))
     return reasons
 
 
@@ -161,9 +189,9 @@ def _undetermined(calibration):
         if status == Status.WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
             what = f'{listed(scale)}: the local gravity was not given, which scales them together'
-            reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity'))
+            reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
         for next_step, members in _by_need(calibration, names).items():
-            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step))
+            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step, sensors=_whose(name.partition('.')[0] for name in members)))
     return reasons
 
 

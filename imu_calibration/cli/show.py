@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from imu_calibration.calibration.result import summary
 from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.errors import with_hint
 from imu_calibration.preflight.finding import CheckFinding, Severity
@@ -51,8 +52,8 @@ def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, 
     for row in parameter_rows(found.calibration):
         table.add_row(*row)
     out.print(table)
-    out.print(f'verdict: {found.verdict.word}')
-    for line in found.verdict.lines(hints):
+    out.print(f'verdict: {found.verdict.text}')
+    for line in summary(found.result, hints)[1]:
         out.print('  ' + line, soft_wrap=True)
     files = 'calibration.yaml' + (' and report.html' if report else '')
     out.print(f'written: {files} in {folder}', soft_wrap=True)

@@ -28,6 +28,8 @@ class Adopted:
 
     calibration: Calibration
     """What its document says."""
+    used: trust.Usable
+    """What of it is used."""
     compensation: LiveCompensation
     """What corrects with it."""
     version: str
@@ -37,8 +39,8 @@ class Adopted:
 
     @property
     def caveats(self) -> list[str]:
-        """What should be known of it, and what speaks against it where somebody insisted."""
-        return trust.objections(self.calibration) + trust.caveats(self.calibration)
+        """What should be known of it: which sensor is left as it comes, and what speaks against it where somebody insisted."""
+        return self.used.lines or trust.objections(self.calibration) + trust.caveats(self.calibration)
 
     def line(self) -> str:
         """Return in one line what is in force."""
@@ -46,7 +48,9 @@ class Adopted:
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
         """Return whether a person should hear of this after `other`: it came from elsewhere, or says something else."""
-        if other is None or (self.source, self.calibration.verdict) != (other.source, other.calibration.verdict):
+        if other is None or any(getattr(self.calibration, name) != getattr(other.calibration, name) for name in ('verdict', 'verdicts')):
+            return True
+        if self.source != other.source or self.used.refused.keys() != other.used.refused.keys():
             return True
         return moved_beyond_sd(other.calibration, self.calibration)
 
@@ -65,10 +69,9 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
     """
     try:
         calibration = calibration_from_text(text)
-        if not settings.anyway:
-            trust.refuse_untrusted(calibration)
+        used = trust.Usable(calibration) if settings.anyway else trust.usable(calibration)
         _require_same_frame(calibration, before)
-        return Adopted(calibration, _prepared(calibration, settings, frames, before), version_of(text), source)
+        return Adopted(calibration, used, _prepared(used.calibration, settings, frames, before), version_of(text), source)
     except ImuCalibrationError:
         raise
     except Exception as error:   # whatever a document does, it must not end the node
@@ -77,7 +80,7 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
 
 def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
     """Return the same calibration under other settings or transforms."""
-    return replace(adopted, compensation=_prepared(adopted.calibration, settings, frames, adopted))
+    return replace(adopted, compensation=_prepared(adopted.used.calibration, settings, frames, adopted))
 
 
 def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> bool:
@@ -115,7 +118,7 @@ def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: S
 def _watch(calibration: Calibration, transfer: Transfer | None, settings: CompensatorSettings, before: Adopted | None) -> StopWatch:
     """Return who looks at the stops: the one that does already, where nothing changes for it."""
     options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
-    watch = None if before is None or before.calibration is not calibration else before.compensation.watch
+    watch = None if before is None or before.used.calibration is not calibration else before.compensation.watch
     if before is not None and watch is not None and watch.health.options == options:
         was = before.compensation.transfer
         if was is transfer or (transfer is not None and transfer.is_close(was)):

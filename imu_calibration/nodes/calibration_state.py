@@ -35,3 +35,5 @@ class WorkerState:
     """What the model gets wrong; None without a table."""
     place: str = ''
     """Where the calibration is saved."""
+    judged: str = ''
+    """The verdict in words, sensor by sensor where they differ."""

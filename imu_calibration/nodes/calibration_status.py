@@ -19,7 +19,7 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     if state.streams is not None:
         level = max(_STREAM_LEVELS[state.streams.word], WARN if stream_faults else OK)
         found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
-    parts = [state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
+    parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
     level = ERROR if state.faults else max(_VERDICT_LEVELS[state.verdict], WARN if state.trouble and state.verdict else OK)
     found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
     if state.session is not None:

@@ -220,8 +220,8 @@ class CalibrationWorker(threading.Thread):
     def _solve(self) -> tuple[bool, str]:
         result, _ = self._publish_solution(pending=True)
         self._diagnosis.want()
-        verdict, lines = summary(result, self.hints)
-        return True, f'{verdict} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
+        _, lines = summary(result, self.hints)
+        return True, f'{result.verdict.text} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
 
     def _diagnose(self) -> tuple[bool, str]:
         if not self._diagnosis_period:
@@ -234,7 +234,7 @@ class CalibrationWorker(threading.Thread):
         text, what = None, ''
         try:
             result, text = self._settled_solution()
-            what = f'{result.calibration.verdict}: {missing(result.calibration) or "every parameter is determined"}'
+            what = f'{result.verdict.text}: {missing(result.calibration) or "every parameter is determined"}'
         except ImuCalibrationError as error:
             what = f'no calibration yet: {error.told(self.hints)}'
         if text is None and not self.live.n_windows:
@@ -306,7 +306,7 @@ class CalibrationWorker(threading.Thread):
         diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
         self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values, self.live.status(self.hints), diagnosis,
-                                 str(self.place.calibration))
+                                 str(self.place.calibration), '' if result is None else result.verdict.text)
 
     def _cover(self) -> None:
         """Make the picture anew when there is something new in it."""

@@ -37,7 +37,7 @@ class CompensatorView(LiveView):
     def take_calibration(self, adopted: Adopted) -> None:
         """Show what is in force."""
         self._adopted = adopted
-        self.show(PARAMETERS, partial(parameters, adopted.calibration, tolerances_of(adopted.calibration.model)))
+        self.show(PARAMETERS, partial(parameters, adopted.used.calibration, tolerances_of(adopted.used.calibration.model)))
         self._listen()
 
     def _listen(self) -> None:

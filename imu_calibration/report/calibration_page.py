@@ -4,6 +4,7 @@ from typing import Any
 
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.trust import usage
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
@@ -33,7 +34,7 @@ def calibration_report(result: CalibrationResult) -> str:
     errors = result.window_errors()
     at_rest, moving = reading_tables(result, errors)
     navigation = navigation_section(result, errors)
-    return render('calibration.html', title='IMU calibration', verdict=result.verdict,
+    return render('calibration.html', title='IMU calibration', verdict=result.verdict, usage=usage(result.calibration),
                   facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, errors, navigation),
                   groups=parameter_groups(result),
                   sample=worked_sample(result), derived=derived_section(result), residuals=residual_section(result, errors),

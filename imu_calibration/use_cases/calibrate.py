@@ -13,7 +13,7 @@ from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.check import check_on_table
 from imu_calibration.calibration.document import Calibration, calibration_to_text
-from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
 from imu_calibration.calibration.verdict import Verdict, judged
 from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
@@ -69,12 +69,12 @@ class Calibrated:
         return repr(self.calibration)
 
     def __str__(self):
-        return '\n'.join([str(self.calibration), f'verdict: {self.verdict.word}', *(f'  {line}' for line in self.verdict.lines())])
+        return '\n'.join([str(self.calibration), f'verdict: {self.verdict.text}', *(f'  {line}' for line in summary(self.result)[1])])
 
     def _repr_html_(self):
         from markupsafe import escape
-        lines = ''.join(f'<li>{escape(line)}</li>' for line in self.verdict.lines())
-        return f'<p><b>{self.verdict.word}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
+        lines = ''.join(f'<li>{escape(line)}</li>' for line in summary(self.result)[1])
+        return f'<p><b>{self.verdict.text}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
 
 
 def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand | None = None, *, jobs: int | None = 1,

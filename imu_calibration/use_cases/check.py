@@ -39,7 +39,8 @@ class Checked:
         return 0 if self.helps else 3
 
     def __str__(self):
-        answer = 'it helps' if self.helps else 'it is not shown to help'
+        helped = ', '.join(self.result.helped)
+        answer = 'it helps' if self.helps else 'it is not shown to help' + (f' but for the {helped}' if helped else '')
         return '\n'.join([answer, *(f'  {line}' for line in (*self.result.lines, *self.notes))])
 
     __repr__ = __str__

@@ -1,7 +1,7 @@
 """From a recording and a calibration to corrected samples, in memory or in a new bag."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.measured_noise import with_measured_noise
-from imu_calibration.calibration.trust import caveats, objections, refuse_untrusted
+from imu_calibration.calibration.trust import Usable, caveats, objections, usable
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, SampleBlock
@@ -32,6 +32,13 @@ class Compensated:
     """What speaks against the calibration, was outside its conditions, or could not be corrected, a line each."""
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Sensor that was left as it came -> why."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 all is corrected, 3 part of it could not be read, or one sensor was left as it came."""
+        return 3 if self.lost or self.refused else 0
 
     def __repr__(self):
         return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])
@@ -61,7 +68,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     correct_stamps : bool
         Move the stamps back by the calibration's time_offset.
     anyway : bool
-        Also with a calibration whose verdict is bad or whose proof failed.
+        Also with a calibration whose verdict is bad or whose proof failed. Without it a sensor of which that is so is left as it comes,
+        where the other one is shown to be helped.
     noise : NoiseFigures or path-like, optional
         noise.yaml of this IMU: the covariances of the corrected readings follow from it where the messages bring none.
     imu_topic, temperature_topic : str, optional
@@ -75,14 +83,13 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
 
     """
     calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
-    if not anyway:
-        refuse_untrusted(calibration)
-    figures = noise_of(noise)
+    used = Usable(calibration) if anyway else usable(calibration)
+    calibration, figures = used.calibration, noise_of(noise)
     calibration = calibration if figures is None else with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
     late = late_ns(calibration, correct_stamps)
     if isinstance(recording, (ImuSamples, SampleBlock)):
-        return _in_memory(recording, calibration, transfer, late)
+        return _in_memory(recording, calibration, transfer, late=late, used=used)
     if output is not None and Path(output).exists():
         raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it')
     topics = Topics(imu_topic, None, temperature_topic)
@@ -96,23 +103,23 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
             return stream.correct(imu)
         if output is None:
             parts = [_corrected(block.imu, correct(block.imu), transfer, late) for block in bag.blocks() if block.imu is not None]
-            return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost)
+            return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost, used)
         from msg_adapters.copying import copy_with_corrected
         lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic=corrected_topic, correct=correct,
                                    propagate=stream.propagate, frame_id=target_frame or None,
                                    mat_ts=None if transfer is None else transfer.mat_ts, late_ns=late)
-        return _outcome(None, stream, lost)
+        return _outcome(None, stream, lost, used)
 
 
-def _in_memory(recording, calibration, transfer, late):
+def _in_memory(recording, calibration, transfer, *, late, used):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
-    return _outcome(_corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {})
+    return _outcome(_corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used)
 
 
-def _outcome(imu, stream, lost):
-    warnings = objections(stream.calibration) + caveats(stream.calibration) + stream.warnings()
-    return Compensated(imu, stream.count, warnings, lost)
+def _outcome(imu, stream, lost, used):
+    against = used.lines or objections(stream.calibration) + caveats(stream.calibration)
+    return Compensated(imu, stream.count, against + stream.warnings(), lost, dict(used.refused))
 
 
 def _corrected(imu, corrected, transfer, late):

@@ -165,4 +165,20 @@ LIVE = _of(
     ('solving again adds the earlier run again', 'calibration/live.py', 'merge([copied(self.earlier), gathered])', 'merge([self.earlier, gathered])',
      'test_live_calibration.py'),
 )
-MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *DIAGNOSIS, *HAND, *TRUST, *FILES, *SIGNS, *LIVE)
+BY_SENSOR = _of(
+    'imu_calibration',
+    ('a sensor without a proof is used beside a refused one', 'calibration/trust.py', 'if sensor not in against and sensor not in calibration.proof:',
+     'if False:', 'test_verdict_by_sensor.py'),
+    ('by hand the gyroscope is used beside a refused accelerometer', 'calibration/trust.py', 'calibration.gauge.get(\'axes\') == HAND_AXES', 'False',
+     'test_verdict_by_sensor.py'),
+    ('documents that were judged as a whole are judged by sensor', 'calibration/trust.py', 'if BAD in calibration.verdicts.values() else word',
+     'if calibration.verdicts else GOOD', 'test_verdict_by_sensor.py'),
+    ('what a refused sensor reads still corrects the other one', 'calibration/nominal.py', 'not any(group.uses', 'True or not any(group.uses',
+     'test_verdict_by_sensor.py'),
+    ('a refused sensor is as certain as a used one', 'calibration/nominal.py', 'np.diag(effect.prior_sds()**2)', 'np.diag(0 * effect.prior_sds()**2)',
+     'test_verdict_by_sensor.py'),
+    ('a reason concerns both sensors', 'calibration/verdict.py', 'if sensor in reason.sensors]) for sensor', ']) for sensor', 'test_verdict_by_sensor.py'),
+    ('who corrects takes the refused sensor too', 'nodes/adoption.py', 'if settings.anyway else trust.usable(calibration)', 'if True else trust.usable(calibration)',
+     'test_adoption.py'),
+)
+MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *DIAGNOSIS, *HAND, *TRUST, *FILES, *SIGNS, *LIVE, *BY_SENSOR)

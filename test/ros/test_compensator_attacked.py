@@ -100,6 +100,12 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
     publisher.publish(String(data=REFUSED['bad'][0]))
     bench.until(lambda: node.adopted.version == version_of(REFUSED['bad'][0]), 'the bad one, since somebody insists')
     bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'its verdict is bad' in bench.lines()[STATUS][1], 'a warning all the same')
+    assert node.set_parameters([Parameter('anyway', value=False)])[0].successful
+    half = calibration_to_text(replace(OTHER, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}, 
+                                       proof=PROOF | {'accelerometer': WORSE['accelerometer']}))
+    publisher.publish(String(data=half))
+    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'the accelerometer is left as it comes' in bench.lines()[STATUS][1], 'a word on the sensor that is left')
+    assert bench.figure(STATUS, 'left as they come') == 'accelerometer' and node.adopted.version == version_of(half)
     answer = bench.call('/compensator_node/reload')
     assert answer.success and version_of(GOOD_TEXT) in answer.message
 

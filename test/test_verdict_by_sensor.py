@@ -1,0 +1,148 @@
+"""A sensor that a recording cannot help is left as it comes, and the other one is corrected: on a vertical shaft the accelerometer sees gravity along one axis."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imu_calibration as imu
+from imu_calibration import files
+from imu_calibration.calibration import trust
+from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.nominal import with_nominal
+from imu_calibration.calibration.verdict import HAND_AXES, grave_reasons
+from imu_calibration.cli.main import main
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.errors import DocumentError
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
+from msg_adapters.bag import open_recording
+from msg_adapters.write import write_session
+
+from worlds.compensation_cases import random_calibration
+from worlds.misfit_worlds import SHAFT, sweeps
+from worlds.physics import make_session
+
+VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
+PROOF = {'accelerometer': {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8},
+         'gyroscope': {'before': 0.02, 'after': 0.001, 'ci95': [0.03, 0.08], 'unit': 'rad/s', 'windows': 8}}
+HARMS = {'after': 0.3, 'ci95': [1.2, 1.8]}
+GOOD = random_calibration(1, verdict='good', verdicts=dict.fromkeys(SENSORS, 'good'), verdict_reasons=('all is well',), proof=PROOF)
+
+
+@pytest.fixture(scope='module')
+def block():
+    """A session on a vertical shaft, of an IMU whose accelerometer is as its data sheet has it, and whose gyroscope is not."""
+    session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
+    triad = session.truth['accelerometer']
+    force = (session.imu.force_s - triad.bias) @ np.linalg.inv(triad.matrix).T
+    return SampleBlock(replace(session.imu, force_s=force), session.joints)
+
+
+@pytest.fixture(scope='module')
+def yaw(block):
+    return imu.calibrate(block, Table.from_mapping(VERTICAL))
+
+
+def harmed(sensor, **changes):
+    """A calibration that is good but for the proof of one sensor."""
+    return replace(GOOD, proof=PROOF | {sensor: PROOF[sensor] | HARMS}, **changes)
+
+
+def test_each_sensor_has_its_own_word_and_the_worst_is_that_of_both(yaw):
+    calibration = yaw.calibration
+    assert calibration.verdict == yaw.verdict.word == 'bad' and calibration.verdicts == {'accelerometer': 'bad', 'gyroscope': 'weak'}
+    assert {reason.sensors for reason in grave_reasons(calibration)} == {('accelerometer',)}
+    read = calibration_from_text(calibration_to_text(calibration))
+    assert read.verdicts == calibration.verdicts and trust.refused_sensors(read).keys() == {'accelerometer'}
+    assert trust.objections(read, 'accelerometer') and not trust.objections(read, 'gyroscope') and trust.objections(read)
+    assert yaw.exit_code == 3
+    for text in (str(yaw), yaw.report, trust.standing(read), repr(read)):
+        assert 'accelerometer bad, gyroscope weak' in text
+    assert 'compensation corrects the gyroscope with it, and leaves the accelerometer as it comes' in str(yaw)
+    assert 'Compensation corrects the gyroscope with it' in yaw.report
+
+
+def test_compensate_corrects_the_one_and_leaves_the_other(yaw, block, tmp_path, capsys):
+    before, after = block.imu, imu.compensate(block, yaw.calibration)
+    np.testing.assert_array_equal(after.imu.force_s, before.force_s)
+    whole = imu.compensate(block, yaw.calibration, anyway=True)
+    np.testing.assert_allclose(after.imu.rate_s, whole.imu.rate_s, rtol=0, atol=1e-12)
+    assert np.abs(after.imu.rate_s - before.rate_s).max() > 1e-3 and np.abs(whole.imu.force_s - before.force_s).max() > 1e-4
+    assert after.refused.keys() == {'accelerometer'} and after.warnings[0].startswith('the accelerometer is left as it comes: its verdict is bad')
+    assert not whole.refused and whole.exit_code == 0
+    write_session(tmp_path / 'bag', block.imu, block.joints)
+    yaw.save(tmp_path, report=False)
+    assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]) == 3
+    told = capsys.readouterr().out
+    assert told.count('the accelerometer is left as it comes') == 1 and 'written' in told
+
+
+def test_what_the_refused_sensor_would_correct_goes_as_well():
+    rich = random_calibration(2, ('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity', 'gyro_quadratic'))
+    still, blind = (with_nominal(rich, [sensor]).model for sensor in SENSORS)
+    assert still.accelerometer == ('bias', 'matrix') and still.gyroscope == ('bias', 'matrix', 'gyro_quadratic')
+    assert blind.accelerometer == ('bias', 'matrix', 'accel_quadratic') and blind.gyroscope == ('bias', 'matrix')
+
+
+def test_the_covariance_of_what_is_left_alone_is_that_of_a_data_sheet():
+    found = with_nominal(GOOD, ['accelerometer'])
+    for role in (Role.OFFSET, Role.LINEAR):
+        effect, part = found.model.find('accelerometer', role), found.model.part('accelerometer', role)
+        np.testing.assert_array_equal(found.values[part], effect.prior_values())
+        np.testing.assert_allclose(found.sd[part], effect.prior_sds())
+        assert set(found.status[part]) == {'held'} and not np.delete(found.covariance[part], np.r_[part], axis=1).any()
+        kept, was = found.model.part('gyroscope', role), GOOD.model.part('gyroscope', role)
+        np.testing.assert_array_equal(found.covariance[kept, kept], GOOD.covariance[was, was])
+
+
+@pytest.mark.parametrize(('calibration', 'refused'), (
+    (GOOD, set()),
+    (harmed('gyroscope'), {'gyroscope'}),
+    (harmed('accelerometer'), {'accelerometer'}),
+    (harmed('accelerometer', gauge={'axes': HAND_AXES}), set(SENSORS)),
+    (harmed('gyroscope', gauge={'axes': HAND_AXES}), {'gyroscope'}),
+    (replace(GOOD, proof={'gyroscope': PROOF['gyroscope'] | HARMS}), set(SENSORS)),
+    (replace(GOOD, verdict='bad', verdicts={}), set(SENSORS)),
+    (replace(GOOD, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}), {'accelerometer'}),
+    (replace(GOOD, verdict='bad'), set(SENSORS)),
+), ids=('nothing', 'gyroscope', 'accelerometer', 'by hand the axes', 'by hand gyroscope', 'the other not proven', 'judged together', 'judged apart',
+        'of neither'))
+def test_who_is_refused(calibration, refused):
+    assert trust.refused_sensors(calibration).keys() == refused
+    if refused == set(SENSORS):
+        with pytest.raises(DocumentError, match='against this one speaks'):
+            trust.usable(calibration)
+    else:
+        assert trust.usable(calibration).refused.keys() == refused
+        assert (trust.usable(calibration).calibration is calibration) == (not refused)
+
+
+def test_check_says_which_sensor_it_helps(yaw, block):
+    values = yaw.calibration.values.copy()
+    values[yaw.calibration.model.part('accelerometer', Role.OFFSET)] += 0.1
+    found = imu.check(block, replace(yaw.calibration, values=values), Table.from_mapping(VERTICAL))
+    assert str(found).splitlines()[0] == 'it is not shown to help but for the gyroscope' and found.exit_code == 3
+    assert any(line.startswith('gyroscope error on data that took no part') for line in found.result.lines)
+
+
+@pytest.mark.real_data
+def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
+    """A vertical shaft: the accelerometer's values would be worse than none, those of the gyroscope halve its error, and all that is used helps."""
+    folder = recordings / 'shaft_yaw_slow_later'
+    table = files.read_table(folder / 'table.yaml')
+    with open_recording(folder) as recording:
+        blocks = list(recording.blocks(table.joint_names))
+    whole = [kind.concatenate([part for block in blocks if (part := getattr(block, name)) is not None])
+             for kind, name in ((ImuSamples, 'imu'), (JointSamples, 'joints'))]
+    middle = int(whole[0].stamp_ns[len(whole[0]) // 2])
+    first, second = (SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole)) for early in (True, False))
+    found = imu.calibrate(first, table)
+    assert found.calibration.verdicts == {'accelerometer': 'bad', 'gyroscope': 'weak'} and found.exit_code == 3
+    used = trust.usable(found.calibration)
+    assert used.refused.keys() == {'accelerometer'}
+    here = imu.check(second, found.calibration, table)
+    assert list(here.result.helped) == ['gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+    left = imu.check(second, used.calibration, table).proof
+    assert left['accelerometer']['after'] == pytest.approx(left['accelerometer']['before'], rel=0.02)
+    assert left['gyroscope']['after'] == pytest.approx(here.proof['gyroscope']['after'], rel=0.02)
