@@ -165,7 +165,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
             lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
-        lines += [f'   {line}' if rest.significant else f'{sensor}: {line}' for line in beyond_lines(sensor, rest)]
+        lines += [f'   {line}' if rest.significant else line for line in beyond_lines(sensor, rest)]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines

@@ -95,6 +95,12 @@ DIAGNOSIS = _of(
     'imu_calibration/diagnosis',
     ('threshold of what is unexplained', 'unexplained.py', 'SIGNIFICANT = 5.0', 'SIGNIFICANT = 50.0', 'test_search.py'),
     ('any correlation is told', 'unexplained.py', 'if p_value < ALPHA and share > max(best[1], 0.15):', 'if share > best[1]:', 'test_search.py'),
+    ('a line of few stretches is a tone', 'beyond/spectrum.py', 'np.where(hits > MOSTLY * count[:, None], binom',
+     'np.where(hits > 0, 0 * binom', 'test_spectrum.py'),
+    ('a finding that a formula does without stays', 'beyond/look.py', 'if beside < NOT_NEEDED * alone:', 'if False:',
+     'test_beyond_catalogue.py'),
+    ('a finding goes for any formula', 'beyond/look.py', 'if beside < NOT_NEEDED * alone:', 'if True:',
+     'test_beyond_catalogue.py'),
 )
 HAND = _of(
     'imu_calibration',
