@@ -86,6 +86,18 @@ def test_a_port_that_is_taken_is_one_sentence(server):
         FoxgloveServer('/other', host='127.0.0.1', port=port, topics=(), clock=int, complain=print)
 
 
+def test_what_stops_take_off_is_taken_off_what_is_shown():
+    from imu_calibration.compensation.stop_watch import CorrectedStretch
+    from imu_calibration.use_cases.view_messages import readings
+    samples = np.column_stack([[0, 20_000_000], np.tile(np.arange(12.0), (2, 1))])
+    offset, sd = (0.5, 0.0, -0.25), (np.full(3, 0.1), np.full(3, np.nan))
+    (first, shown), (second, _) = readings(CorrectedStretch(10**18, samples, offset), sd)
+    assert (first, second) == (10**18, 10**18 + 20_000_000)
+    assert shown['corrected'] == {'gyroscope': {'x': -0.5, 'y': 1.0, 'z': 2.25}, 'accelerometer': {'x': 3.0, 'y': 4.0, 'z': 5.0}}
+    assert shown['measured']['gyroscope'] == {'x': 6.0, 'y': 7.0, 'z': 8.0} and shown['low']['accelerometer'] == {}
+    assert shown['high']['gyroscope']['x'] == pytest.approx(-0.5 + 0.1 * BAND)
+
+
 pytest.importorskip('rclpy')
 
 

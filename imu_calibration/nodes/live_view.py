@@ -1,13 +1,17 @@
 """The live picture of a node for Foxglove: there while parameter 'foxglove' asks for it; without it the node goes on as it was."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from imu_calibration.errors import InputError
 from imu_calibration.nodes.complaints import Complaints
 from imu_calibration.settings import setting
-from imu_calibration.use_cases.foxglove_server import FoxgloveServer
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.foxglove_server import FoxgloveServer
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class LiveView:
         if self.is_on and not settings.foxglove:
             self.close()
         elif settings.foxglove and not self.is_on:
+            from imu_calibration.use_cases.foxglove_server import FoxgloveServer  # a second of imports, for those who ask for it
             self._server = FoxgloveServer(self._node.get_fully_qualified_name(), host=settings.foxglove_host, port=settings.foxglove_port,
                                           topics=self._topics, clock=lambda: self._node.get_clock().now().nanoseconds,
                                           complain=self._complaints.event)

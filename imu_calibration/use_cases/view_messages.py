@@ -1,17 +1,20 @@
 """What is shown of a calibration and of a compensation beside the sphere, as JSON with a schema for each topic: in a file, and live."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.residual_spectrum import residual_spectrum
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.compensation.health import HealthState
-from imu_calibration.compensation.stop_watch import CorrectedStretch
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.segmentation.window import Window
+
+if TYPE_CHECKING:   # a compensator that shows nothing must not wait for what a calibration needs
+    from imu_calibration.calibration.document import Calibration
+    from imu_calibration.calibration.result import CalibrationResult
+    from imu_calibration.compensation.health import HealthState
+    from imu_calibration.compensation.stop_watch import CorrectedStretch
+    from imu_calibration.segmentation.window import Window
 
 PARAMETERS, RESIDUAL, SPECTRUM, SPHERE = '/imu/parameters', '/imu/residual/windows', '/imu/residual/spectrum', '/imu/coverage'
 READINGS, HEALTH = '/imu/readings', '/imu/health'
@@ -67,6 +70,7 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
 
 def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, Any]:
     """Return the amplitude density of what is left within windows with motion; no lines where none is long enough."""
+    from imu_calibration.calibration.residual_spectrum import residual_spectrum
     frequency, density = residual_spectrum(result, windows)
     return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
 
