@@ -14,7 +14,7 @@ pytest.importorskip('rclpy')
 from imu_calibration.diagnosis.live import FOUND  # noqa: E402
 from imu_calibration.driving.campaign import Suspect  # noqa: E402
 from imu_calibration.nodes import joint_commands  # noqa: E402
-from imu_calibration.nodes.planner_node import findings_from  # noqa: E402
+from imu_calibration.nodes.planner_worker import findings_from  # noqa: E402
 
 from ros.live_station import TABLE, Station  # noqa: E402
 

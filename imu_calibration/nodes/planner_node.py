@@ -27,7 +27,6 @@ from visualization_msgs.msg import MarkerArray
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
 from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
 from imu_calibration.driving.separating import separator_of
@@ -41,7 +40,7 @@ from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
 from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.planner_worker import Peers, PlannerWorker
+from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.noise import expected_noise, require_grade
@@ -288,15 +287,6 @@ class PlannerNode(Node):
         faults = self._joints.faults() + self._calibrations.faults()
         text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
         return [make_status(_LEVELS.get(driver.state, WARN if faults else OK), 'drive', text, values=values)]
-
-
-def findings_from(told: dict[str, str]) -> list[Suspect]:
-    """Return what the values of calibration_node's status 'diagnosis' say, the strongest first."""
-    if told.get('outcome') != FOUND:
-        return []
-    found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]
-    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{each}.'): float(value) for each in (effect, *mates)
-                                           for key, value in told.items() if key.startswith(f'{SIZE}{each}.')}) for effect, mates in found]
 
 
 def main(arguments: list[str] | None = None) -> int:

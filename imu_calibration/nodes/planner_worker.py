@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
 from imu_calibration.driving.campaign import Campaign, Suspect
 from imu_calibration.driving.driver import Driver, DriveState
 from imu_calibration.errors import ImuCalibrationError, shortened
@@ -182,3 +183,10 @@ class PlannerWorker(threading.Thread):
         self._peers.say(INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
 
 
+def findings_from(told: dict[str, str]) -> list[Suspect]:
+    """Return what the values of calibration_node's status 'diagnosis' say, the strongest first."""
+    if told.get('outcome') != FOUND:
+        return []
+    found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]
+    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{each}.'): float(value) for each in (effect, *mates)
+                                           for key, value in told.items() if key.startswith(f'{SIZE}{each}.')}) for effect, mates in found]
