@@ -125,6 +125,6 @@ def test_what_a_smaller_recording_shows_is_taken_in():
 
 def test_what_other_recordings_name_comes_once_and_beside_what_the_largest_names():
     def found(*named):
-        return SimpleNamespace(named=[SimpleNamespace(effect=SimpleNamespace(key=('gyroscope', name))) for name in named])
+        return SimpleNamespace(adopted=[SimpleNamespace(effect=SimpleNamespace(key=('gyroscope', name))) for name in named])
     more = _named_elsewhere(found('a'), [found('a', 'b'), found('b', 'c')])
     assert [question.effect.key[1] for question in more] == ['b', 'c']
