@@ -146,6 +146,7 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
     calibration = Calibration(model, values, np.diag(model.prior()[1]**2), ('weak',) * len(values))
     separator = make_separator(table, calibration, pair, noise=NOISE)
     before = separator.situation.goal.missing(separator.situation.belief(separator.known).known)
+    assert 0 < separator.plan(longest=6.0).seconds <= 6.0
     plan = separator.plan(longest=180.0)
     assert before == ('gyro_quadratic and gyro_scale_asymmetry',) and plan.missing == () and plan.seconds < 180
     speeds = {round(float(np.abs(motion.from_position(motion.place)[1].rate_to).max()), 1) for motion in plan.motions

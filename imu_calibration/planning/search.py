@@ -68,7 +68,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         choice = Offers(situation, belief, place, margin=margin)
         must = len(chosen) < len(first)
         number = first[len(chosen)] if must else choice.best
-        if not must and choice.hopeless(number):
+        if not must and (choice.hopeless(number) or spent + float(choice.seconds[number]) > longest):
             break
         belief.take(choice.information[number], float(choice.seconds[number]))
         chosen.append(number)
