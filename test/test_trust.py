@@ -58,6 +58,11 @@ def test_files_of_earlier_versions_stay_usable_and_say_so():
     assert trust.standing(old) == 'no verdict, no proof on held-out data'
 
 
+def test_a_verdict_on_both_is_one_on_each_where_nobody_judged_them_apart():
+    both = replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',))
+    assert all(trust.objections(both, sensor) == ['its verdict is bad: the residuals are large'] for sensor in ('accelerometer', 'gyroscope'))
+
+
 def test_a_weak_calibration_says_what_is_missing():
     weak = replace(GOOD, verdict='weak', status=(HELD,) * 2 + GOOD.status[2:])
     assert trust.caveats(weak) == ['its verdict is weak: 2 of 33 parameters not determined (accelerometer.bias.x, accelerometer.bias.y)']

@@ -178,7 +178,7 @@ BY_SENSOR = _of(
     ('by hand the gyroscope is used beside a refused accelerometer', 'calibration/trust.py', 'calibration.gauge.get(\'axes\') == HAND_AXES', 'False',
      'test_verdict_by_sensor.py'),
     ('documents that were judged as a whole are judged by sensor', 'calibration/trust.py', 'if BAD in calibration.verdicts.values() else word',
-     'if calibration.verdicts else GOOD', 'test_verdict_by_sensor.py'),
+     'if calibration.verdicts else GOOD', 'test_trust.py'),
     ('what a refused sensor reads still corrects the other one', 'calibration/nominal.py', 'not any(group.uses', 'True or not any(group.uses',
      'test_verdict_by_sensor.py'),
     ('a refused sensor is as certain as a used one', 'calibration/nominal.py', 'np.diag(effect.prior_sds()**2)', 'np.diag(0 * effect.prior_sds()**2)',
