@@ -70,7 +70,7 @@ def test_pairs_are_asked_where_a_rest_stays(monkeypatch, rest, found):
     assert names(investigation._looked_again(outcome(search, [], rest), None, False).named) == found
 
 
-def test_what_leaves_more_is_not_taken(monkeypatch):
+def test_what_leaves_a_fifth_is_not_taken(monkeypatch):
     search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
-    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, 60.0))
+    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, 10.0))
     assert not investigation._looked_again(outcome(search, [], 50.0), None, False).named

@@ -179,6 +179,15 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
     assert explained.share([OFFSET], OFFSET) == pytest.approx(1 / 3)
 
 
+@pytest.mark.parametrize(('within', 'share'), ((20.0, 1.0), (0.6e3, 0.5)))
+def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(within, share):
+    """It explains the means; within windows, where it shows or does not, as much stays as it removes in all."""
+    explained = Explained.__new__(Explained)
+    explained.n_means, explained.n_within = 100.0, 1000.0
+    explained.excess = lambda chosen: {'accelerometer': (0.0, 1000.0 + within) if chosen else (1000.0, 1000.0 + 2 * within)}
+    assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
+
+
 def test_every_bias_moves_by_half_the_white_noise_of_a_second():
     (process,) = natural_processes(NoiseModel(np.full(3, 0.04), np.ones(3)), 0.01)
     assert process.sd == pytest.approx(0.5 * np.sqrt(0.04 * 0.01)) and process.time == 100.0

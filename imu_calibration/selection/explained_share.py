@@ -17,6 +17,8 @@ LEAST_SHARE = 0.7
 """Share of the unexplained that a finding must remove from held-out windows, where a significant rest remains."""
 LEAST_SHARE_SMOOTH = 0.9
 """The same for an effect that is smooth in time: any smooth curve resembles any other."""
+SHOWS = 0.2
+"""An effect shows where it removes at least this share of what it removes elsewhere."""
 SIGNIFICANT_REST = 5.0
 """Standard deviations above what noise leaves from which a rest counts as significant."""
 
@@ -49,18 +51,35 @@ class Explained:
 
     def rest(self, excess: tuple[float, float]) -> float:
         """Return the part of an excess that noise does not explain: zero where it is not significant."""
-        limits = (SIGNIFICANT_REST * np.sqrt(2 * self.n_means), SIGNIFICANT_REST * np.sqrt(2 * self.n_within))
-        return sum(value for value, limit in zip(excess, limits) if value > limit)
+        return float(sum(self._rest(excess)))
+
+    def _rest(self, excess):
+        """Return the same of the means and within windows, shape (2,)."""
+        limits = SIGNIFICANT_REST * np.sqrt(2 * np.array([self.n_means, self.n_within]))
+        return np.where(np.asarray(excess) > limits, excess, 0.0)
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return the least share of the unexplained that the effect removes, over the sensors in which it shows."""
+        """
+        Return the least share of the unexplained that the effect removes, over the sensors in which it shows.
+
+        Of a sensor counts the part in which it shows, the means of windows, what is within them, or both: what nobody explains in the other part does not
+        hide it.
+        """
+        return min((removed / (removed + rest) for removed, rest in self._where_it_shows(chosen, question)), default=0.0)
+
+    def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
+        """Return what the choice leaves that noise does not explain, where the effect shows."""
+        return sum(rest for _, rest in self._where_it_shows(chosen, question))
+
+    def _where_it_shows(self, chosen, question):
+        """Return (removed by the effect, significant rest beside it) of each sensor in which it shows, of the parts in which it does."""
         with_it, without = self.excess(chosen), self.excess([q for q in chosen if q is not question])
-        removed = {s: sum(without[s]) - sum(with_it[s]) for s in sensors_of(question.effect)}
-        strongest = max(removed.values())
-        if strongest <= 0:
-            return 0.0
+        removed = {s: np.subtract(without[s], with_it[s]) for s in sensors_of(question.effect)}
+        strongest = max(parts.sum() for parts in removed.values())
         # A cause of the table shows in both sensors; where it hardly shows it proves nothing.
-        return min(value / (value + self.rest(with_it[s])) for s, value in removed.items() if value >= 0.2 * strongest)
+        sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
+        shown = {s: removed[s] >= SHOWS * removed[s].max() for s in sensors}
+        return [(float(removed[s][shown[s]].sum()), float(self._rest(with_it[s])[shown[s]].sum())) for s in sensors]
 
 
 def with_steps_of_encoders(noise: NoiseModel, recording: ReducedRecording, *, step: float) -> NoiseModel:

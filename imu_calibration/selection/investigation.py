@@ -34,6 +34,8 @@ LINEARISATIONS = 5
 """Times that the columns are taken anew, at most."""
 LEAST_REDUCTION = 0.01
 """Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for sure."""
+LEFT = 0.1
+"""Share of a significant rest that pairs, or effects of implausible size, may leave."""
 LEAST_WINDOWS = 8
 """Fewer windows leave none to hold out."""
 
@@ -132,7 +134,11 @@ class _Outcome:
 
 
 def _looked_again(outcome, attempted, any_size):
-    """Return the _Outcome of what leaves less, where a significant rest stays: searches that start from pairs, or that ask about implausible sizes too."""
+    """
+    Return the _Outcome of what explains a significant rest that stays: searches that start from pairs, or that ask about implausible sizes too.
+
+    Any two of many effects take something off a rest that has another cause: together they must take nearly all.
+    """
     if not outcome.rest:
         return outcome
     attempt = outcome.attempt.asking_any_size() if any_size else outcome.attempt
@@ -141,7 +147,8 @@ def _looked_again(outcome, attempted, any_size):
     best = min(found, key=search.cost)
     if {question.label for question in best} == known or (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
         return outcome
-    return min(outcome, _settled(attempted, attempt, best), key=lambda each: each.rest)
+    other = _settled(attempted, attempt, best)
+    return other if other.rest < LEFT * outcome.rest else outcome
 
 
 def _settled(attempted, attempt, chosen, progress=None):
@@ -197,9 +204,8 @@ def _that_help(attempt, explained, named):
 
 
 def _needed_reduction(attempt, explained, chosen, question):
-    """Return what the residual must fall by: at all, and plainly where misfit stays that nobody explains or where nothing tells it from noise."""
-    excess = explained.excess(chosen)
-    clear = not attempt.recording.moving.all() and not any(explained.rest(excess[sensor]) > 0 for sensor in sensors_of(question.effect))
+    """Return what the residual must fall by: at all, and plainly where misfit stays beside it that nobody explains, or where nothing tells it from noise."""
+    clear = not attempt.recording.moving.all() and not explained.rest_beside(chosen, question)
     return 0.0 if clear else LEAST_REDUCTION
 
 
