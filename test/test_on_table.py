@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.errors import InputError
-from imu_calibration.preflight.on_table import same_motion, signs_or_delay
+from imu_calibration.preflight.on_table import _a_period_late, same_motion, signs_or_delay
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
@@ -81,6 +81,7 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
     motion = JointMotion(time, position[0][:, None], rates[0][:, None], zero, zero)
     felt = reference_motion(table, replace(motion, rate=sign * rates[1 if sign > 0 else 0][:, None])).rate_s
     window = Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(felt), felt, motion)
+    assert _a_period_late([window], table) is None, 'opposite rates are not a clock that is late by a whole period'
     found = signs_or_delay([window], table)
     if swing and sign < 0:
         assert found is None
