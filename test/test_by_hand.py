@@ -75,7 +75,7 @@ def test_system_is_the_derivative_of_its_residuals():
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     state = State(random_truth(rng, 1e-3), up, rng.normal(0, 0.01, (3, 3)))
     poses = Poses(rng.normal(0, 9, (3, 3)), rng.normal(0, 0.1, (3, 3)), np.full((3, 3), 0.01), np.full((3, 3), 0.001), np.arange(3),
-                  np.arange(3) + 1)
+                  np.arange(3) + 1, np.arange(3.0))
     time = 0.01 * np.arange(100)
     data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
     known = TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))
@@ -258,7 +258,7 @@ def test_g_sensitivity_test_keeps_its_level():
     rng = np.random.default_rng(14)
     values = []
     for _ in range(500):
-        poses = Poses(rng.normal(0, 6, (15, 3)), rng.normal(0, 1e-4, (15, 3)), None, None, None, None)
+        poses = Poses(rng.normal(0, 6, (15, 3)), rng.normal(0, 1e-4, (15, 3)), None, None, None, None, np.arange(15.0))
         values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
     assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.04  # four sd of 500 trials
 

@@ -169,8 +169,8 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
 
     """
     scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
-    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances,
-                              *(float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True)), None)
+    pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
+    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd, None)
     if poses is None:
         return knowledge
     ups = ups_of(poses)
@@ -186,10 +186,11 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < 0.5 * model.priors
     wider = max(1.0, float(np.max(np.where(known, hand.sd[published] / expected, 0.0))))
-    sds = (np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd']),
-           np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd']), max(statistics['turn_scatter_sd'], 1e-4))
+    pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
+    drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
+    turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
     return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances[published],
-                         *(float(wider * sd) for sd in sds), ups_of(poses)[-1])
+                         float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
 
 
 def ups_of(poses: Poses | None) -> np.ndarray:

@@ -34,7 +34,7 @@ class BiasMovement:
 
 def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[str, BiasMovement]:
     """Return sensor -> `BiasMovement` of the biases that move beyond the scatter from pose to pose (F test of a parabola in time)."""
-    if poses.time is None or not np.ptp(poses.time) > 0:
+    if not np.ptp(poses.time) > 0:
         return {}
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
     residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)

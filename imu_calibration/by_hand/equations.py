@@ -36,7 +36,7 @@ class Poses:
     """Index of the first sample, shape (k,)."""
     stop: np.ndarray
     """Index after the last sample, shape (k,)."""
-    time: np.ndarray | None = None
+    time: np.ndarray
     """Middle of each interval, seconds since the first sample, shape (k,)."""
     temperature_c: np.ndarray | None = None
     """Mean temperature, shape (k,), when it was recorded."""

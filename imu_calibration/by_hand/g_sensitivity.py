@@ -34,8 +34,7 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
 
     """
     count = len(poses.force)
-    time = np.arange(count, dtype=float) if poses.time is None else poses.time
-    time = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    time = (poses.time - poses.time.mean()) / max(np.ptp(poses.time), 1e-9)
     course = np.column_stack([np.ones(count), time, time**2][:3 if count >= 12 else 2])
     if poses.temperature_c is not None and np.ptp(poses.temperature_c) > 0:
         course = np.column_stack([course, (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c)])

@@ -167,7 +167,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
-    base = tuple(np.flatnonzero(~_held(baseline)))
+    base = tuple(np.flatnonzero(~_held(baseline)).tolist())
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()

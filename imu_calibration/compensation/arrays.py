@@ -1,6 +1,7 @@
 """Compensation of whole arrays at once: for notebooks and other programs."""
 
 from collections.abc import Sequence
+from typing import overload
 
 import numpy as np
 
@@ -10,10 +11,30 @@ from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 
+Vectors = Sequence[Sequence[float]] | np.ndarray
+Temperatures = Sequence[float] | np.ndarray | TemperatureSamples | float
 
-def compensate_readings(calibration: FittedErrors, samples: Sequence[Sequence[float]] | np.ndarray | ImuSamples,
-                        rate_s: Sequence[Sequence[float]] | np.ndarray | None = None, *, time: Sequence[float] | np.ndarray | None = None,
-                        temperature_c: np.ndarray | TemperatureSamples | float | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
+
+@overload
+def compensate_readings(calibration: FittedErrors, samples: ImuSamples, rate_s: None = None, *, time: None = None,
+                        temperature_c: Temperatures | None = None) -> ImuSamples: ...
+
+
+@overload
+def compensate_readings(calibration: FittedErrors, samples: Vectors, rate_s: Vectors | None = None, *,
+                        time: Sequence[float] | np.ndarray | None = None,
+                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+@overload
+def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples, rate_s: Vectors | None = None, *,
+                        time: Sequence[float] | np.ndarray | None = None,
+                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples: ...
+
+
+def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples, rate_s: Vectors | None = None, *,
+                        time: Sequence[float] | np.ndarray | None = None,
+                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
     """
     Return readings with the calibrated errors taken out.
 
@@ -40,11 +61,10 @@ def compensate_readings(calibration: FittedErrors, samples: Sequence[Sequence[fl
         When shapes do not fit, or times or temperatures are missing that the calibration needs.
 
     """
-    whole = isinstance(samples, ImuSamples)
-    imu = samples if whole else _as_samples(calibration, samples, rate_s, time)
+    imu = samples if isinstance(samples, ImuSamples) else _as_samples(calibration, samples, rate_s, time)
     stream = CompensationStream(calibration, temperature=_as_temperatures(temperature_c, imu.stamp_ns))
     corrected = stream.correct(imu)
-    if whole:
+    if isinstance(samples, ImuSamples):
         return ImuSamples(imu.stamp_ns, corrected.force, corrected.rate, imu.frame_id)
     return corrected.force, corrected.rate
 

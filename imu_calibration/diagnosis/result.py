@@ -83,8 +83,8 @@ class Diagnosis:
     """Solution of the model that was diagnosed."""
     solution: Any
     """Solution of the extended model on all windows; the baseline's when nothing was found."""
-    gain: Gain
-    """`gain.Gain` of all findings together on windows that took no part in choosing."""
+    gain: Gain | None
+    """`gain.Gain` of all findings together on windows that took no part in choosing; None where by hand nothing was found."""
     traces: Any
     """`gain.Traces`: residuals before and after, for plots."""
     windows: int
