@@ -83,7 +83,7 @@ class NoiseModel:
         """Correlation time of the largest bias process, s; None when there is none."""
         return max(self.bias_processes, key=lambda process: process.sd).time if self.bias_processes else None
 
-    def mean_variance(self, kinds: Sequence[str], counts: np.ndarray) -> np.ndarray:
+    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Return the variance of means of windows of these kinds and lengths by the noise within, shape (k, 3)."""
         factors = {kind: moving.means for kind, moving in self.moving.items()}
         return self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]

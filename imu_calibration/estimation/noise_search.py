@@ -1,5 +1,7 @@
 """How large the offsets of windows, the bias process and its steps from recording to recording are: averaged over the restricted likelihood."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imu_calibration.estimation.noise_model import BiasProcess, dof_factor
@@ -44,7 +46,7 @@ class NoiseLikelihood:
         self.many, self.known = len(rows) >= LEAST_WINDOWS, known
         self._white, self._likelihood, self._losses = white, RestrictedLikelihood(rows, times, sessions, information=information), {}
 
-    def loss(self, shape: tuple, used: np.ndarray | None = None, restricted: bool = True, *, session: float = 0.0) -> float:
+    def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, restricted: bool = True, *, session: float = 0.0) -> float:
         """Return minus twice the (restricted) log likelihood with the parameters `used`, all where not given."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:

@@ -1,5 +1,7 @@
 """Solving with columns scaled to unit norm, from rows or from a normal matrix, and the covariance where parameters are held."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.linalg
 
@@ -54,7 +56,7 @@ def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, 
     return covariance @ (normal[used, -1] + prior_mean[used] / prior_sd[used]**2), covariance
 
 
-def quadratic(normal: np.ndarray, used: np.ndarray, values: np.ndarray) -> float:
+def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.ndarray) -> float:
     """Return the sum of squares that `values` of the parameters `used` leave under a normal matrix."""
     used = np.asarray(used)
     return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)

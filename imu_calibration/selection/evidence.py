@@ -67,6 +67,10 @@ class Evidence(ABC):
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of the choice `larger` against `smaller`."""
 
+    def heldout_parts(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
+        """Return the loss on held-out data by sensor, where an effect acts on both: (of the windows' means, within the windows)."""
+        raise NotImplementedError(f'{type(self).__name__} knows of no effect that acts on both sensors')
+
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""
         key = (tuple(used), number)
@@ -96,13 +100,13 @@ class WindowEvidence(Evidence):
         numbers = range(fold.max() + 1)
         self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
         self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
-        self._parts = [sum(part[s][number] for part in (self._means, self._within) for s in SENSORS) for number in numbers]
-        self.total = sum(self._parts)
+        self._parts = [np.sum([part[s][number] for part in (self._means, self._within) for s in SENSORS], axis=0) for number in numbers]
+        self.total = np.sum(self._parts, axis=0)
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
         """Return the covariance that one sensor alone, and what is known before, leave the parameters `used`."""
         at = np.ix_(used, used)
-        information = sum((*self._means[sensor], *self._within[sensor]))[at] + np.diag(1 / self._prior['prior_sd'][list(used)]**2)
+        information = np.sum([*self._means[sensor], *self._within[sensor]], axis=0)[at] + np.diag(1 / self._prior['prior_sd'][list(used)]**2)
         return inverse_normal(information)
 
     def normal(self, number: int | None = None) -> np.ndarray:

@@ -25,6 +25,6 @@ def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarr
     """
     at = list(at)
     difference = (halves[0][0] - halves[1][0])[at]
-    apart = float(difference @ np.linalg.solve(sum(covariance for _, covariance in halves)[np.ix_(at, at)], difference))
+    apart = float(difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference))
     known, value = np.linalg.inv(whole[1][np.ix_(at, at)]), whole[0][at]
     return bool(chi2.sf(apart, len(at)) > DISAGREE or difference @ known @ difference < 0.25 * value @ known @ value)

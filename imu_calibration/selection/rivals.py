@@ -63,10 +63,12 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
     best = int(np.argmin(costs))
     values = [dict(zip(there.space.names, there.values(choice))) for there, choice in zip(attempts, choices)]
     near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
-    settled = attempted(point=attempt.point(same_questions(attempt, choices[best])))
-    return settled, [
-        Rival(*same_questions(settled, _difference(choices[best], choices[k])), float(costs[k] - costs[best]),
-              {name: values[k][name] - values[best][name] for name in attempt.baseline.param_names}) for k in near]
+    settled, found = attempted(point=attempt.point(same_questions(attempt, choices[best]))), []
+    for k in near:
+        taken, other = same_questions(settled, _difference(choices[best], choices[k]))
+        moves = {name: values[k][name] - values[best][name] for name in attempt.baseline.param_names}
+        found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
+    return settled, found
 
 
 def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Question]:

@@ -94,19 +94,24 @@ class Search:
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
-        smaller, larger = self.used(chosen), self.used(chosen + [question])
+        smaller, larger = self.used(chosen), self.used([*chosen, question])
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
         beside = [*chosen, question]
         return Score(question, gain, p_value, self.allowed(beside, question), self.implausible(beside, question))
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the effect's estimate is possible: a lag is not negative, no angle (at 1 g) within half an encoder step, and unless asked no size implausible."""
+        """
+        Return whether the effect's estimate is possible.
+
+        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is implausible, unless asked.
+        """
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
             return False
         # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
-        turns = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}.get(question.effect.unit)
+        angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
+        turns = angles.get(question.effect.unit)
         if turns is not None and np.all(np.abs(value) * turns < 0.5 * self.encoder_step):
             return False
         if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
@@ -149,7 +154,7 @@ class Search:
                 break
             best = max(good, key=lambda s: s.net)
             before = [q.label for q in chosen]
-            chosen = self.reconsidered(chosen + [best.question])
+            chosen = self.reconsidered([*chosen, best.question])
             if [q.label for q in chosen] == before:
                 break
         return chosen
@@ -183,7 +188,7 @@ class Search:
             for other in self.others(rest):
                 if other is question:
                     continue
-                trial = chosen[:place] + [other] + chosen[place + 1:]
+                trial = [*chosen[:place], other, *chosen[place + 1:]]
                 value = self.cost(trial)
                 if value < cost and all(self.allowed(trial, each) for each in trial):
                     best, cost = trial, value
@@ -194,7 +199,7 @@ class Search:
         place, cost = chosen.index(question), self.cost(chosen)
         found = {}
         for other in self.others(chosen):
-            trial = chosen[:place] + [other] + chosen[place + 1:]
+            trial = [*chosen[:place], other, *chosen[place + 1:]]
             difference = self.cost(trial) - cost
             if question.effect.contained_in == other.name:
                 continue  # a special case that does as well as the whole wins, and the whole is no rival of it

@@ -21,8 +21,8 @@ them the noise beside them came out otherwise; from six times on it does not mat
 class BankEntry:
     """One effect at one time constant."""
 
-    effect: object
-    """The Effect."""
+    effect: Effect
+    """It."""
     number: int
     """Number of the time constant."""
     point: dict

@@ -70,7 +70,7 @@ SEARCH = _of(
     ('a negative time constant is allowed', 'search.py', 'if question.effect.nonnegative and value[0] < 0:', 'if False:', 'test_search.py'),
     ('steps of the encoder pass for errors of the table', 'search.py', '< 0.5 * self.encoder_step)', '< 0.0 * self.encoder_step)', 'test_search.py'),
     ('implausible sizes are explanations', 'search.py', '(self.any_size or not self.implausible(chosen, question))', 'True', 'test_search.py'),
-    ('earlier choices never reconsidered', 'search.py', 'chosen = self.reconsidered(chosen + [best.question])', 'chosen = chosen + [best.question]',
+    ('earlier choices never reconsidered', 'search.py', 'chosen = self.reconsidered([*chosen, best.question])', 'chosen = [*chosen, best.question]',
      'test_search.py'),
     ('share of the unexplained that a finding must remove', 'explained_share.py', 'LEAST_SHARE = 0.7', 'LEAST_SHARE = 0.1', 'test_search.py'),
     ('the same for what is smooth in time', 'explained_share.py', 'LEAST_SHARE_SMOOTH = 0.9', 'LEAST_SHARE_SMOOTH = 0.1', 'test_search.py'),
