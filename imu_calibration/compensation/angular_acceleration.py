@@ -108,7 +108,8 @@ class StampedDerivative:
         self._zero = (0.0, 0.0, 0.0)
         self.resets = -1
         self._restart()
-        self._newest, self.alpha = None, self._zero
+        self._newest: int | None = None
+        self.alpha = self._zero
 
     def _restart(self):
         self.resets += 1
@@ -166,7 +167,7 @@ class StampedDerivative:
             part = k / (missing + 1)
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
 
-    def rebase(self, stamp_ns: np.ndarray) -> None:
+    def rebase(self, stamp_ns: int) -> None:
         """Count the newest sample as taken at another time."""
         self._newest = stamp_ns
 
@@ -204,7 +205,7 @@ class StampedDerivative:
         self._refresh()
 
 
-def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float:
+def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float | None:
     """Return the median of the steps ahead between stamps, s; None without one."""
     steps = np.diff(np.asarray(stamp_ns, np.int64))
     steps = steps[steps > 0]

@@ -91,7 +91,7 @@ class Transfer:
 def invertible(model: SensorModel) -> SensorModel:
     """Return the model with only those effects that compensation inverts."""
     keep = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact') for sensor in SENSORS}
-    return replace(model, reference=(), **keep)
+    return replace(model, accelerometer=keep['accelerometer'], gyroscope=keep['gyroscope'], reference=())
 
 
 def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarray]:

@@ -91,7 +91,7 @@ class Uncertainty:
         self._calibration = calibration
         self.use(derivative, period)
 
-    def use(self, derivative: CausalDerivative, period: float | None = None) -> None:
+    def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
         """Take the angular acceleration from another CausalDerivative, or from none, and the noise of samples `period` s apart."""
         self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
         weights = np.zeros(1) if derivative is None else derivative.weights

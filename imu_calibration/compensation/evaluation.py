@@ -45,10 +45,10 @@ def session_truth(blocks: Iterable[SampleBlock], table: Table, settings: WindowS
     """Return the samples of a session with their reference, as far as joints and IMU are both there."""
     windows = MotionGatherer(table, settings, keep_unused=True).all_of(blocks)
     references = [_reference(window, table) for window in windows]
-    imu = ImuSamples(*(np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s')))
+    stamp_ns, force_s, rate_s = (np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s'))
     names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')
     joined = {name: np.concatenate([getattr(r, name) for r in references]) for name in names}
-    return SessionTruth(imu, Reference(**joined, gravity=table.gravity_value))
+    return SessionTruth(ImuSamples(stamp_ns, force_s, rate_s), Reference(**joined, gravity=table.gravity_value))
 
 
 def _reference(window, table):

@@ -32,6 +32,10 @@ class FittedErrors(Protocol):
         """Whether somebody knows how certain the values are."""
 
     @property
+    def knows_density(self) -> bool:
+        """Whether the noise is known at any sampling rate."""
+
+    @property
     def frame_id(self) -> str:
         """Frame of the messages that it was made from."""
 

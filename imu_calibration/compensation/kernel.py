@@ -55,7 +55,8 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     known = _known(model.temperature_ref_c)
     accel, gyro = (_Part(model, sensor, values, known) for sensor in SENSORS)
     turn, arm = (np.eye(3), np.zeros(3)) if transfer is None else (transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t)
-    at_arm = [_sum(arm, row) for row in np.reshape(LEVER.products(known), (3, 3))]
+    products = LEVER.products(known)
+    at_arm = [_sum(arm, products[start:start + 3]) for start in (0, 3, 6)]
     slope = _turned(gyro.inverse, _vector('a'))
     lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt):']
     if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends_with('g'):

@@ -65,7 +65,9 @@ class RateSlope:
         self._tracker: StampedDerivative | None = None
         self._stamps: deque[int] = deque(maxlen=HISTORY)
         self._due = LEAST + 1
-        self._newest, self._reading, self._slope = None, NO_SLOPE, NO_SLOPE
+        self._newest: int | None = None
+        self._reading: tuple = NO_SLOPE
+        self._slope: tuple = NO_SLOPE
         self._count, self._longest_ns, self._young = 0, 0.0, True
         self._recent: deque[tuple] = deque(maxlen=RECENT[1])
         self._all_of_it: SlopeError | None = None
@@ -97,7 +99,7 @@ class RateSlope:
             self._recent.append((x, y, z))
             return NO_SLOPE
         if self._longest_ns:
-            stamp_ns = self._counted(step_ns)
+            stamp_ns = self._counted(self._tracker, step_ns)
         self._slope = slope = self._tracker.push(stamp_ns, x, y, z)
         self._recent.append(slope)
         return slope
@@ -108,6 +110,7 @@ class RateSlope:
         while start < len(values):
             stop = self._usual_until(stamp_ns, values, start)
             if stop > start:
+                assert self._tracker is not None, 'regular stamps have a derivative'
                 out[start:stop] = self._tracker.push_block(stamp_ns[start:stop], values[start:stop])
                 self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop])
             if stop < len(values):
@@ -182,10 +185,10 @@ class RateSlope:
         lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
         return SlopeError(_moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period)**2)
 
-    def _counted(self, step_ns: int) -> int:
+    def _counted(self, tracker: StampedDerivative, step_ns: int) -> int:
         """Return the time of the newest sample by counting; behind a pause that hides how many were lost the window starts anew."""
-        self._count += 1 if 0 <= step_ns <= self._longest_ns else self.derivative.taps + 1
-        return round(self._count * 1e9 * self._tracker.period)
+        self._count += 1 if 0 <= step_ns <= self._longest_ns else tracker.taps + 1
+        return round(self._count * 1e9 * tracker.period)
 
     def _review(self) -> None:
         """Look at the latest stamps again; after the first motion by new ones, say how far the derivative is off."""
@@ -231,7 +234,7 @@ class RateSlope:
         self._stamps.extend(stamp_ns[-HISTORY:].tolist())
         self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
         self._due = (self._due - len(stamp_ns) - 1) % BLOCK + 1
-        self._recent.extend(map(tuple, slopes[-self._recent.maxlen:].tolist()))
+        self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)):].tolist()))
 
 
 def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:

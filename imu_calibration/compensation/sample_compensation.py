@@ -50,16 +50,18 @@ class SampleCompensation:
         if self.needs_temperature and temperature_c - temperature_c == 0.0:
             self.dt = temperature_c - self.calibration.model.temperature_ref_c
 
-    def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...]:
+    def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...] | None:
         """Return corrected rate and specific force, six floats, or None when there is nothing to publish; `counts` says why."""
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
-            return self.refuse('no temperature yet' if dt is None else 'not finite')
+            self.refuse('no temperature yet' if dt is None else 'not finite')
+            return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
         ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
-            return self.refuse('beyond what can be undone')
+            self.refuse('beyond what can be undone')
+            return None
         self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt)
         if squared > self.fastest_squared:
             self.fastest_squared = squared
@@ -67,18 +69,18 @@ class SampleCompensation:
         return vx, vy, vz, ux, uy, uz
 
     def refuse(self, reason: str) -> None:
-        """Count a sample that cannot be corrected; return None."""
+        """Count a sample that cannot be corrected."""
         self.counts[reason] += 1
 
-    def covariances(self, force_cov: np.ndarray, rate_cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at the sample at which they were taken last.
 
         Those of the measured ones, (3, 3), may be zero or no covariances at all: the calibration's noise is taken; or None: not measured.
         """
-        known = [np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise for cov,
-                 noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
-        return self._sensitivity.covariances(*known, self.with_parameters)
+        force, rate = (np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
+                       for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise))
+        return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
         """Take the covariances of the corrected readings anew at the latest sample."""

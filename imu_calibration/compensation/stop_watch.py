@@ -57,7 +57,7 @@ class StopWatch:
     @property
     def rate_cov(self) -> np.ndarray:
         """Covariance of what is taken off the rate, shape (3, 3)."""
-        if self._offset is None:
+        if self._offset is None or self.health.update is None:
             return np.zeros((3, 3))
         return np.diag(self.health.update.predict(self._look * 1e-9)[1])
 

@@ -99,8 +99,8 @@ class CompensationStream:
 
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
-        known = [c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)]
-        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(*known)
+        force, rate = (c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise))
+        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(force, rate)
 
     def warnings(self) -> list[str]:
         """Return lines about what was outside the calibration's conditions or could not be corrected."""
