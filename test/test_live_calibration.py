@@ -193,6 +193,12 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     assert_same(found, expected, 1e-12)
 
 
+def test_before_the_first_temperature_there_is_nothing_to_save():
+    live = LiveCalibration(TABLE, CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias'))
+    with pytest.raises(InputError, match='none came yet'):
+        live.saved()
+
+
 def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
     live = LiveCalibration(TABLE)
     data = accumulator_state.to_bytes(live.gathered(), live.model)

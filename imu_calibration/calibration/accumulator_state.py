@@ -5,6 +5,7 @@ import json
 import zipfile
 import zlib
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
               'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
               'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length, 'blocks': [_outline(block) for block in accumulator.blocks],
               **{name: getattr(gathered, name) for name in _PLAIN}}
-    arrays = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
+    arrays: dict[str, Any] = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
               'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
               'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
               'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),

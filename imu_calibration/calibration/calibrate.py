@@ -2,6 +2,7 @@
 
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.collector import GatherStep
@@ -78,7 +79,7 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
     for _ in range(PASSES):
         model = again
         step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress)
-        gathered = join(list(mapper(step, enumerate(sources))), names, lambda part, model=model: check_units(part, model, table))
+        gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
         solution = solve_gathered(gathered, model, options)
         again = linearise_again(model, solution)
         if again is None:

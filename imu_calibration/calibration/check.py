@@ -71,6 +71,6 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model = model_for(calibration, table)
-    step = GatherStep(table, model, options.windows, options.nominal, names, progress)
+    step = GatherStep(table, model, options.windows, options.nominal, names, progress=progress)
     gathered = join(list(map(step, enumerate(sources))), names, lambda part: check_units(part, model, table))
     return CheckResult(prove_calibration(gathered.held_out, model, calibration), gathered.findings)

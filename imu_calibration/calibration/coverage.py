@@ -8,8 +8,8 @@ import numpy as np
 
 from imu_calibration.calibration.effect_states import GroupState
 from imu_calibration.calibration.from_solution import only_axis
-from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
@@ -100,7 +100,7 @@ def share_gained(before: float, after: np.ndarray) -> np.ndarray:
     return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
-def table_coverage(result: CalibrationResult, frame_id: str = '') -> Coverage:
+def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
 
@@ -109,7 +109,7 @@ def table_coverage(result: CalibrationResult, frame_id: str = '') -> Coverage:
 
     Parameters
     ----------
-    result : CalibrationResult
+    result : TableResult
     frame_id : str
 
     """

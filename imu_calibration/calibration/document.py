@@ -64,7 +64,7 @@ class Calibration:
     """The verdict with its reasons one by one, where it was not read from a file."""
 
     @property
-    def param_names(self) -> tuple[str, ...]:
+    def param_names(self) -> list[str]:
         """Names in the order of `values`."""
         return self.model.param_names
 
@@ -177,7 +177,7 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
 
 def to_mapping(calibration: Calibration) -> dict:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
-    document = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
+    document: dict[str, Any] = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
     if calibration.model.definitions:
         document['effects'] = _plain(calibration.model.definitions)
     for section in SECTIONS:

@@ -141,7 +141,7 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
     """
     solution = result.solution
-    pieces = [_piece(result, *source, changes) for source in _sources(result)]
+    pieces = [_piece(result, changes, *source) for source in _sources(result)]
     free = ~fixed_parameters(solution.model) & ~solution.held
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
@@ -203,7 +203,7 @@ def _sources(result):
         yield window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature
 
 
-def _piece(result, kind, time, session, count, stride, motion, temperature, changes):
+def _piece(result, changes, kind, time, session, count, stride, motion, temperature):
     model, values, table = result.solution.model, result.solution.values, result.table
     temperature = _known(model, motion, temperature)
     parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}

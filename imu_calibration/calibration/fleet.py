@@ -114,13 +114,12 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
         When no unit was calibrated.
 
     """
-    good = [result for result in results if result.calibration is not None]
+    good = [(result.name, result.calibration) for result in results if result.calibration is not None]
     if not good:
         first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
         raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}')
     values, order, units = {}, [], {}
-    for result in good:
-        calibration = result.calibration
+    for unit, calibration in good:
         for effect in calibration.model.effects:
             units |= {name: effect.unit_of(k) for k, name in enumerate(effect.param_names())}
         for name, value, sd, status in zip(calibration.param_names, calibration.values, calibration.sd, calibration.status, strict=True):
@@ -128,7 +127,7 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
                 order.append(name)
             values.setdefault(name, [])
             if status != HELD:
-                values[name].append((float(value), float(sd), result.name))
+                values[name].append((float(value), float(sd), unit))
     return [_spread(name, units[name], values[name]) for name in order]
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
     undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
     centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
-    gauge = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
+    gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,

@@ -65,7 +65,7 @@ class Gathered:
     @property
     def duration(self) -> float:
         """Seconds from the first to the last IMU stamp, recordings added."""
-        return 0.0 if self.first_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
+        return 0.0 if self.first_stamp_ns is None or self.last_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
 
 
 def merge(parts: Iterable[Gathered]) -> Gathered:
@@ -84,7 +84,7 @@ def merge(parts: Iterable[Gathered]) -> Gathered:
         total.findings += part.findings
         ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
         total.temperature_c = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
-        if part.first_stamp_ns is not None:
+        if part.first_stamp_ns is not None and part.last_stamp_ns is not None:
             total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
             total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
     return total

@@ -61,11 +61,14 @@ class LiveCalibration:
 
     def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
                  saved: bytes | None = None):
-        self.table, self.options, self.settings, self.earlier = table, options, settings, None
+        self.table, self.options, self.settings = table, options, settings
+        self.earlier: Gathered | None = None
         self.demand = Demand() if saved is None or options.as_asked else accumulator_state.saved_demand(saved)
         """What joined the model that was asked for."""
         self._asked = choose_model(self.demand.options(options), table)
-        self._waiting, self._collector, self._first_temperature_c = [], None, None
+        self._waiting: list[SampleBlock] = []
+        self._collector: LiveCollector | None = None
+        self._first_temperature_c: float | None = None
         self.result: TableResult | None = None
         self.last: LiveSnapshot | None = None
         """What the last solution was made of."""
@@ -82,7 +85,7 @@ class LiveCalibration:
     @property
     def n_windows(self) -> int:
         """Windows gathered so far, those of an earlier run included."""
-        parts = [self.earlier] + [self._collector and self._collector.gathered]
+        parts = (self.earlier, self._collector and self._collector.gathered)
         return sum(sum(part.accumulator.windows.values()) for part in parts if part)
 
     @property
@@ -96,7 +99,7 @@ class LiveCalibration:
     @property
     def stamping(self) -> StampLine | None:
         """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
-        return self._collector and self._collector.gatherer.cleaner.stamping
+        return None if self._collector is None else self._collector.gatherer.cleaner.stamping
 
     @property
     def needs_temperature(self) -> bool:
@@ -126,7 +129,7 @@ class LiveCalibration:
     @property
     def model(self) -> SensorModel | None:
         """The model whose columns are gathered; None while a thermal effect waits for the first temperature."""
-        return self._collector and self._collector.model
+        return None if self._collector is None else self._collector.model
 
     def push(self, block: SampleBlock) -> list[Window]:
         """
@@ -189,11 +192,10 @@ class LiveCalibration:
             When the units are plainly wrong.
 
         """
-        if self._collector is None:
-            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
-        gathered, store = self._collector.snapshot(pending)
-        snapshot = LiveSnapshot(self._with_earlier(gathered), self._collector.model, self.table, self.options, self.demand, store,
-                                self._collector.session, self._first_temperature_c)
+        collector = self._begun()
+        gathered, store = collector.snapshot(pending)
+        snapshot = LiveSnapshot(self._with_earlier(gathered), collector.model, self.table, self.options, self.demand, store,
+                                collector.session, self._first_temperature_c)
         options = self.demand.options(self.options)
         solution, total, model = snapshot.solved(options)
         self.result = conclude(self.demand.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
@@ -231,7 +233,12 @@ class LiveCalibration:
 
     def saved(self, pending: bool = False) -> bytes:
         """Return everything that was gathered as bytes, for another run (see `accumulator_state`)."""
-        return accumulator_state.to_bytes(self.gathered(pending), self.model, self.demand)
+        return accumulator_state.to_bytes(self.gathered(pending), self._begun().model, self.demand)
+
+    def _begun(self) -> LiveCollector:
+        if self._collector is None:
+            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
+        return self._collector
 
     def _with_earlier(self, gathered):
         if self.earlier is None:

@@ -72,6 +72,5 @@ class LiveCollector(Collector):
 
 def copied(gathered: Gathered) -> Gathered:
     """Return a copy that shares only what nobody changes in place."""
-    copies = {'accumulator': gathered.accumulator.copy(), 'held_out': gathered.held_out.copy()}
-    return replace(gathered, **copies, poses=list(gathered.poses), kept=[], counts=dict(gathered.counts),
-                   spreads=[spread.copy() for spread in gathered.spreads])
+    return replace(gathered, accumulator=gathered.accumulator.copy(), held_out=gathered.held_out.copy(), poses=list(gathered.poses),
+                   kept=[], counts=dict(gathered.counts), spreads=[spread.copy() for spread in gathered.spreads])

@@ -31,7 +31,8 @@ class ModelChanges:
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any]) -> 'ModelChanges':
         """Return the changes that `to_mapping` told."""
-        return cls(*(tuple(known.get(name, ())) for name in ('added', 'denied')), dict(known.get('implausible', {})), tuple(known.get('lacking', ())))
+        return cls(tuple(known.get('added', ())), tuple(known.get('denied', ())), dict(known.get('implausible', {})),
+                   tuple(known.get('lacking', ())))
 
 
 @dataclass(frozen=True, eq=False)

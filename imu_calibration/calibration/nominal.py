@@ -22,8 +22,9 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
-    small = replace(model, **{section: tuple(effect.name for effect in model.effects if effect.sensor == section and _stays(effect, sensors))
-                              for section in SECTIONS})
+    names = {section: tuple(effect.name for effect in model.effects if effect.sensor == section and _stays(effect, sensors))
+             for section in SECTIONS}
+    small = replace(model, accelerometer=names['accelerometer'], gyroscope=names['gyroscope'], reference=names['reference'])
     places = np.concatenate([np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)])
     values, covariance = calibration.values[places], calibration.covariance[np.ix_(places, places)]
     status = [calibration.status[place] for place in places]

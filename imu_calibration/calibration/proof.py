@@ -115,8 +115,8 @@ def model_for(calibration: Calibration, table: Table) -> SensorModel:
     known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
     sensors = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor and (same_joints or not effect.in_reference))
                for sensor in SENSORS}
-    model = SensorModel(**sensors, reference=known.reference if same_joints else (), joint_names=table.joint_names,
-                        temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)
+    model = SensorModel(sensors['accelerometer'], sensors['gyroscope'], reference=known.reference if same_joints else (),
+                        joint_names=table.joint_names, temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)
     model = model.at(np.concatenate([calibration.values[known.slices[effect.key]] for effect in model.effects]))
     # Where the sensor sits on the table is nobody's error, and each side gets what suits it.
     return model if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None else model.with_role('accelerometer', Role.ARM)

@@ -38,6 +38,7 @@ class CalibrationResult(ABC):
     @property
     def verdict(self) -> Verdict:
         """Good, weak or bad, with reasons."""
+        assert self.calibration.judgement is not None, 'a result is made of a calibration that was judged'
         return self.calibration.judgement
 
     @property

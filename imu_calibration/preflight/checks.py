@@ -5,6 +5,8 @@ What is wrong with a recording before anything is estimated from it.
 """
 
 
+from collections.abc import Sequence
+
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
 from imu_calibration.preflight import frozen_checks, stamp_checks, value_checks
@@ -70,11 +72,11 @@ def refuse(findings: tuple[CheckFinding, ...]) -> None:
             raise InputError(finding.text, key=finding.key)
 
 
-def warnings(findings: tuple[CheckFinding, ...]) -> list[CheckFinding]:
+def warnings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:
     """Return the findings that a user must see."""
     return [finding for finding in findings if finding.severity in (REFUSE, WARNING)]
 
 
-def unusable(findings: tuple[CheckFinding, ...]) -> int:
+def unusable(findings: Sequence[CheckFinding]) -> int:
     """Return how many samples are unusable for reasons that no other count holds."""
     return sum(finding.samples for finding in findings)

@@ -23,6 +23,6 @@ class JointMotion:
     def __len__(self) -> int:
         return len(self.time)
 
-    def select(self, index: np.ndarray) -> 'JointMotion':
+    def select(self, index: np.ndarray | slice) -> 'JointMotion':
         """Return the motion at `index` (slice, mask or integer array)."""
         return JointMotion(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

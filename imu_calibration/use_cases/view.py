@@ -15,6 +15,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import group_states
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
@@ -109,5 +110,6 @@ def _coverage(result: CalibrationResult) -> Coverage:
     if isinstance(result, HandResult):
         found = hand_coverage(replace(NOTHING, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
     else:
+        assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)
     return replace(found, bars=bars_of(group_states(result)))
