@@ -13,7 +13,9 @@ from imu_calibration.estimation.window_statistics import SensorStatistics, Windo
 CAPACITY = 4096
 """Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
 MOST_BLOCKS = 48
-"""Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there."""
+"""
+Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there.
+"""
 LEAST_ROWS = 16
 """Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
 
@@ -197,7 +199,8 @@ def _joined(first, second):
     sensors = {}
     for sensor in SENSORS:
         a, b = first.sensors[sensor], second.sensors[sensor]
-        means = [share[0] * x + share[1] * y for x, y in ((a.mean, b.mean), (a.noise_variance, b.noise_variance), (a.inflation, b.inflation))]
+        pairs = ((a.mean, b.mean), (a.noise_variance, b.noise_variance), (a.inflation, b.inflation))
+        means = [share[0] * x + share[1] * y for x, y in pairs]
         sensors[sensor] = SensorStatistics(means[0], a.within[:0], means[1], means[2])
     time = share[0] * first.time + share[1] * second.time
     return WindowStatistics(first.kind, float(time), first.duration + second.duration, total, sensors, first.session)
@@ -215,7 +218,8 @@ def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.nda
     chosen = {}
     for sensor in SENSORS:
         place = wide.layout(sensor).rows
-        chosen[sensor] = np.concatenate([*(np.arange(place[name].start, place[name].stop) for name, _ in narrow.groups(sensor)), [-3, -2, -1]])
+        kept = (np.arange(place[name].start, place[name].stop) for name, _ in narrow.groups(sensor))
+        chosen[sensor] = np.concatenate([*kept, [-3, -2, -1]])
     return chosen
 
 
@@ -236,6 +240,8 @@ def _chosen(factors, chosen):
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:
     """Return a reduced window with the columns `chosen` (sensor -> indices) only."""
-    sensors = {name: replace(s, mean=s.mean[chosen[name]], within=s.within[:, chosen[name]], slow=None if s.slow is None else s.slow[:, chosen[name]])
-               for name, s in window.sensors.items()}
+    sensors = {}
+    for name, own in window.sensors.items():
+        at = chosen[name]
+        sensors[name] = replace(own, mean=own.mean[at], within=own.within[:, at], slow=None if own.slow is None else own.slow[:, at])
     return replace(window, sensors=sensors)

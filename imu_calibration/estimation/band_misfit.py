@@ -103,7 +103,7 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
 
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
-    """Return the squares that the best fit leaves of products of ``[design | output]``, shape (q + 1, q + 1), and the rank of the design."""
+    """Return the squares that the best fit leaves of products of ``[design | output]``, shape (q + 1, q + 1), and the design's rank."""
     scale = 1 / np.sqrt(np.maximum(np.diag(products), 1e-300))
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])

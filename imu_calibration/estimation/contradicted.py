@@ -27,7 +27,8 @@ def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
     """
     Return sensor -> keys of the windows whose mean the others of its kind contradict, beyond those that the noise leaves out already.
 
-    Of one kind at a time, the one with the least probable of them: a bias that seems to move makes the neighbours of such a window stand out, too.
+    Of one kind at a time, the one with the least probable of them: a bias that seems to move makes the neighbours of such a window stand
+    out, too.
 
     With an offset of its own for one window the others must fit improbably better (F test, for as many windows as there are). The noise may
     have been estimated with that window: too large by it, it is too large for all, and the ratio stays.

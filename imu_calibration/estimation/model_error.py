@@ -71,9 +71,9 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     if len(system.accumulator.blocks) < LEAST_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), np.zeros(len(values)))
     waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
-    sensors = {effect.sensor for effect in system.model.effects}
-    found, misfits = errors_of_waves(waves, len(values), groups={sensor: [system.model.slices[e.key] for e in system.model.effects if e.sensor == sensor]
-                                                                for sensor in sensors})
+    model = system.model
+    groups = {sensor: [model.slices[e.key] for e in model.effects if e.sensor == sensor] for sensor in {e.sensor for e in model.effects}}
+    found, misfits = errors_of_waves(waves, len(values), groups=groups)
     if 'accelerometer' in misfits:   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
         found.added_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN**2 * _scatter_of_means(noises['accelerometer'])
     return found
@@ -193,8 +193,8 @@ class Waves:
         """
         Return (chance, variance to add) by the score test of the variance of a walk.
 
-        What is not white but goes up and down fast, as the ripple of a motor, counts as noise and leaves less in the slow cosines than noise is
-        thought to: where the faster ones scatter by less, the slow ones are judged beside them.
+        What is not white but goes up and down fast, as the ripple of a motor, counts as noise and leaves less in the slow cosines than
+        noise is thought to: where the faster ones scatter by less, the slow ones are judged beside them.
         """
         inverse, walk, moved = self._inverse(group), self.walk[:SLOW_WAVES], self.moved[:, group]
         fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]

@@ -124,7 +124,7 @@ class NoiseModel:
 
 
 def dof_factor(dof: np.ndarray | float) -> np.ndarray:
-    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: what a variance from few data is taken larger by."""
+    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: by it a variance from few data grows."""
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
 
 

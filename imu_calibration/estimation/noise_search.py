@@ -1,4 +1,4 @@
-"""How large the offsets of windows, the bias process and its steps from recording to recording are: averaged over the restricted likelihood."""
+"""How large the offsets of windows, the bias process and its steps between recordings are: averaged over the restricted likelihood."""
 
 from collections.abc import Sequence
 

@@ -91,8 +91,8 @@ def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *
     Return for each parameter that is not determined the standard motion that would serve it best.
 
     Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
-    tolerances. A table that turns the sensor about one axis only (`only_axis`, unit vector in the sensor frame) can do few of them: where none
-    of these would help, the IMU has to be mounted anew.
+    tolerances. A table that turns the sensor about one axis only (`only_axis`, unit vector in the sensor frame) can do few of them: where
+    none of these would help, the IMU has to be mounted anew.
 
     Returns
     -------

@@ -26,7 +26,7 @@ class Regime(StrEnum):
 
 
 def pieces_at_rest(mean: np.ndarray, duration: float) -> dict[str, np.ndarray]:
-    """Return {regime: rows} of a static window: its mean row ``[columns | output]``, weighed as so many pieces, and no change of the input."""
+    """Return {regime: rows} of a static window: its mean row ``[columns | output]``, weighed as so many pieces, and no change of input."""
     row = np.concatenate([mean[:-AXES], np.zeros(AXES), mean[-AXES:]])
     return {Regime.REST: np.sqrt(count_pieces(duration)) * row[None]}
 

@@ -57,7 +57,8 @@ class RestrictedLikelihood:
         Returns
         -------
         tuple
-            First derivative of the log likelihood by the variances, shape (n_groups,), and minus the expected second one, (n_groups, n_groups).
+            First derivative of the log likelihood by the variances, shape (n_groups,), and minus the expected second one, (n_groups,
+            n_groups).
 
         """
         white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(-1, self._rows.shape[2])

@@ -13,9 +13,9 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     """
     Return a Solution whose values of some effects go towards their prior as far as the recording does not ask for them.
 
-    By the share ``k / chi2`` of the way (James and Stein), chi2 the squared distance from the prior in standard deviations, k its directions, at most
-    all of it; the other parameters follow as if the effect had been known there. An effect that is not there costs the others hardly any
-    of their certainty then, one that is plain stays, and the standard deviations hold in both cases.
+    By the share ``k / chi2`` of the way (James and Stein), chi2 the squared distance from the prior in standard deviations, k its
+    directions, at most all of it; the other parameters follow as if the effect had been known there. An effect that is not there costs the
+    others hardly any of their certainty then, one that is plain stays, and the standard deviations hold in both cases.
 
     Parameters
     ----------

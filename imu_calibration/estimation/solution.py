@@ -30,7 +30,9 @@ class Solution:
     residual_rms: dict
     """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
     session_biases: dict = field(default_factory=dict)
-    """Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean."""
+    """
+    Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean.
+    """
 
     model_error: ModelError | None = None
     """What the covariance has grown by, beyond what noise gives."""

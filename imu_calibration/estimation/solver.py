@@ -72,7 +72,8 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
             more = contradicted(system, values, noises)
             if not any(more.values()):
                 break
-            values, noises = _with_noise(system, values, {s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS}, free)
+            smaller = {s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS}
+            values, noises = _with_noise(system, values, smaller, free)
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
     held = _undetermined(system, values, factors, free)
@@ -113,10 +114,11 @@ def _with_noise(system, values, noises, free):
 def _refuse(without, held, model, allow_holding):
     names = [name for name, flag in zip(model.param_names, held) if flag]
     if without.all():
-        raise NotObservableError('the recording must determine at least one parameter, it determines none; record static positions in at least four '
-                                 'different attitudes')
+        raise NotObservableError('the recording must determine at least one parameter, it determines none; '
+                                 'record static positions in at least four different attitudes')
     if held.any() and not allow_holding:
-        raise NotObservableError(f"every parameter must be determined, {len(names)} are not: {', '.join(names)}; record more motion or allow holding")
+        raise NotObservableError(f"every parameter must be determined, {len(names)} are not: {', '.join(names)}; "
+                                 'record more motion or allow holding')
 
 
 def start(system: WeightedSystem) -> np.ndarray:

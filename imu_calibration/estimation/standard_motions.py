@@ -68,7 +68,8 @@ EDGES = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) i
 def _spin(axis, speeds, up=None, arm=None):
     def make(gravity):
         across = np.roll(axis, 1) if up is None else up
-        return [_turn(axis, TIME, s * DEG * TIME, np.full(len(TIME), s * DEG), np.zeros(len(TIME)), gravity, across, arm=arm) for s in speeds]
+        return [_turn(axis, TIME, s * DEG * TIME, np.full(len(TIME), s * DEG), np.zeros(len(TIME)), gravity, across, arm=arm)
+                for s in speeds]
     return make
 
 
@@ -114,12 +115,14 @@ def _fine_poses():
     return [tuple(v) for v in np.concatenate(rings)]
 
 
+SPINS = (-200, -100, 100, 200)
+"""Speeds of a spin, deg/s."""
 MOTIONS = (
     Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(EDGES)),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
-    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), (-200, -100, 100, 200)), (1, 0, 0)),
-    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), (-200, -100, 100, 200)), (0, 1, 0)),
-    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), (-200, -100, 100, 200)), (0, 0, 1)),
+    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), SPINS), (1, 0, 0)),
+    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), SPINS), (0, 1, 0)),
+    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), SPINS), (0, 0, 1)),
     Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
         piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
         for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
@@ -129,7 +132,8 @@ MOTIONS = (
     Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
-    Motion('warm_up', 'rest in six faces, cold and warm', _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
+    Motion('warm_up', 'rest in six faces, cold and warm',
+           _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
 

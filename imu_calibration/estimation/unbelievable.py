@@ -20,8 +20,8 @@ def unbelievable(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, 
 
     The value lies beyond what is known of any instrument, and if all misfit of moving windows that noise does not explain lay along the
     parameter, it would move it as far. An accelerometer's scale along an axis that never saw gravity lives on what little the arms and
-    wrong angles bring there; a gyroscope at the wrong full-scale setting does not fit by misfit, and keeps its value. An effect is held as a
-    whole, of a matrix single entries.
+    wrong angles bring there; a gyroscope at the wrong full-scale setting does not fit by misfit, and keeps its value. An effect is held as
+    a whole, of a matrix single entries.
 
     Parameters
     ----------
@@ -51,8 +51,9 @@ def _limit(effect: Effect) -> float:
 
 
 def _feigned(system, sensor, values, noise):
-    """Return how many standard deviations of noise all unexplained misfit of moving windows could move a parameter by, of the worst axis."""
-    rest = NOISE * np.maximum(noise.low_variance, noise.white_variance) if any(row.kind == 'static' for row in system.accumulator.rows) else 0.0
+    """Return by how many standard deviations of noise all unexplained misfit of moving windows could move a parameter of the worst axis."""
+    rested = any(row.kind == 'static' for row in system.accumulator.rows)
+    rest = NOISE * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
     total = np.zeros(3)
     for kind, factor in system.within[sensor].items():
         squares = (system.misfit(sensor, factor, values)**2).sum(axis=0)

@@ -33,7 +33,8 @@ class GroupVariances:
         group : array, shape (m,)
             Group of each row, -1 for none.
         inflated : bool
-            Take it larger as far as it was itself estimated from few data (`noise_model.dof_factor`), so that intervals from few poses hold.
+            Take it larger as far as it was itself estimated from few data (`noise_model.dof_factor`), so that intervals from few poses
+            hold.
 
         """
         factor = np.where(self.dof > DOF_LEAST, dof_factor(self.dof), 1.0) if inflated else 1.0
@@ -91,7 +92,7 @@ class _Groups:
         return (self.members @ self.variance(extra)) / np.maximum(self.members.sum(1), 1)
 
     def step(self, extra, free):
-        """Return the next variances, a scoring step over the free groups that are not pinned at zero, and the degrees of freedom of each."""
+        """Return the next variances, a scoring step over the free groups that are not pinned at zero, and each one's degrees of freedom."""
         score, information = self.likelihood.scoring(self.variance(extra)[:, None], self.members)
         index, step, typical = np.flatnonzero(free & ~((extra <= 0) & (score < 0))), np.zeros(len(extra)), self.typical(extra)
         if len(index):

@@ -142,7 +142,7 @@ def _gains_of_one(variance, decay, fresh):
 def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
                             noise: NoiseModel) -> np.ndarray:
     """
-    Return the offset of each session, shape (n_sessions, 3): the mean of its residuals, weighted, drawn towards zero by the noise of that mean.
+    Return the offset of each session, shape (n_sessions, 3): the weighted mean of its residuals, drawn towards zero by its noise.
 
     Parameters
     ----------
@@ -153,4 +153,5 @@ def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.
     """
     rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(np.stack([np.ones_like(misfit), misfit], axis=2))
     ones, rest = np.moveaxis(rows, 2, 0)
-    return np.array([(ones[index] * rest[index]).sum(axis=0) / ((ones[index]**2).sum(axis=0) + 1 / noise.session_variance) for index in sessions])
+    parts = ((ones[index], rest[index]) for index in sessions)
+    return np.array([(one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance) for one, left in parts])

@@ -36,7 +36,9 @@ class SensorStatistics:
     inflation: np.ndarray
     """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
     slow: np.ndarray | None = None
-    """Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; its misfit shows what white noise does not."""
+    """
+    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; its misfit shows what white noise does not.
+    """
     slow_rows: int = 0
     """Number of those pieces."""
 

@@ -85,8 +85,8 @@ def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
     still_ns : array, shape (n, 2)
         First and last stamp of each stretch in which no joint position changes.
     rate_at_rest : array, shape (3,)
-        What the gyroscope reads at rest, rad/s; what it reads mostly while the joints stand still, where that explains more (spins about the
-        vertical are as steady as rests).
+        What the gyroscope reads at rest, rad/s; what it reads mostly while the joints stand still, where that explains more (spins about
+        the vertical are as steady as rests).
 
     """
     inside = np.zeros(len(chunks), bool)

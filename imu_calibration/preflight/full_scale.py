@@ -9,11 +9,15 @@ from imu_calibration.preflight.chunks import Chunks
 from imu_calibration.preflight.rest import Rest
 
 FAR = 0.25
-"""Rms angle by which gravity misses the direction after a turn, rad, from which on factors are tried at all: scales off by a tenth leave less."""
+"""
+Rms angle by which gravity misses the direction after a turn, rad, from which on factors are tried at all: scales off by a tenth leave less.
+"""
 BETTER = 0.3
 """A factor is believed when it leaves less than this share of that angle."""
 FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
-"""Readings over true rates that are tried: full-scale ranges from a sixteenth to sixteen times the one that is set, and what lies between."""
+"""
+Readings over true rates that are tried: full-scale ranges from a sixteenth to sixteen times the one that is set, and what lies between.
+"""
 NEAR_POWER = 0.15
 """A factor within this share of a power of two is one: scales are off by a few per cent."""
 LEAST_TURNS, MOST_TURNS = 3, 16

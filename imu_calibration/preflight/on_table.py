@@ -86,7 +86,8 @@ def _a_period_late(windows, table):
     if not windows:
         return None
     shift, share, unshifted = _best_shift(windows, table)
-    if abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):   # opposite rates: a wrong sign, or half a period
+    # opposite rates: a wrong sign, or half a period
+    if abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):
         return None
     return CheckFinding('on_table', REFUSE, f'both streams must tell the same time, the joints explain {100 * unshifted:.0f} % of the rates as stamped and '
                         f'{100 * share:.0f} % shifted: {_late(shift)}')

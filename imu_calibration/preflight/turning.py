@@ -25,9 +25,13 @@ class Turning:
     """What relates measured rates to the turn of measured gravity."""
 
     matrix: np.ndarray
-    """``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero across the directions that were not seen, shape (3, 3)."""
+    """
+    ``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero across the directions that were not seen, shape (3, 3).
+    """
     seen: np.ndarray
-    """Projector on the directions of the measured rate that were: a turn about (1, 1, 1) alone shows one direction and no axis, shape (3, 3)."""
+    """
+    Projector on the directions of the measured rate that were: a turn about (1, 1, 1) alone shows one direction and no axis, shape (3, 3).
+    """
     explained: float
     """Share of gravity's turns that it explains."""
 

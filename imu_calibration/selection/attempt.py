@@ -106,11 +106,12 @@ class Attempt:
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
         """Return whether the linearisation is too coarse for what was chosen: curvature times evidence."""
-        return any('@' in question.label for question in chosen) or any(self.curvature_shows(chosen, question) > TOO_COARSE for question in chosen)
+        return any('@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE for question in chosen)
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
         """Return what the evidence makes of an effect's curvature, nats: how well it is told from its own first derivative."""
-        weight = self.evidence.loss(self.search.used([q for q in chosen if q is not question])) - self.evidence.loss(self.search.used(chosen))
+        without = self.search.used([q for q in chosen if q is not question])
+        weight = self.evidence.loss(without) - self.evidence.loss(self.search.used(chosen))
         return weight * _curvature(question, self.values(chosen), self.recording.model)**2
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:

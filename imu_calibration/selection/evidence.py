@@ -106,8 +106,8 @@ class WindowEvidence(Evidence):
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
         """Return the covariance that one sensor alone, and what is known before, leave the parameters `used`."""
         at = np.ix_(used, used)
-        information = np.sum([*self._means[sensor], *self._within[sensor]], axis=0)[at] + np.diag(1 / self._prior['prior_sd'][list(used)]**2)
-        return inverse_normal(information)
+        information = np.sum([*self._means[sensor], *self._within[sensor]], axis=0)[at]
+        return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)]**2))
 
     def normal(self, number: int | None = None) -> np.ndarray:
         """Return the normal matrix of the chosen windows, or of all but fold `number`."""

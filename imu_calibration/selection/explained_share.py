@@ -62,8 +62,8 @@ class Explained:
         """
         Return the least share of the unexplained that the effect removes, over the sensors in which it shows.
 
-        Of a sensor counts the part in which it shows, the means of windows, what is within them, or both: what nobody explains in the other part does not
-        hide it.
+        Of a sensor counts the part in which it shows, the means of windows, what is within them, or both: what nobody explains in the other
+        part does not hide it.
         """
         return min((removed / (removed + rest) for removed, rest in self._where_it_shows(chosen, question)), default=0.0)
 

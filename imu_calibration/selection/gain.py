@@ -61,8 +61,8 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
     """
     Return the same Gain on the windows that choose, each fold under the fit to the others.
 
-    Told is the measure that falls most, or where that is not sure, the one that falls most surely: a small lag takes a tenth off the window means by
-    chance, and half a percent off the samples for sure.
+    Told is the measure that falls most, or where that is not sure, the one that falls most surely: a small lag takes a tenth off the window
+    means by chance, and half a percent off the samples for sure.
     """
     found, fold = [], attempt.evidence.fold
     for sensor in sensors:
@@ -81,7 +81,7 @@ def _gain(sensor, measure, pair):
 
 
 def _squares(space, values, sensor):
-    """Return measure -> (sums of squares, their numbers) per window, each (k,), at vectors of `ParameterSpace.reduced`, one for all or each."""
+    """Return measure -> (sums of squares, their numbers) per window, each (k,), at vectors of `ParameterSpace.reduced`, one or many."""
     recording = space.recording
     means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
     for axis in range(3):
@@ -92,7 +92,8 @@ def _squares(space, values, sensor):
     at_rest = np.array([window.sensors[sensor].noise_variance.sum() for window in recording.windows])
     within[rest] = at_rest[rest] * (recording.count[rest] - 1)
     three = np.full(len(means), 3.0)
-    return dict(zip(MEASURES, ((within + recording.count * means, 3 * recording.count), (means, three), (within, 3 * (recording.count - 1)))))
+    every = (within + recording.count * means, 3 * recording.count)
+    return dict(zip(MEASURES, (every, (means, three), (within, 3 * (recording.count - 1)))))
 
 
 def _certainty(pair):
@@ -106,7 +107,7 @@ def _rms(squares, number):
 
 
 def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
-    """Return the 95 % interval of the reduction over resamples of whole windows, from (sums of squares, numbers) per window before and after."""
+    """Return the 95 % interval of the reduction over resampled windows, from (sums of squares, numbers) per window before and after."""
     n_windows = len(pair[0][0])
     if n_windows < 3:
         return (float('nan'), float('nan'))

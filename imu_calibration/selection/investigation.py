@@ -33,7 +33,10 @@ from imu_calibration.selection.search import Named, Search
 LINEARISATIONS = 5
 """Times that the columns are taken anew, at most."""
 LEAST_REDUCTION = 0.01
-"""Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for sure."""
+"""
+Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for
+sure.
+"""
 LEFT = 0.1
 """Share of a significant rest that pairs, or effects of implausible size, may leave."""
 LEAST_WINDOWS = 8
@@ -135,9 +138,10 @@ class _Outcome:
 
 def _looked_again(outcome, attempted, any_size):
     """
-    Return the _Outcome of what explains a significant rest that stays: searches that start from pairs, or that ask about implausible sizes too.
+    Return the _Outcome of what explains a significant rest that stays.
 
-    Any two of many effects take something off a rest that has another cause: together they must take nearly all.
+    Further searches start from pairs, or ask about implausible sizes too. Any two of many effects take something off a rest that has
+    another cause: together they must take nearly all.
     """
     if not outcome.rest:
         return outcome
@@ -190,8 +194,8 @@ def _that_help(attempt, explained, named):
     Return the findings that are possible and predict windows held out in turn better, one at a time the least helpful taken out.
 
     Likelihood alone is not enough: without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes
-    evidence of anything that goes with it. So the plain residual, in the unit of the sensor, must fall too. The locked windows are not asked:
-    what they show afterwards could not be told as a gain.
+    evidence of anything that goes with it. So the plain residual, in the unit of the sensor, must fall too. The locked windows are not
+    asked: what they show afterwards could not be told as a gain.
     """
     kept = [question for question in named if attempt.search.allowed(named, question)]
     while kept:
@@ -204,13 +208,17 @@ def _that_help(attempt, explained, named):
 
 
 def _needed_reduction(attempt, explained, chosen, question):
-    """Return what the residual must fall by: at all, and plainly where misfit stays beside it that nobody explains, or where nothing tells it from noise."""
+    """
+    Return what the residual must fall by.
+
+    At all, and plainly where misfit stays beside it that nobody explains, or where nothing tells it from noise.
+    """
     clear = not attempt.recording.moving.all() and not explained.rest_beside(chosen, question)
     return 0.0 if clear else LEAST_REDUCTION
 
 
 def _sure_reduction(attempt, chosen, question):
-    """Return the lower end of the interval of what an effect takes off the residual of windows held out in turn, in the sensor's own unit."""
+    """Return the lower end of the interval of what an effect takes off the residual of windows held out in turn, in the sensor's unit."""
     return gain_in_turn(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
 
 
@@ -233,7 +241,8 @@ def _without_clipping(windows, table, model):
     for rows in (~locked, locked):
         part = _of(windows, rows)
         kept.append(without_clipped(part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd))
-    in_order = sorted([(window.time[0], number, window) for number, part in enumerate(kept) for window in part], key=lambda entry: entry[:2])
+    entries = [(window.time[0], number, window) for number, part in enumerate(kept) for window in part]
+    in_order = sorted(entries, key=lambda entry: entry[:2])
     return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
 
 

@@ -16,9 +16,13 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 SMOOTH_PENALTY = 10.0
 """Fall of minus twice the log likelihood per parameter that an effect smooth in time must win over a bias process."""
 PLAUSIBLE = 3.0
-"""A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one."""
+"""
+A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one.
+"""
 STABLE = {'accelerometer': 3e-4, 'gyroscope': 0.0}
-"""Whatever the white noise, a wander of up to this much passes for noise, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug."""
+"""
+Whatever the white noise, a wander of up to this much passes for noise, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug.
+"""
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
@@ -55,7 +59,7 @@ def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ..
 
 
 def plausible_processes(noise: NoiseModel, period: float, *, sensor: str) -> tuple[BiasProcess, ...]:
-    """Return how a bias moves as far as that passes for noise: as was found in the recording, naturally at least, and no more than such biases do."""
+    """Return how a bias moves as far as that passes for noise: as found in the recording, naturally at least, at most as such biases do."""
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
         return natural

@@ -33,7 +33,9 @@ class ParameterSpace:
     index: dict[str, list[np.ndarray]]
     """Sensor -> the parameters that act on each axis."""
     join: dict[str, list[np.ndarray]]
-    """Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design | residual]``, shape (p + 3, q_a + 1)."""
+    """
+    Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design | residual]``, shape (p + 3, q_a + 1).
+    """
     slow_only: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS})
     """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
     slow_variance: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS})

@@ -23,7 +23,7 @@ CHUNK = 16384
 
 @dataclass(frozen=True, eq=False)
 class ReducedRecording:
-    """Windows of one recording as statistics of ``[columns of the model | bank of time constants | output]``, and a point to take residuals at."""
+    """Windows of one recording as statistics of ``[columns of the model | bank of time constants | output]``; residuals at a point."""
 
     model: SensorModel
     """Every effect that is asked about, linearised at its point."""
@@ -72,7 +72,7 @@ class ReducedRecording:
 
     @cached_property
     def products(self) -> dict[tuple[str, str], np.ndarray]:
-        """(sensor, 'within' or 'slow') -> products of the windows' centred rows ``[columns | residual]``, or of their slow part, (k, p + 3, p + 3)."""
+        """(sensor, 'within' or 'slow') -> products of centred rows ``[columns | residual]`` or of their slow part, (k, p + 3, p + 3)."""
         found = {}
         for (sensor, part), factors in self._factors.items():
             rows = self._with_residual(sensor, factors[self.moving])
@@ -188,7 +188,7 @@ def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
     Return the mean lever arm of the accelerometers for each of them, zero where a model has none, shape (3, 3).
 
-    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not show them
-    and they come out as centimetres.
+    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not show
+    them and they come out as centimetres.
     """
     return np.tile(all_arms(model, values).mean(axis=0), (3, 1))

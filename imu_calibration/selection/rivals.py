@@ -38,8 +38,8 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
     """
     Return (the Attempt at the best of a choice and its rivals, the rivals that come near it).
 
-    The first derivatives of a delay and of a low-pass are the same, and a search that takes its columns at one of them sees the other by its
-    straight line alone: whichever it met first would win. So each is linearised where it is, and all are judged with the same noise,
+    The first derivatives of a delay and of a low-pass are the same, and a search that takes its columns at one of them sees the other by
+    its straight line alone: whichever it met first would win. So each is linearised where it is, and all are judged with the same noise,
     that of each in turn; only those that are compared have columns there.
 
     Parameters

@@ -194,7 +194,8 @@ class Search:
                     best, cost = trial, value
         return best
 
-    def class_mates(self, chosen: Sequence[Question], question: Question, *, most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
+    def class_mates(self, chosen: Sequence[Question], question: Question, *,
+                    most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
         place, cost = chosen.index(question), self.cost(chosen)
         found = {}

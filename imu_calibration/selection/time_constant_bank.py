@@ -12,8 +12,8 @@ from imu_calibration.reference.reference_motion import Reference
 
 WIDE = 10.0
 """
-Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior held
-them the noise beside them came out otherwise; from six times on it does not matter.
+Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior
+held them the noise beside them came out otherwise; from six times on it does not matter.
 """
 
 
@@ -50,7 +50,7 @@ class BankEntry:
 
 
 def make_bank(effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray) -> dict[str, list[BankEntry]]:
-    """Return sensor -> list of BankEntry for those of `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
+    """Return sensor -> list of BankEntry for the `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
     bank = {sensor: [] for sensor in SENSORS}
     for effect in effects:
         if effect.time_constant:
