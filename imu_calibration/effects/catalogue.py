@@ -57,7 +57,8 @@ class Catalogue:
         """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:
-            raise InputError(f"effect '{name}' is unknown or ambiguous; choose from {', '.join(sorted(n for n in names if names.count(n) == 1))}")
+            raise InputError(f"effect '{name}' is unknown or ambiguous; "
+                             f"choose from {', '.join(sorted(n for n in names if names.count(n) == 1))}")
         return next(sensor for sensor, known in self.effects(joint_names) if known == name)
 
     def with_effects(self, *effects: Effect) -> 'Catalogue':
@@ -81,7 +82,8 @@ class Catalogue:
         added = [effect for effect in self.added if effect.name in names]
         for effect in added:
             if effect.definition is None:
-                raise InputError(f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; make it with `effects.term.term`")
+                raise InputError(f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; "
+                                 "make it with `effects.term.term`")
         return {effect.name: effect.definition for effect in added}
 
     @classmethod
@@ -127,7 +129,8 @@ CATALOGUE = Catalogue()
 
 def _check(effect, taken):
     if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {'effects'}:
-        raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; choose another one")
+        raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; "
+                         "choose another one")
     if effect.sensor not in SECTIONS:
         raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")
     strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH

@@ -39,7 +39,11 @@ class Amplitudes:
 
 @dataclass(frozen=True)
 class AlongAxis:
-    """Values before a function of the input along each element's own axis; ``function(input axes)`` gives the coefficients of one of each."""
+    """
+    Values before a function of the input along each element's own axis.
+
+    ``function(input axes)`` gives the coefficients of one of each.
+    """
 
     effect: str
     group: str

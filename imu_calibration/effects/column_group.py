@@ -85,7 +85,8 @@ class ColumnGroup:
         try:
             values = {name: getattr(ref, field)[index] for name, field, index in self._places}
         except IndexError as error:
-            raise InputError(f"the columns of '{self.name}' speak of more joints than there are: {', '.join(self.text)}; correct them") from error
+            raise InputError(f"the columns of '{self.name}' speak of more joints than there are: {', '.join(self.text)}; "
+                             "correct them") from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
         if 'tau' in self.names:
@@ -96,7 +97,8 @@ class ColumnGroup:
                 if self.width > count:
                     result[:, count + k] = np.imag(column) / STEP
         if self._may_fail and not np.all(np.isfinite(result)):
-            raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; divide by nothing that "
+            raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; "
+                             "divide by nothing that "
                              'passes through zero, and take no root or logarithm of what may be negative')
         return result
 

@@ -121,7 +121,11 @@ def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references:
 
 
 def _steps(effect, at, forward):
-    """Yield (values above, values below, distance) for the derivative by each parameter; what cannot be negative is not tried below zero."""
+    """
+    Yield (values above, values below, distance) for the derivative by each parameter.
+
+    What cannot be negative is not tried below zero.
+    """
     for index in range(effect.size):
         step = np.zeros(effect.size)
         step[index] = effect.step

@@ -29,7 +29,10 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'reference temperature': {'temperature_ref_c': (None,)},
     'time constant': {'tau': (None,)},
 }
-"""Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints from the base outwards."""
+"""
+Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints
+from the base outwards.
+"""
 KNOWN = 'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, temperature_ref_c, tau'
 """The names for people."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
@@ -54,7 +57,8 @@ def read(text: str) -> ast.expr:
     Raises
     ------
     InputError
-        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; it says where.
+        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; it says
+        where.
 
     """
     try:
@@ -85,8 +89,8 @@ class _Refused(Exception):
 
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place:place + 30].split())
-    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {KNOWN} with {", ".join(FUNCTIONS)} and powers up to '
-                      f'{HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it')
+    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {KNOWN} with {", ".join(FUNCTIONS)} and '
+                      f'powers up to {HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it')
 
 
 def _checked(node, text, depth):
@@ -137,7 +141,8 @@ def names_in(tree: ast.expr) -> set[str]:
 
 def may_fail(tree: ast.expr) -> bool:
     """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
-    divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant) for node in ast.walk(tree) if isinstance(node, ast.BinOp))
+    divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
+                  for node in ast.walk(tree) if isinstance(node, ast.BinOp))
     return divides or any(called(node) in UNBOUNDED for node in ast.walk(tree) if isinstance(node, ast.Call))
 
 
@@ -183,8 +188,8 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
             return {(): float(node.value)}   # type: ignore[arg-type]   # `read` takes no others
         case ast.Name():
             if node.id not in known:
-                raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), which is not known there; "
-                                 "declare the effect with compensation 'none'")
+                raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
+                                 "which is not known there; declare the effect with compensation 'none'")
             return known[node.id]
         case ast.UnaryOp():
             return scaled(products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0)
@@ -230,7 +235,8 @@ def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str
 
 def _multiplied(left, right):
     if len(left) * len(right) > MOST_PRODUCTS:
-        raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; write it shorter')
+        raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; '
+                         'write it shorter')
     return added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
 
 

@@ -16,7 +16,8 @@ def _second_order():
     Return (weight, delay) pairs of the maximally flat second-order filter, in units of its delay.
 
     ``1 / (1 + d s + d^2 s^2 / 2)`` answers a blow by ``2 e^-x sin x``, x = t / d, whose moments of order k over k! follow from the
-    denominator. The weights meet the first five of them: 6e-5 is left where frequency times delay is 0.3 rad, and joints' noise is not amplified.
+    denominator. The weights meet the first five of them: 6e-5 is left where frequency times delay is 0.3 rad, and joints' noise is not
+    amplified.
     """
     moments = [1.0, 1.0]
     for order in range(2, 5):
@@ -27,9 +28,11 @@ def _second_order():
 
 SECOND_ORDER = _second_order()
 _KINDS = {
-    'bandwidth': ('time_constant', FIRST_ORDER, 'answers through a first-order low-pass filter: its output lags and loses amplitude at speed'),
+    'bandwidth': ('time_constant', FIRST_ORDER, 'answers through a first-order low-pass filter: '
+                  'its output lags and loses amplitude at speed'),
     'delay': ('delay', ((1.0, 1.0),), 'sends its output late, and the other sensor does not: a pure delay of its own'),
-    'filter': ('delay', SECOND_ORDER, 'answers through a second-order (Butterworth) low-pass filter: its output lags, and keeps its amplitude up to near its edge'),
+    'filter': ('delay', SECOND_ORDER, 'answers through a second-order (Butterworth) low-pass filter: its output lags, '
+               'and keeps its amplitude up to near its edge'),
 }
 """Ending of the name -> (component, (weight, delay) pairs, what the sensor does). All have the same first derivative."""
 
@@ -50,9 +53,12 @@ def _lag_effect(sensor, ending):
     return Effect(
         name=f'{SHORT[sensor]}_{ending}', sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
         explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
-        tolerance_reason='1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer' else '0.1 deg/s while the rate changes by 1000 deg/s^2',
+        tolerance_reason=('1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer'
+                          else '0.1 deg/s while the rate changes by 1000 deg/s^2'),
         motion=('oscillate_fast',), compensation='none', warp=_Lag(pairs), acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
 
 
 LAGS = tuple(_lag_effect(sensor, ending) for ending in _KINDS for sensor in SENSORS)
-"""First-order filter, pure delay and second-order filter of each sensor; what is alike where it is small is told apart where it is large."""
+"""
+First-order filter, pure delay and second-order filter of each sensor; what is alike where it is small is told apart where it is large.
+"""

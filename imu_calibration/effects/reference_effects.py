@@ -91,17 +91,20 @@ def _earth(values, point):
 def _earth_known(table):
     """Return why the Earth's rate cannot be asked about: nobody says where the table stands, or it is in the reference."""
     if table.latitude is None:
-        return 'the table gives no latitude, so the rotation of the Earth is not modelled', 'give latitude and height in the table description'
+        return ('the table gives no latitude, so the rotation of the Earth is not modelled',
+                'give latitude and height in the table description')
     if table.azimuth_deg is None:
         return None
-    return 'the reference holds the rotation of the Earth already, from latitude and azimuth', 'leave the azimuth out of the table description'
+    return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
+            'leave the azimuth out of the table description')
 
 
 def _bent(values, point):
     """
     Coefficients of a mount that turns by theta = K f with the force that it carries, to first order.
 
-    The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta / dt`` with df/dt = f x w where gravity is the load.
+    The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta / dt`` with df/dt = f x w where gravity
+    is the load.
     """
     matrix, turn = values['matrix'].reshape(3, 3), values['load_compliance'].reshape(3, 3)
     force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
@@ -116,7 +119,8 @@ def _bent(values, point):
 def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
-    of_table: dict[str, Any] = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True, 'against': ('angle',)}
+    of_table: dict[str, Any] = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True,
+                                'against': ('angle',)}
     return (
         Effect(
             **of_table, name='table_tilt', role=Role.TILT, components=('x', 'y'), shape=(2,),
@@ -150,21 +154,26 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
         Effect(
             **of_table, name='axis_sag', components=names.turning[1:], shape=(len(names.turning[1:]),),
-            explanation='The axes sag: each hangs towards the ground by an angle that goes with how level it lies, as a loaded shaft bends.',
-            tolerance_reason='as the tilt', prior_sd=2e-3, plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),),
+            explanation='The axes sag: each hangs towards the ground by an angle that goes with how level it lies, '
+            'as a loaded shaft bends.',
+            tolerance_reason='as the tilt', prior_sd=2e-3,
+            plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),),
             motion=('static_dense', 'two_axis'), warp=_sag, needs=('joints', 'two_joints')),
         Effect(
             **of_table, name='axis_wobble', shape=(len(names.turning), len(WOBBLES), 2),
             components=tuple(f'{name}_{kind}{order:+d}' for name in names.turning for order in WOBBLES for kind in ('cos', 'sin')),
             explanation='An axis wobbles: it leans another way at every angle of its turn, as a bearing out of round makes it.',
-            tolerance_reason='as the tilt', prior_sd=2e-3, plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),),
+            tolerance_reason='as the tilt', prior_sd=2e-3,
+            plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),),
             motion=('slow_turn', 'two_axis'), warp=_wobble, needs=('joints',)),
         Effect(
-            **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance', components=MATRIX, shape=(3, 3),
+            **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance',
+            components=MATRIX, shape=(3, 3),
             explanation='The mount bends with the load: the sensor turns a little with the force that it carries, which both sensors see.',
             tolerance_reason='0.1 mrad at 1 g', prior_sd=1e-3 / STANDARD_GRAVITY,
             plausible=(('bench', 3e-3 / STANDARD_GRAVITY, '10 arcmin per g of a slender bracket'),),
-            motion=('static_dense', 'two_axis'), groups=tuple(LOAD.values()), group_sensors=tuple(LOAD), coefficients=_bent, needs=('joints',)),
+            motion=('static_dense', 'two_axis'), groups=tuple(LOAD.values()), group_sensors=tuple(LOAD), coefficients=_bent,
+            needs=('joints',)),
         Effect(
             name='time_offset', sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
             explanation='The IMU stamps are late against the joint stamps.',

@@ -33,21 +33,26 @@ def _pair(sensor):
         Effect(
             name='bias', sensor=sensor, role=Role.OFFSET, components=VECTOR, shape=(3,), unit=unit,
             explanation=f'The {sensor} has an offset.',
-            tolerance=small, tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
+            tolerance=small,
+            tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
             prior_sd=2.0 if accel else 0.2, plausible=(('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),),
             motion=('static_poses',), compensation='exact', groups=(regressors.ONE,), coefficients=Amplitudes('bias', 'one')),
         Effect(
             name='matrix', sensor=sensor, role=Role.LINEAR, components=MATRIX, shape=(3, 3), unit='1',
             title='matrix (scale factors and axis directions)',
             explanation=f'The {sensor} scale factors and axis directions differ from nominal.',
-            tolerance=1e-3, tolerance_reason='1 mg at 1 g, as much as the bias; 1 mrad of installation angle' if accel else '0.36 deg in one full turn',
+            tolerance=1e-3,
+            tolerance_reason='1 mg at 1 g, as much as the bias; 1 mrad of installation angle' if accel else '0.36 deg in one full turn',
             prior=tuple(np.eye(3).ravel()), prior_sd=0.1, motion=('static_poses',) if accel else ('spin_x', 'spin_y', 'spin_z'),
             compensation='exact', groups=(own['TRUE_INPUT'],), coefficients=OfMatrix('matrix', kind)),
         Effect(
             name=f'{short}_quadratic', sensor=sensor, components=VECTOR, shape=(3,), unit=f'({unit})^-1', against=(kind,),
-            explanation=f'The {sensor} output bends with the square of its input (K2), so that equal inputs of opposite sign do not give opposite readings.',
-            tolerance=small / full**2, tolerance_reason='1 mg at 1 g' if accel else '0.01 deg/s at 100 deg/s', prior_sd=100 * small / full**2,
-            plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: 0.1 % / 0.5 % of range'),),
+            explanation=f'The {sensor} output bends with the square of its input (K2), '
+            'so that equal inputs of opposite sign do not give opposite readings.',
+            tolerance=small / full**2, tolerance_reason='1 mg at 1 g' if accel else '0.01 deg/s at 100 deg/s',
+            prior_sd=100 * small / full**2,
+            plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
+                        '0.1 % / 0.5 % of range'),),
             motion=curved, compensation='exact', **along_axis(f'{short}_quadratic', 'SQUARES', regressors.square_coefficients)),
         Effect(
             name=f'{short}_scale_asymmetry', sensor=sensor, components=VECTOR, shape=(3,), unit='1', against=(kind,),
@@ -56,14 +61,16 @@ def _pair(sensor):
             plausible=(('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),),
             motion=curved, compensation='exact', **along_axis(f'{short}_scale_asymmetry', 'SIGNED', regressors.signed_coefficients)),
         Effect(
-            name=f'{short}_thermal_bias', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K', against=('temperature',), smooth=True,
+            name=f'{short}_thermal_bias', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K', against=('temperature',),
+            smooth=True,
             explanation=f'The {sensor} bias follows the temperature.',
             tolerance=0.1 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=10 * small,
             plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
             groups=(regressors.TEMPERATURE,), coefficients=Amplitudes(f'{short}_thermal_bias', 'temperature')),
         Effect(
-            name=f'{short}_thermal_bias_2', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K^2', against=('temperature',), smooth=True,
+            name=f'{short}_thermal_bias_2', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K^2', against=('temperature',),
+            smooth=True,
             title=f'{short} thermal bias, second order',
             explanation=f'The {sensor} bias bends with the temperature: it follows its square too.',
             tolerance=0.01 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=small,
@@ -79,7 +86,8 @@ def _pair(sensor):
             groups=(own['THERMAL'],), coefficients=OfMatrix(f'{short}_thermal_scale', own['THERMAL'].name)),
         Effect(
             name=f'{short}_cross_axis_lag', sensor=sensor, components=OTHERS, shape=(3, 2), unit='s', against=('rate',),
-            explanation=f'Each {sensor} axis hears the others with another lag than its own: what they feel comes onto it by how fast it changes.',
+            explanation=f'Each {sensor} axis hears the others with another lag than its own: '
+            'what they feel comes onto it by how fast it changes.',
             tolerance=1e-5, tolerance_reason='1 mrad of cross coupling through a lag of 10 ms', prior_sd=1e-3,
             plausible=(('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),),
             motion=('oscillate_fast', 'two_axis'), compensation='exact', needs=('rotation',), moot=_one_axis,
@@ -88,14 +96,16 @@ def _pair(sensor):
             name=f'{short}_bias_drift', sensor=sensor, components=VECTOR + ('time_constant',), shape=(4,), unit=(unit, unit, unit, 's'),
             time_constant=True, smooth=True, against=('time',),
             explanation=f'The {sensor} bias settles after turn-on like 1 - exp(-t / time constant), with no temperature to explain it.',
-            tolerance=small, tolerance_reason='as the bias', prior=(0.0, 0.0, 0.0, 300.0), prior_sd=(50 * small, 50 * small, 50 * small, 1000.0),
+            tolerance=small, tolerance_reason='as the bias', prior=(0.0, 0.0, 0.0, 300.0),
+            prior_sd=(50 * small, 50 * small, 50 * small, 1000.0),
             plausible=(('consumer', 20 * MILLI_G if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),),
             motion=('warm_up',), compensation='none', groups=(own['WARM_UP'],),
             coefficients=Amplitudes(f'{short}_bias_drift', own['WARM_UP'].name, time_constant=True)),
         Effect(
             name=f'{short}_saturation', sensor=sensor, role=Role.LIMIT, components=('level',), shape=(), unit=unit,
             explanation=f'The {sensor} output is clipped: it cannot follow inputs beyond its range.',
-            tolerance=0.01 * full, tolerance_reason='10 mg of the range' if accel else '1 deg/s of the range', prior=np.inf, prior_sd=100 * full,
+            tolerance=0.01 * full, tolerance_reason='10 mg of the range' if accel else '1 deg/s of the range', prior=np.inf,
+            prior_sd=100 * full,
             nonnegative=True, motion=('fast_spin',), compensation='flagged'),
     )
 
@@ -110,7 +120,8 @@ ACCELEROMETER = _pair('accelerometer') + (
         coefficients=AlongAxis('accel_cubic', 'force_cubes', regressors.cube_coefficients)),
     Effect(
         name='accel_cross_product', sensor='accelerometer', components=PRODUCTS, shape=(3, 3), unit='(m/s^2)^-1', against=('force',),
-        explanation='The accelerometers are pendulums that give way: products of specific-force components enter the output (Avrutov 2017, eq. 4).',
+        explanation='The accelerometers are pendulums that give way: '
+        'products of specific-force components enter the output (Avrutov 2017, eq. 4).',
         tolerance=MILLI_G / STANDARD_GRAVITY**2, tolerance_reason='1 mg for 1 g on two axes', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**2,
         plausible=(('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),),
         motion=('static_dense',), compensation='exact', groups=(regressors.SQUARES['accelerometer'],),
@@ -133,22 +144,28 @@ ACCELEROMETER = _pair('accelerometer') + (
 
 GYROSCOPE = _pair('gyroscope') + (
     Effect(
-        name='gyro_g_sensitivity', sensor='gyroscope', role=Role.CROSS, components=MATRIX, shape=(3, 3), unit='(rad/s)/(m/s^2)', against=('force',),
+        name='gyro_g_sensitivity', sensor='gyroscope', role=Role.CROSS, components=MATRIX, shape=(3, 3), unit='(rad/s)/(m/s^2)',
+        against=('force',),
         explanation='The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).',
         tolerance=0.01 * DEG / STANDARD_GRAVITY, tolerance_reason='0.01 deg/s at 1 g', prior_sd=1.0 * DEG / STANDARD_GRAVITY,
         plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),), motion=('static_poses',),
         compensation='exact', groups=(regressors.TRUE_INPUT['accelerometer'],), coefficients=Amplitudes('gyro_g_sensitivity', 'force')),
     Effect(
-        name='gyro_force_squared', sensor='gyroscope', components=tuple(f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')),
+        name='gyro_force_squared', sensor='gyroscope',
+        components=tuple(f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')),
         shape=(3, 6), unit='(rad/s)/(m/s^2)^2', against=('force',), title='response to the square of specific force',
-        explanation='The gyroscopes respond to squares and products of specific force: their elements yield more along one axis than along another.',
+        explanation='The gyroscopes respond to squares and products of specific force: '
+        'their elements yield more along one axis than along another.',
         tolerance=0.01 * DEG / STANDARD_GRAVITY**2, tolerance_reason='0.01 deg/s at 1 g', prior_sd=0.2 * DEG / STANDARD_GRAVITY**2,
-        plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),), motion=('static_dense', 'centrifuge'),
-        compensation='exact', groups=(regressors.SQUARES['accelerometer'],), coefficients=Amplitudes('gyro_force_squared', 'force_squares')),
+        plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),),
+        motion=('static_dense', 'centrifuge'),
+        compensation='exact', groups=(regressors.SQUARES['accelerometer'],),
+        coefficients=Amplitudes('gyro_force_squared', 'force_squares')),
     Effect(
         name='gyro_rate_product', sensor='gyroscope', components=PRODUCTS, shape=(3, 3), unit='(rad/s)^-1', against=('rate',),
         explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',
         tolerance=1e-3, tolerance_reason='as the matrix at 1 rad/s', prior_sd=0.3,
         plausible=(('consumer', 0.06, 'Avrutov 2017, sample 4: 1e-3 V/(deg/s)^2 at 0.1 V/(deg/s) is 0.6'),), motion=('two_axis',),
-        compensation='exact', needs=('rotation',), groups=(regressors.SQUARES['gyroscope'],), coefficients=Products('gyro_rate_product', 'rate_squares')),
+        compensation='exact', needs=('rotation',), groups=(regressors.SQUARES['gyroscope'],),
+        coefficients=Products('gyro_rate_product', 'rate_squares')),
 )

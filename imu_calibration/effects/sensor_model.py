@@ -88,7 +88,8 @@ class SensorModel:
         """Return whether another model makes the very same columns: the same effects, linearised at the same point."""
         same = all(tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS) \
             and all(getattr(self, name) == getattr(other, name) for name in ('joint_names', 'temperature_ref_c', 'definitions'))
-        return same and self.point.keys() == other.point.keys() and all(np.array_equal(self.point[name], other.point[name]) for name in self.point)
+        return (same and self.point.keys() == other.point.keys()
+                and all(np.array_equal(self.point[name], other.point[name]) for name in self.point))
 
     def find(self, sensor: str, role: Role) -> Effect | None:
         """Return the effect of a sensor in a place of its equation, or None."""
@@ -194,7 +195,8 @@ class SensorModel:
             for effect in self.concerning(sensor):
                 for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
-                        raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', which other columns are called; rename it")
+                        raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', "
+                                         "which other columns are called; rename it")
                     widths[group.name] = group.width
                 if effect.warp is not None:
                     widths[WARP + effect.name] = 3 * effect.size

@@ -11,10 +11,12 @@ from imu_calibration.errors import InputError
 
 JOINTS = {'joint angle', 'joint rate'}
 """Quantities that only a table knows."""
-MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)), ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
+MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
+           ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
            ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
 """Standard motions that show a quantity; the first that a column uses is taken."""
-DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'time': 'time', 'force': 'force', 'rate': 'rate'}
+DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'time': 'time', 'force': 'force',
+                 'rate': 'rate'}
 """Quantity -> what a residual is drawn against where a column uses it; the first."""
 MANY = 100.0
 """Tolerances in the prior's standard deviation, where nobody says more."""
@@ -89,7 +91,8 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason, explanation=text, needs=needs,
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINTS} else 'exact', groups=(group,),
-        coefficients=Amplitudes(name, name, len(columns) == 3, settles), smooth=not group.uses - {'time', 'temperature', 'reference temperature', 'time constant'},
+        coefficients=Amplitudes(name, name, len(columns) == 3, settles),
+        smooth=not group.uses - {'time', 'temperature', 'reference temperature', 'time constant'},
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
@@ -108,4 +111,5 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
     try:
         return term(name, **definition)
     except TypeError as error:
-        raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); correct it") from error
+        raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
+                         "correct it") from error

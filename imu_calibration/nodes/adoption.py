@@ -75,7 +75,8 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
     except ImuCalibrationError:
         raise
     except Exception as error:   # whatever a document does, it must not end the node
-        raise DocumentError('a calibration must be usable, this one is not: ' + shortened(f'{type(error).__name__}: {error}', 200)) from error
+        what = shortened(f'{type(error).__name__}: {error}', 200)
+        raise DocumentError(f'a calibration must be usable, this one is not: {what}') from error
 
 
 def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
@@ -95,7 +96,8 @@ def _transfer(calibration: Calibration, settings: CompensatorSettings, frames: S
     if not target or given or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:
-        raise DocumentError(f"to move readings to '{target}' by {TOPIC} the calibration must name the frame of the sensor, it names none; give "
+        raise DocumentError(f"to move readings to '{target}' by {TOPIC} the calibration must name the frame of the sensor, "
+                            "it names none; give "
                             'target_xyz and target_rpy')
     pose = frames.pose(target, calibration.frame_id)
     if pose is None:
@@ -108,7 +110,8 @@ def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: S
     if settings.noise_file:
         calibration = with_measured_noise(calibration, files.read_noise(files.user_path(settings.noise_file)))
     transfer = _transfer(calibration, settings, frames)
-    compensation = LiveCompensation(calibration, transfer, check_frame=settings.check_frame_id, with_parameters=settings.parameter_covariance,
+    compensation = LiveCompensation(calibration, transfer, check_frame=settings.check_frame_id,
+                                    with_parameters=settings.parameter_covariance,
                                     correct_stamps=settings.correct_stamps, watch=_watch(calibration, transfer, settings, before))
     if before is not None:
         compensation.prepare(before.compensation)

@@ -50,10 +50,12 @@ class BagPlayerNode(Node):
         self._players = [self._publisher(name) for name in self._topics]
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
-        self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players, on_end=self._ended)
+        self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players,
+                                  on_end=self._ended)
         self.failed = self._is_over = False
         self._playback.start()
-        self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: {", ".join(self._topics)}')
+        self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: '
+                               f'{", ".join(self._topics)}')
 
     def close(self) -> str:
         """Stop publishing and close the files; return what became of it."""

@@ -79,14 +79,19 @@ class CalibrationNodeSettings:
                                    symptom='an effect that is there bends the others', fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='good parameters are called weak', session=True)
-    effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, tolerance, text}, '
-                                'or a calibration that has some; a model may name them then', symptom='the node refuses a model that names them',
+    effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
+                                'tolerance, text}, '
+                                'or a calibration that has some; a model may name them then',
+                                symptom='the node refuses a model that names them',
                                 session=True, fixed='motion is gathered for the model')
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: how its biases move from window to window, on a table; empty: what '
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: how its biases move from window to window, on a table; '
+                              'empty: what '
                               'the windows say of it', symptom='standard deviations of the biases are too large or too small', session=True,
                               fixed='one session is judged by one noise')
-    save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, also when '
-                             'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, with ~/save alone',
+    save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, '
+                             'also when '
+                             'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, '
+                             'with ~/save alone',
                              symptom='the node says at its start that the place is not writable', live=True, session=True)
     resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
                            symptom='old motion of another IMU enters the calibration', session=True)
@@ -130,7 +135,8 @@ class CalibrationNode(Node):
         self.worker.start()
 
     def _listen(self) -> None:
-        topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu), 'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
+        topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
+                  'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
         if self._reference.joint_names is not None:
             topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
         self._inputs = {name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
@@ -218,9 +224,11 @@ class CalibrationNode(Node):
         """Return the diagnostics, and say on the terminal what has changed."""
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
-        silent = [] if state.streams is None else [self._inputs[name].silence(state.streams.unusable.get(name, '')) for name in state.streams.silent]
+        streams = state.streams
+        silent = [] if streams is None else [self._inputs[name].silence(streams.unusable.get(name, '')) for name in streams.silent]
         if 'joints' not in self._inputs and self.count_publishers(self.resolve_topic_name('joint_states')):
-            about_topics.append("joint states are published and not listened to: to calibrate on a table or an arm give 'table_file' or 'urdf_file'")
+            about_topics.append("joint states are published and not listened to: "
+                                "to calibrate on a table or an arm give 'table_file' or 'urdf_file'")
         trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
         if time.monotonic() - self._started > PATIENCE:
             self._complaints.now('calibration', about_topics + silent + trouble, state.faults)

@@ -118,7 +118,8 @@ class CalibrationWorker(threading.Thread):
             while not self._ending:
                 self._wake.wait(PERIOD)
                 self._wake.clear()
-                for step in (self._take, self._answer, self._solve_when_due, self._adopt_what_was_found, self._autosave, self._diagnose_when_due, self._tell,
+                for step in (self._take, self._answer, self._solve_when_due, self._adopt_what_was_found, self._autosave,
+                             self._diagnose_when_due, self._tell,
                              self._cover):
                     self._survive(step)
             self._survive(self._take)
@@ -228,7 +229,8 @@ class CalibrationWorker(threading.Thread):
             return False, "nothing is diagnosed by hand while it runs, nor where parameter 'diagnosis_period' is 0"
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return True, f'asked what the model gets wrong on {self.live.n_windows} windows; the answer comes on /diagnostics, and joins the calibration'
+        return True, (f'asked what the model gets wrong on {self.live.n_windows} windows; '
+                      'the answer comes on /diagnostics, and joins the calibration')
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
@@ -305,7 +307,8 @@ class CalibrationWorker(threading.Thread):
         groups = self.live.groups() if stale else self.state.groups
         diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
         self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
-                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values, self.live.status(self.hints), diagnosis,
+                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
+                                 self.live.status(self.hints), diagnosis,
                                  str(self.place.calibration), '' if result is None else result.verdict.text)
 
     def _cover(self) -> None:

@@ -27,8 +27,10 @@ HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
-         'covariance not finite': "covariances that came are none (not finite, or a variance below zero): the calibration's noise takes their place",
-         'zero stamp': 'the driver sets no stamps, they are zero: the time of arrival stands for them where the angular acceleration is formed',
+         'covariance not finite': ("covariances that came are none (not finite, or a variance below zero): "
+                                   "the calibration's noise takes their place"),
+         'zero stamp': ('the driver sets no stamps, they are zero: '
+                        'the time of arrival stands for them where the angular acceleration is formed'),
          'beyond what can be undone': 'readings are too large for the non-linear effects to be undone: these messages are not published'}
 
 
@@ -115,10 +117,11 @@ class CompensatorDiagnostics:
         notes = []
         for reason, count in self._new_counts(compensation).items():
             (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, compensation))
-        return serious, notes + [compensation.slope.doubt] * bool(compensation.slope.doubt) + self._outside(compensation) + self._warmth(compensation)
+        doubts = [compensation.slope.doubt] * bool(compensation.slope.doubt)
+        return serious, notes + doubts + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
-        """Return the reasons of which there is more than at any call before: a calibration that is about to take over has counted nothing."""
+        """Return the reasons of which there is more than at any call before: a calibration about to take over has counted nothing."""
         counts = dict(compensation.counts)
         new = {reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)}
         self._counts |= new
@@ -151,13 +154,15 @@ class CompensatorDiagnostics:
 
     def _values(self):
         node, adopted = self._node, self._node.adopted
-        values = {'calibration': adopted.version if adopted else 'none', 'source': adopted.source if adopted else '', 'adopt': node.settings.adopt,
+        values = {'calibration': adopted.version if adopted else 'none', 'source': adopted.source if adopted else '',
+                  'adopt': node.settings.adopt,
                   'loop': 'wait set' if node.by_wait_set else 'public executor', 'input': node.imu.source(),
                   'passed or held back without calibration': node.uncorrected}
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
-        values |= {'verdict': verdict_text(calibration.verdict, calibration.verdicts) or 'none', 'left as they come': ', '.join(adopted.used.refused) or 'none',
+        values |= {'verdict': verdict_text(calibration.verdict, calibration.verdicts)
+                   or 'none', 'left as they come': ', '.join(adopted.used.refused) or 'none',
                    'standing': trust.standing(calibration), 'date': calibration.conditions.get('date', ''),
                    'parameters': len(calibration.status), 'not determined': sum(status != DETERMINED for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}

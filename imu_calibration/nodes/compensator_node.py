@@ -158,8 +158,10 @@ class CompensatorNode(Node):
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
         self._view.take_calibration(adopted)
         self.awaited = ''
-        if self.temperature is None and (adopted.compensation.needs_temperature or adopted.calibration.conditions.get('temperature_range_c')):
-            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10, raw=False)
+        if self.temperature is None and (adopted.compensation.needs_temperature
+                                         or adopted.calibration.conditions.get('temperature_range_c')):
+            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10,
+                                            raw=False)
             self.inputs.append(self.temperature)
         self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
         self.diagnostics.publish_now()

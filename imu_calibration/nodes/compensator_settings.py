@@ -10,8 +10,8 @@ ADOPT = (FILE, TOPIC, FILE_THEN_TOPIC)
 """
 Where calibrations are taken from.
 
-By default a file that was named stays in force, whatever comes on the topic, and without one the topic is listened to: nobody who names a file
-wants it displaced by somebody else's session, and nobody who names none has another use for the node.
+By default a file that was named stays in force, whatever comes on the topic, and without one the topic is listened to: nobody who names a
+file wants it displaced by somebody else's session, and nobody who names none has another use for the node.
 """
 
 
@@ -19,7 +19,8 @@ wants it displaced by somebody else's session, and nobody who names none has ano
 class CompensatorSettings:
     """What to correct with, where to, and how."""
 
-    calibration_file: str = setting('', '', 'calibration.yaml to correct with, and to return to on ~/reload; empty: wait for imu/calibration',
+    calibration_file: str = setting('', '', 'calibration.yaml to correct with, and to return to on ~/reload; '
+                                    'empty: wait for imu/calibration',
                                     symptom='nothing is published, diagnostics say why', live=True, session=True)
     adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
                          'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
@@ -28,34 +29,42 @@ class CompensatorSettings:
                            symptom='the correction may make the readings worse', live=True)
     passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
                                 symptom='uncorrected messages on the corrected topic', live=True)
-    target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, or where both are '
-                                'zero by the transforms on /tf_static; empty: the frame of the sensor',
+    target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, '
+                                'or where both are zero by the transforms on /tf_static; empty: the frame of the sensor',
                                 symptom='frame_id is not the one that others expect', live=True, session=True)
     target_xyz: tuple = setting((0.0, 0.0, 0.0), 'm', 'place of the sensor in the target frame; with target_rpy zero too: from /tf_static',
                                 symptom='specific force is wrong while the body turns, right at rest', live=True, session=True)
-    target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame; with target_xyz zero too: from /tf_static',
+    target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame; '
+                                'with target_xyz zero too: from /tf_static',
                                 symptom='gravity points along the wrong axis', live=True, session=True)
     check_frame_id: bool = setting(True, '', 'correct only messages that carry the frame_id of the calibration',
-                                   symptom='nothing is published, diagnostics name both frames; if false, another sensor may pass unnoticed',
+                                   symptom='nothing is published, diagnostics name both frames; '
+                                   'if false, another sensor may pass unnoticed',
                                    live=True)
     correct_stamps: bool = setting(False, '', 'move the stamps back by the time_offset of the calibration',
                                    symptom='stamps differ from those of the driver', live=True)
     parameter_covariance: bool = setting(True, '', 'add what the uncertainty of the calibration contributes to the covariances',
                                          symptom='covariances are too small, filters trust the readings too much', live=True)
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: covariances follow from it where the messages bring none; empty: '
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: '
+                              'covariances follow from it where the messages bring none; empty: '
                               'from the noise that the calibration saw', symptom='filters trust the readings too much or too little',
                               live=True, session=True)
-    covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; 0: only with a new calibration',
+    covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; '
+                                     '0: only with a new calibration',
                                      (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
-    gravity: float = setting(0.0, 'm/s^2', 'gravity where the robot drives, for what stops say of the calibration; 0: that of the calibration, within '
-                             'the half per cent by which places differ', (0.0, 20.0), 'a scale that is off by less than half a per cent goes unnoticed',
+    gravity: float = setting(0.0, 'm/s^2', 'gravity where the robot drives, for what stops say of the calibration; '
+                             '0: that of the calibration, within '
+                             'the half per cent by which places differ',
+                             (0.0, 20.0), 'a scale that is off by less than half a per cent goes unnoticed',
                              live=True)
     update_gyro_bias: bool = setting(False, '', 'take off the bias of the gyroscope that stops show beyond the calibration',
-                                     symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at "rest", that '
+                                     symptom='headings drift as the sensor warms up; '
+                                     'if true where the robot turns slowly and steadily at "rest", that '
                                      'turn is taken for a bias', live=True)
     gyro_bias_time: float = setting(600.0, 's', 'in which such an update loses its meaning while the robot does not stop', (10.0, 86400.0),
                                     'too long: the bias of long ago is believed; too short: it is forgotten between stops', live=True)
-    public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, instead of a wait set of our own",
+    public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, "
+                                    "instead of a wait set of our own",
                                     symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
 
     def __post_init__(self):

@@ -1,8 +1,8 @@
 """
 Diagnostics: what a node knows about itself, once per second on /diagnostics and at once when it changes.
 
-Levels by convention: OK works as it should, a start included; WARN works and somebody should look; ERROR does not do what it is for. STALE is
-for those who listen, when nothing comes any more.
+Levels by convention: OK works as it should, a start included; WARN works and somebody should look; ERROR does not do what it is for. STALE
+is for those who listen, when nothing comes any more.
 """
 
 from collections.abc import Callable, Mapping

@@ -127,7 +127,8 @@ def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicC
         from control_msgs.action import FollowJointTrajectory
     except ImportError:
         if how == 'action':
-            raise InputError("parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, or use topic") from None
+            raise InputError("parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, "
+                             "or use topic") from None
         return TopicCommand(node)
     from rclpy.action import ActionClient
     client = ActionClient(node, FollowJointTrajectory, 'follow_joint_trajectory')

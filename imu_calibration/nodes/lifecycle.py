@@ -29,8 +29,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     ----------
     make_node : callable
         Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, what
-        it returns is printed; a class with a method `halt` has it called at the first signal, while the context still lives and messages can be sent;
-        an attribute `failed` says whether it ended because it could not go on, and has said so.
+        it returns is printed; a class with a method `halt` has it called at the first signal, while the context still lives and messages
+        can be sent; an attribute `failed` says whether it ended because it could not go on, and has said so.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
     spin : callable, optional

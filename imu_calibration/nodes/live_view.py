@@ -23,7 +23,8 @@ class FoxgloveSettings:
     foxglove_host: str = setting('127.0.0.1', '', 'address to listen on; 0.0.0.0: on every network, for everybody there',
                                  symptom='only programs on the same host find it', fixed='the address is taken when the server starts')
     foxglove_port: int = setting(8766, '', 'port to listen on, beside the 8765 of foxglove_bridge; 0: any that is free', (0, 65535),
-                                 'another program has it: the node says so and shows nothing', fixed='the port is taken when the server starts')
+                                 'another program has it: the node says so and shows nothing',
+                                 fixed='the port is taken when the server starts')
 
 
 class LiveView:

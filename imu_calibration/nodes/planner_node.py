@@ -2,9 +2,9 @@
 planner_node: moves a table or an arm so that calibration_node can determine every parameter, and no further.
 
 in: joint_states (sensor_msgs/JointState), imu/calibration (std_msgs/String, from calibration_node), /diagnostics (its diagnosis).
-out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed; /diagnostics;
-imu/coverage (visualization_msgs/MarkerArray): the motion that is driven, beside calibration_node's picture.
-services: ~/start (all motions that are needed), ~/next (one motion), ~/stop (at any moment). Nothing moves before ~/start or ~/next.
+out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed;
+/diagnostics; imu/coverage (visualization_msgs/MarkerArray): the motion that is driven, beside calibration_node's picture. services: ~/start
+(all motions that are needed), ~/next (one motion), ~/stop (at any moment). Nothing moves before ~/start or ~/next.
 """
 
 import sys
@@ -66,7 +66,8 @@ class PlannerNodeSettings:
     """What is moved, for which parameters, and how it is commanded."""
 
     table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
-                              'config/table_three_axis.yaml, or with urdf_file nothing', symptom='other joints, or limits that are not theirs', session=True)
+                              'config/table_three_axis.yaml, or with urdf_file nothing',
+                              symptom='other joints, or limits that are not theirs', session=True)
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='motions go on for too long, or end too early', session=True)
     accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
@@ -80,7 +81,8 @@ class PlannerNodeSettings:
                               'the predicted standard deviations are not those that are reached')
     command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
                            'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
-    calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows', symptom='~/start says that nobody calibrates')
+    calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows',
+                                    symptom='~/start says that nobody calibrates')
 
 
 class PlannerNode(Node):
@@ -95,7 +97,8 @@ class PlannerNode(Node):
         require_grade(settings.grade)
         robot = declare_parameters(self, RobotSettings)
         self._table = chain_of(self, robot, settings.table_file) or files.read_table(config_file('table_three_axis.yaml'))
-        tolerances = files.read_tolerances(files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml'))
+        own = settings.tolerances_file
+        tolerances = files.read_tolerances(files.user_path(own) if own else config_file('tolerances.yaml'))
         self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
                                            settings.reference_model or None, tolerances,
                                            noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
@@ -120,7 +123,8 @@ class PlannerNode(Node):
         self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
-        self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; nothing moves before ~/start')
+        self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
+                               'nothing moves before ~/start')
 
     def close(self) -> str:
         """Stop what moves; return what became of it."""
@@ -136,7 +140,8 @@ class PlannerNode(Node):
 
     def _make_campaign(self) -> Campaign:
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
-        planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate, options=self._options,
+        planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate,
+                               options=self._options,
                                calibration=self._latest())
         return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise))
 
@@ -220,7 +225,8 @@ class PlannerNode(Node):
         known = len(self._documents)
         answer = self._ask('solve')
         if answer is None:
-            raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; see whether it runs")
+            raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
+                             "see whether it runs")
         if not answer.success:
             self._say(INFO, f'no calibration yet: {answer.message}')
             return None
@@ -252,7 +258,9 @@ class PlannerNode(Node):
         if not self._calibrator['solve'].service_is_ready():
             return False, f'nobody takes the windows: {self._calibrator["solve"].srv_name} is not there; start calibration_node'
         self.worker.go(motions)
-        return True, 'one motion, then it rests' if motions > 0 else 'plans and moves until every parameter is within its tolerance; the first motion is slow'
+        if motions > 0:
+            return True, 'one motion, then it rests'
+        return True, 'plans and moves until every parameter is within its tolerance; the first motion is slow'
 
     def _stop(self) -> tuple[bool, str]:
         self.worker.halt('stopped by ~/stop')
@@ -276,7 +284,8 @@ class PlannerNode(Node):
         if self._driven is not None:   # again, since calibration_node's picture begins with clearing everything
             self._coverage.publish(self._driven)
         name, excess = worker.worst
-        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}', 'it takes [s]': f'{worker.seconds:.1f}',
+        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
+                  'it takes [s]': f'{worker.seconds:.1f}',
                   'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside, 'furthest outside': name,
                   'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name}
         if worker.campaign is not None and worker.campaign.findings is not None:

@@ -1,4 +1,8 @@
-"""The thread behind planner_node: what next, when the joints rest; plans, questions and answers take their time, and the joints are watched meanwhile."""
+"""
+The thread behind planner_node: what next, when the joints rest.
+
+Plans, questions and answers take their time, and the joints are watched meanwhile.
+"""
 
 from __future__ import annotations
 

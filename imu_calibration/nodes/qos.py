@@ -7,7 +7,7 @@ DEPTH = 1000
 
 
 def input_qos(reliable: bool = False, depth: int = DEPTH) -> QoSProfile:
-    """Return the profile of an input (see `inputs.MatchedInput`): `reliable` asks again for what is lost, best effort takes any publisher."""
+    """Return the profile of an input (`inputs.MatchedInput`): `reliable` asks again for what is lost, best effort takes any publisher."""
     return _last(depth, ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
 
 

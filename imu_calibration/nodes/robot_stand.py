@@ -32,12 +32,16 @@ Found = TypeVar('Found')
 class RobotSettings:
     """The arm that carries the IMU."""
 
-    urdf_file: str = setting('', '', f"description (.urdf or .xacro) of the arm that carries the IMU, path; {TOPIC}: what comes on robot_description; empty: "
-                             'table_file alone. Beside an arm table_file says where it stands: up, gravity, latitude, limits of joints by name',
+    urdf_file: str = setting('', '', "description (.urdf or .xacro) of the arm that carries the IMU, path; "
+                             f"{TOPIC}: what comes on robot_description; empty: "
+                             'table_file alone. Beside an arm table_file says where it stands: up, gravity, latitude, '
+                             'limits of joints by name',
                              symptom='the node waits, and says for what', session=True, fixed='all motion gathered so far is of that arm')
     imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',
-                            symptom='another place and attitude of the sensor', session=True, fixed='all motion gathered so far is of that link')
-    world_frame: str = setting('', '', 'frame whose z axis points up and that /tf_static ties to the root of the arm; empty: up is as table_file says, '
+                            symptom='another place and attitude of the sensor', session=True,
+                            fixed='all motion gathered so far is of that link')
+    world_frame: str = setting('', '', 'frame whose z axis points up and that /tf_static ties to the root of the arm; '
+                               'empty: up is as table_file says, '
                                "else the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
                                fixed='all motion gathered so far is of an arm that stands so')
 

@@ -53,7 +53,8 @@ STRETCH = 0.1
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml, or with urdf_file nothing',
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml, '
+                              'or with urdf_file nothing',
                               symptom='joint names are not those expected', session=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
@@ -120,7 +121,8 @@ class SimulatorNode(Node):
         self.failed = self._is_over = False
         self._playback.start()
         moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
-        self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, {settings.time_factor:g} times as fast as real time')
+        self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, '
+                               f'{settings.time_factor:g} times as fast as real time')
 
     def close(self) -> str:
         """Stop publishing; return what became of it."""
@@ -130,11 +132,13 @@ class SimulatorNode(Node):
     def _make_table(self):
         settings = self.settings
         robot = declare_parameters(self, RobotSettings)
-        table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id) or files.read_table(config_file('table_three_axis.yaml'))
+        table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id)
+        table = table or files.read_table(config_file('table_three_axis.yaml'))
         profile = None if settings.profile in NO_PROFILE else make_profile(settings.profile, settings.seed, table)
         if profile is not None and profile.table is not None:
             table = Table.from_mapping(profile.table)
-        return table, TableController(profile, table.joint_names, limits=limits_of(table), settings=self._controller, repeat=settings.repeat)
+        return table, TableController(profile, table.joint_names, limits=limits_of(table), settings=self._controller,
+                                      repeat=settings.repeat)
 
     def _imu_seed(self):
         return self.settings.seed if self.settings.imu_seed < 0 else self.settings.imu_seed

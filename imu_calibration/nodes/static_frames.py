@@ -44,7 +44,8 @@ class StaticFrames:
         """Take a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             place, turn = stamped.transform.translation, stamped.transform.rotation
-            usable = self.transforms.add(stamped.header.frame_id.lstrip('/'), stamped.child_frame_id.lstrip('/'), xyz=(place.x, place.y, place.z),
+            usable = self.transforms.add(stamped.header.frame_id.lstrip('/'), stamped.child_frame_id.lstrip('/'),
+                                         xyz=(place.x, place.y, place.z),
                                          quaternion=(turn.x, turn.y, turn.z, turn.w))
             self.n_unusable += not usable
         self._changed()
@@ -54,7 +55,7 @@ class StaticFrames:
             try:
                 from tf2_msgs.msg import TFMessage
             except ImportError as error:
-                raise InputError(f'{TOPIC} needs the messages of the package tf2_msgs, which is not installed; install ros-jazzy-tf2-msgs, or give '
-                                 'target_xyz and target_rpy') from error
+                raise InputError(f'{TOPIC} needs the messages of the package tf2_msgs, which is not installed; '
+                                 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy') from error
             qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._subscription = self._node.create_subscription(TFMessage, TOPIC, self.take, qos)

@@ -17,7 +17,8 @@ from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
 CHECKS = (
     value_checks.force_unit, stamp_checks.stamps, stamp_checks.clocks, frozen_checks.frozen, frozen_checks.frozen_for_a_time,
-    value_checks.rate_unit, value_checks.full_scale, value_checks.handedness, value_checks.bias, value_checks.gravity, value_checks.clipping,
+    value_checks.rate_unit, value_checks.full_scale, value_checks.handedness, value_checks.bias, value_checks.gravity,
+    value_checks.clipping,
     value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
     stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )

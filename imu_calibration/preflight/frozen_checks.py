@@ -37,8 +37,8 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield CheckFinding('frozen', WARNING,
-                                   f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; look at its connection, '
-                              'and leave that time out', samples=int(stuck.sum() * chunks.size))
+                                   f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; '
+                                   'look at its connection, and leave that time out', samples=int(stuck.sum() * chunks.size))
 
 
 def _at_end(values, ends):

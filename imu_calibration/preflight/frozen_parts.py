@@ -101,7 +101,8 @@ def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
 
 
 def _part(chunks, who, start, stop):
-    return FrozenPart(who, float(chunks.time[start] - chunks.duration[start] / 2), float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
+    return FrozenPart(who, float(chunks.time[start] - chunks.duration[start] / 2),
+                      float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
                       int((stop - start) * chunks.size))
 
 

@@ -1,4 +1,4 @@
-"""Checks against the table: whether the IMU is on it, units, signs and order of the axes, from the windows that calibration gathered anyway."""
+"""Checks against the table: whether the IMU is on it, units, signs and order of the axes, from windows that calibration gathered anyway."""
 
 from typing import Any, Protocol
 
@@ -142,8 +142,8 @@ def _exchange(match, seen):
 
 def _cause(match, matrix, seen, table):
     if match.turned and match.mirrored:
-        return ('this recording cannot tell a turned sensor from a wrong sign; correct mount.rpy_deg or the sign of a joint axis in the table, '
-                'or the signs in the driver')
+        return ('this recording cannot tell a turned sensor from a wrong sign; '
+                'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver')
     if match.mirrored:
         return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
     fits = ''
@@ -185,7 +185,8 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table | None = Non
 def check_force(length: float) -> None:
     """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
     if 0.8 < length < 1.25:
-        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; convert it in the driver or '
+        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; '
+                         'convert it in the driver or '
                          f'give a nominal scaling with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}', key='nominal')
     if not 3.0 < length < 30.0:
         raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; '

@@ -58,9 +58,10 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     elif gain > TURNS:
         return None
     if not cause:
-        key, cause = 'imu_topic', 'it turns otherwise than the table; is it the right topic, are these the joints of its table, and do both clocks agree?'
-    return CheckFinding('on_table', REFUSE, f'the gyroscope must tell the motion of the joints, they explain {100 * min(explained, 1.0):.0f} % of its rates '
-                        f'at a gain of {gain:.2g}: {cause}', key=key)
+        key, cause = 'imu_topic', ('it turns otherwise than the table; is it the right topic, are these the joints of its table, '
+                                   'and do both clocks agree?')
+    return CheckFinding('on_table', REFUSE, 'the gyroscope must tell the motion of the joints, '
+                        f'they explain {100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}', key=key)
 
 
 def _cause(windows, table):
@@ -89,13 +90,15 @@ def _a_period_late(windows, table):
     # opposite rates: a wrong sign, or half a period
     if abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):
         return None
-    return CheckFinding('on_table', REFUSE, f'both streams must tell the same time, the joints explain {100 * unshifted:.0f} % of the rates as stamped and '
+    return CheckFinding('on_table', REFUSE, 'both streams must tell the same time, '
+                        f'the joints explain {100 * unshifted:.0f} % of the rates as stamped and '
                         f'{100 * share:.0f} % shifted: {_late(shift)}')
 
 
 def _late(shift):
     side = 'behind' if shift > 0 else 'ahead of'
-    return f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; set both clocks by one source, or stamp in the drivers'
+    return (f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; '
+            'set both clocks by one source, or stamp in the drivers')
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,11 @@ def _some(windows):
 
 
 def _best_shift(windows, table):
-    """Return by how much the IMU is late, s, the share of the rates that the joints then explain, and that without a delay, negative where opposite."""
+    """
+    Return by how much the IMU is late, s, the share of the rates that the joints then explain, and that without a delay.
+
+    The last is negative where the rates are opposite.
+    """
     period = float(np.median([window.period for window in windows]))
     start, end = windows[0].time[0], windows[-1].time[-1]
     felt, told = np.zeros((2, int((end - start) / period) + 2, 3))

@@ -66,7 +66,8 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             if found.n_gaps:
                 severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
                 yield CheckFinding('gaps', severity,
-                                   f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of {found.duration:.0f} s, '
+                                   f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, '
+                                   f'{found.gap_total:.2f} s of {found.duration:.0f} s, '
                               f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
@@ -79,7 +80,8 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
                 yield CheckFinding('sampling', WARNING,
                                    f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
-                              'samples were lost, or stamps are made when messages arrive; look at the driver and at the load of the recorder')
+                              'samples were lost, or stamps are made when messages arrive; '
+                              'look at the driver and at the load of the recorder')
             elif nominal:
                 yield CheckFinding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
@@ -99,7 +101,8 @@ def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 continue
             came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
             if stream.irregular > IRREGULAR_SHARE:
-                came += (', ' if came else '') + f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
+                off = f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
+                came = f'{came}, {off}' if came else off
             yield CheckFinding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
 
 
@@ -115,7 +118,8 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     late = (joints.first_ns - imu.first_ns) * 1e-9
     if overlap <= 0 and shorter > 0:
         yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
-                      f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on one computer')
+                      f'{"after" if late > 0 else "before"} the Imu and they never overlap; '
+                      'synchronise the clocks or stamp both on one computer')
     elif overlap < 0.9 * shorter:
         yield CheckFinding('clocks', WARNING,
                            f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '

@@ -42,13 +42,15 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     same = [np.append(np.all(np.diff(window.rate_s, axis=0) == 0, axis=1), False) for window in windows]
     spans = _joined(span for each in zip(windows, same, turning) for span in _spans(*each))
     if spans:
-        return CheckFinding('frozen', REFUSE, f'the gyroscope must measure all the time, it repeats one reading {_words(spans)} while the joints turn; '
+        return CheckFinding('frozen', REFUSE, 'the gyroscope must measure all the time, '
+                            f'it repeats one reading {_words(spans)} while the joints turn; '
                             'look at the sensor and its driver, and leave that time out')
     bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
     for k, name in enumerate(table.joint_names):
         spans = _joined(span for window, rate in zip(windows, told) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
-            return CheckFinding('frozen', REFUSE, f'joint states must follow the table, {name} stands still {_words(spans)} while the IMU turns about its '
+            return CheckFinding('frozen', REFUSE, 'joint states must follow the table, '
+                                f'{name} stands still {_words(spans)} while the IMU turns about its '
                                 'axis; look at the driver of the table, and leave that time out')
     return None
 

@@ -62,7 +62,9 @@ class StreamWatch:
     """
 
     def __init__(self, joints: bool = True, temperature: bool = False):
-        self._needed = {'imu': SILENT_AFTER} | ({'joints': SILENT_AFTER} if joints else {}) | ({'temperature': COLD_AFTER} if temperature else {})
+        wanted = {'imu': True, 'joints': joints, 'temperature': temperature}
+        after = {'imu': SILENT_AFTER, 'joints': SILENT_AFTER, 'temperature': COLD_AFTER}
+        self._needed = {name: after[name] for name, asked in wanted.items() if asked}
         self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
         self._newest = {}
         self._arrived = {}
@@ -144,11 +146,13 @@ class StreamWatch:
                 '' if none else ', nothing can be used meanwhile')
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
         if self._apart_for(lead, now) > SILENT_AFTER:
-            return TROUBLE, f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; bring the clocks together'
+            return TROUBLE, (f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
+                             'bring the clocks together')
         if self._stamping is not None and self._stamping.word == IRREGULAR:
             return TROUBLE, f"{self._stamping}: when each sample was taken cannot be told; let the driver stamp by the sensor's clock"
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT:
-            return TROUBLE, f'{", ".join(f"{count} {reason}" for reason, count in self._notes.items())}: the driver sets none, the time of arrival is taken'
+            notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
+            return TROUBLE, f'{notes}: the driver sets none, the time of arrival is taken'
         if recently := self._recently(now):
             return TROUBLE, f'dropped lately: {recently}'
         return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

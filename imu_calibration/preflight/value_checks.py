@@ -192,7 +192,8 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
         yield CheckFinding('gravity', WARNING,
-                           f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads {rest.length:.3f} ({what}), '
+                           f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, '
+                           f'the accelerometer reads {rest.length:.3f} ({what}), '
                       f'{100 * off:+.1f} %: scale or bias is far off (gravity itself differs by '
                       f'{100 * PLACE} % between places)')
     else:
@@ -205,7 +206,8 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
         yield CheckFinding('repeated_readings', WARNING,
-                           f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the driver publishes faster than '
+                           f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
+                           'the driver publishes faster than '
                       'the sensor measures, and noise is underestimated; publish each measurement once')
 
 
@@ -221,8 +223,8 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             size = step[coarse].max()
             people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
             yield CheckFinding('resolution', NOTE,
-                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: means over short windows '
-                          'are rounded too')
+                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: '
+                               'means over short windows are rounded too')
 
 
 def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -233,7 +235,8 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if low < -80 or high > 180:
         kelvin = ': kelvin?' if 200 < low and high < 450 else ''
         yield CheckFinding('temperature', WARNING,
-                           f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; convert it in the driver')
+                           f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; '
+                           'convert it in the driver')
     else:
         yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
 
