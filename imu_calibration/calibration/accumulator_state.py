@@ -38,19 +38,21 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
 
     """
     rows, accumulator = gathered.accumulator.rows, gathered.accumulator
-    header = {'format': FORMAT, 'model': {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')} | {'joint_errors': model.joint_names.errors},
+    names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
+    header = {'format': FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
               'effects': model.definitions, 'demand': demand.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
               'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
-              'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length, 'blocks': [_outline(block) for block in accumulator.blocks],
+              'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length,
+              'blocks': [_outline(block) for block in accumulator.blocks],
               **{name: getattr(gathered, name) for name in _PLAIN}}
     arrays: dict[str, Any] = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
-              'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
-              'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
-              'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
-              'poses': np.array([position for _, _, position in gathered.poses], float)}
+                              'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
+                              'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
+                              'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
+                              'poses': np.array([position for _, _, position in gathered.poses], float)}
     for sensor in _sensors(rows):
         for name in ('mean', 'noise_variance', 'inflation'):
             arrays[f'{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
@@ -89,7 +91,8 @@ def _reading(data):
                 raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove it, "
                                     'or start without resume')
             yield header, arrays
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile,
+            zlib.error) as error:
         raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this is not '
                             f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume') from error
 

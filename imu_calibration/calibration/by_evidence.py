@@ -2,8 +2,8 @@
 One mind for `calibrate` and `diagnose`: what a recording demands is in the model.
 
 The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
-names joins the model; what parts of the recording deny, or what is no more than chance once the standard deviations allow for all that the model
-misses, does not, and widens the standard deviations instead, as does what would do nearly as well as a choice.
+names joins the model; what parts of the recording deny, or what is no more than chance once the standard deviations allow for all that the
+model misses, does not, and widens the standard deviations instead, as does what would do nearly as well as a choice.
 """
 
 from collections.abc import Callable, Sequence
@@ -148,7 +148,8 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*solved, known)
-    found = investigate(parts[0], table, baseline_model(options, table, solution.model), progress=asking, bias_processes=options.bias_processes)
+    found = investigate(parts[0], table, baseline_model(options, table, solution.model), progress=asking,
+                        bias_processes=options.bias_processes)
     found = _without_faint(found, solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # a search that met a limit is the solution itself
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
@@ -187,7 +188,8 @@ def _is_faint(solution, question):
 def _without_faint(found, solution):
     """Return the Investigation without findings that are in a solution and do not stand out there."""
     faint = [question for question in found.named if _is_faint(solution, question)]
-    return replace(found, named=[question for question in found.named if question not in faint], denied=[*found.denied, *faint]) if faint else found
+    return replace(found, named=[question for question in found.named if question not in faint],
+                   denied=[*found.denied, *faint]) if faint else found
 
 
 def _named_elsewhere(found, others):
@@ -246,6 +248,7 @@ def _point(found):
 
 
 def _moves(found, lacking=()):
-    """Return (what other choices would have moved the parameters by, weight): what is denied, doubtful, implausible or lacking, and rivals."""
-    moves = [(found.attempt.moved_by(found.named, question), 1.0) for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
+    """Return (what other choices would have moved the parameters by, weight): what is denied, doubtful, implausible or lacking, rivals."""
+    moves = [(found.attempt.moved_by(found.named, question), 1.0)
+             for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
     return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))

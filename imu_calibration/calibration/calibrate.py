@@ -120,7 +120,8 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
     """
     model = accumulator_state.saved_model(data)
     if model.joint_names != table.joint_names:
-        raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, this is of {', '.join(model.joint_names) or 'none'}; "
+        raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, "
+                            f"this is of {', '.join(model.joint_names) or 'none'}; "
                             'give the table or the arm that it was gathered on', key='table')
     gathered = accumulator_state.from_bytes(data, model)
     demand = accumulator_state.saved_demand(data)
@@ -136,7 +137,8 @@ def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, tabl
     tolerances = tolerances_of(solution.model, options.tolerances)
     needed = motions_needed(solution, tolerances, table)
     proof = prove_solution(gathered.held_out, solution, model)
-    calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof, changes=changes)
+    calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof,
+                           changes=changes)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
 

@@ -68,7 +68,8 @@ class Collector:
         return [self._reduce(window) for window in windows if window.kind != 'unused']
 
     def _reduce(self, window):
-        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True, column_function=self._columns(window))
+        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True,
+                                column_function=self._columns(window))
         found = self.gathered
         found.take(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
@@ -118,7 +119,9 @@ class GatherStep:
 
     def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *, windows: list | None = None) -> Gathered:
         """
-        Return the Gathered of a recording, which is read once, for its windows and for the checks; `windows` takes them all, unused ones too.
+        Return the Gathered of a recording, which is read once, for its windows and for the checks.
+
+        `windows` takes them all, unused ones too.
 
         Raises
         ------
@@ -126,7 +129,8 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,), windows=windows,
+        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,),
+                              windows=windows,
                               spread=self.spread)
         count = 0
         for block in blocks:

@@ -79,10 +79,12 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
                  for name, i, j, s, h, d in zip(common, a, b, sd, held, difference))
     groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
     rejected = _holm(groups)
-    lines = notes + [f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}' for name, chi2, k, p in groups if name in rejected]
+    lines = notes + [f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}'
+                     for name, chi2, k, p in groups if name in rejected]
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
-        lines.append('off-diagonal terms of a matrix include how the IMU was mounted on the table: mounted anew they differ without a change of the IMU')
+        lines.append('off-diagonal terms of a matrix include how the IMU was mounted on the table: '
+                     'mounted anew they differ without a change of the IMU')
     if held.any():
         lines.append(f'{int(held.sum())} parameters are held in one of them and were not compared')
     if len(parts) < 2:

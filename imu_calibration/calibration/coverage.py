@@ -1,4 +1,4 @@
-"""What a session has seen and what is still worth having: a sphere of directions that can be turned up, judged by information, not by visits."""
+"""What a session has seen and what is still worth having: a sphere of directions that can be up, judged by information, not visits."""
 
 import itertools
 from collections.abc import Sequence
@@ -104,8 +104,8 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
 
-    What is next is the standard motion that gains most per second, the seconds are those of it and all that are needed after it. Where these
-    would not do, it is what the solution names for the parameter worst off.
+    What is next is the standard motion that gains most per second, the seconds are those of it and all that are needed after it. Where
+    these would not do, it is what the solution names for the parameter worst off.
 
     Parameters
     ----------
@@ -157,7 +157,8 @@ def _foretold(information, left, added, motions):
         best = max(range(len(motions)), key=lambda k: (missing - remaining[k]) / motions[k].seconds, default=None)
         if best is None or missing - remaining[best] < LEAST_GAIN * missing:
             break
-        first, seconds, information, missing = first or motions[best], seconds + motions[best].seconds, information + more[best], remaining[best]
+        first, seconds = first or motions[best], seconds + motions[best].seconds
+        information, missing = information + more[best], remaining[best]
     return None, float('nan')
 
 

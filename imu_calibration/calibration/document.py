@@ -59,7 +59,9 @@ class Calibration:
     verdict_reasons: tuple = ()
     """What speaks for or against it, a line each, and what to do next."""
     proof: dict = field(default_factory=dict)
-    """Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured."""
+    """
+    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured.
+    """
     judgement: Verdict | None = None
     """The verdict with its reasons one by one, where it was not read from a file."""
 
@@ -169,7 +171,8 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
                              f'{shortened(repr(entries))}; correct it')
         for name, value in entries.items():
             if name not in known[section]:
-                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; those are {", ".join(known[section])}')
+                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; '
+                                 f'those are {", ".join(known[section])}')
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
                 raise InputError(f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it")
     return mapping
@@ -231,7 +234,8 @@ def from_mapping(document: Any) -> Calibration:
 
     """
     if not isinstance(document, dict):
-        raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; give a file written by 'imu_calibration calibrate'")
+        raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; "
+                            "give a file written by 'imu_calibration calibrate'")
     _check_format(document.get('format'))
     check_parts(document)
     try:
@@ -249,9 +253,11 @@ def _one_line(error):
 def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
-        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; give a file written by 'imu_calibration calibrate'")
+        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; "
+                            "give a file written by 'imu_calibration calibrate'")
     if int(number) > int(FORMAT.partition('/')[2]):
-        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; update imu_calibration")
+        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; "
+                            "update imu_calibration")
 
 
 def calibration_to_text(calibration: Calibration) -> str:

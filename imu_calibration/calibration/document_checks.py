@@ -66,7 +66,8 @@ def _is_direction(value):
 
 
 def _is_joint_errors(value):
-    return isinstance(value, dict) and all(_is_list_of(_is_text)(value.get(name)) and len(set(value[name])) == len(value[name]) <= MOST_JOINTS
+    return isinstance(value, dict) and all(_is_list_of(_is_text)(value.get(name))
+                                           and len(set(value[name])) == len(value[name]) <= MOST_JOINTS
                                            for name in ('turning', 'zeros', 'angles'))
 
 
@@ -87,7 +88,8 @@ KNOWN = {
     **{section: _SECTION for section in SECTIONS}, 'covariance': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
-    'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {}, 'undetermined_directions': _or_none(_is_list_of(_is_direction)),
+    'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {},
+    'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
     'verdict': _is_word, 'verdicts': {sensor: _is_word for sensor in SENSORS}, 'verdict_reasons': _is_list_of(_is_text),
@@ -111,10 +113,12 @@ def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> N
         value = document[name]
         if isinstance(wanted, dict):
             if not isinstance(value, dict) and (value is not None or place):
-                raise DocumentError(f"'{place}{name}' must be a mapping, got {shortened(repr(value))}; correct the calibration file or write it anew")
+                raise DocumentError(f"'{place}{name}' must be a mapping, got {shortened(repr(value))}; "
+                                    "correct the calibration file or write it anew")
             check_parts(value or {}, wanted, f'{place}{name}.')
         elif not wanted(value):
-            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {shortened(repr(value))}; correct the calibration file or write it anew")
+            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {shortened(repr(value))}; "
+                                "correct the calibration file or write it anew")
 
 
 def check_numbers(calibration: 'Calibration') -> 'Calibration':
@@ -143,8 +147,8 @@ def check_numbers(calibration: 'Calibration') -> 'Calibration':
                 raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
         condition = np.linalg.cond(calibration.of(sensor, Role.LINEAR))
         if not condition < CONDITION_LIMIT:
-            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {condition:.3g}; '
-                                'calibrate again with more attitudes')
+            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), '
+                                f'its condition number is {condition:.3g}; calibrate again with more attitudes')
     return calibration
 
 

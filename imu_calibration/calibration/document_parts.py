@@ -30,7 +30,8 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         entry = entries[effect.key]
         _check_unit(entry.get('unit'), effect)
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
-            raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; write it anew")
+            raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; "
+                                "write it anew")
     return {'model': model.at(values), 'values': values, 'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
             'undetermined': tuple(document.get('undetermined_directions') or ()), 'verdict': document.get('verdict') or '',

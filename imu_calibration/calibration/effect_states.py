@@ -53,7 +53,8 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         state = group_status(calibration.status[part])
-        known = [] if state == Progress.DETERMINED else [result.needed[name] for name in (names[worst], *names[part]) if name in result.needed]
+        lacking = () if state == Progress.DETERMINED else (names[worst], *names[part])
+        known = [result.needed[name] for name in lacking if name in result.needed]
         text, predicted = known[0] if known else ('', float('nan'))
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), text, predicted))

@@ -37,7 +37,7 @@ def only_axis(table: Table) -> np.ndarray | None:
 
 def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gathered: Gathered, needed: dict[str, tuple[str, float]],
              provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges()) -> Calibration:
-    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its proof (`proof`) and the verdict."""
+    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its `proof` and the verdict."""
     model = solution.model
     covariance = with_gravity_uncertainty(solution, table)
     sd = np.sqrt(np.diag(covariance))

@@ -143,5 +143,6 @@ def _require_like_the_first(first, part, first_name, name):
     if not part.accumulator.rows:
         raise InputError(f'{name}: every recording must hold a static window, spin or dynamic stretch, this one has none; leave it out')
     if part.frame_id != first.frame_id:
-        raise InputError(f"{name}: all recordings must come from one IMU, the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
+        raise InputError(f"{name}: all recordings must come from one IMU, "
+                         f"the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
                          'calibrate different IMUs one by one')

@@ -56,8 +56,10 @@ class HeldOutBlock:
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
         """Return the block with the columns of the model `narrow` only."""
-        chosen = {sensor: np.concatenate([columns[:-AXES], np.arange(-2 * AXES, 0)]) for sensor, columns in selected_columns(wide, narrow).items()}
-        return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()}, self.counts)
+        chosen = {sensor: np.concatenate([columns[:-AXES], np.arange(-2 * AXES, 0)])
+                  for sensor, columns in selected_columns(wide, narrow).items()}
+        return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
+                            self.counts)
 
 
 @dataclass(eq=False)
@@ -114,7 +116,7 @@ class HeldOut:
 
 
 def _linearised(blocks, solution, prior):
-    """Return the triangular factor of ``[derivative of the residuals | residuals]`` of all windows of some blocks, weighed with the noise."""
+    """Return the triangular factor of ``[derivative of the residuals | residuals]`` of all windows of some blocks, weighed by noise."""
     n_params, rows = len(solution.values), []
     for block in blocks:
         if block.accumulator.rows:

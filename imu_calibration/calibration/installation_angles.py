@@ -127,7 +127,8 @@ def in_paper_units(derived: Derived,
     name = 'g' if accelerometer else '(deg/s)'
     if nominal is None:
         bias_factor, unit = (1e3 / STANDARD_GRAVITY, 'mg') if accelerometer else (1 / DEG, 'deg/s')
-        return (('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd), ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor))
+        return (('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
+                ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor))
     nominal = nominal if isinstance(nominal, NominalScaling) else NominalScaling(**nominal)
     offset, per_si = ((nominal.accelerometer_offset, nominal.accelerometer_scale) if accelerometer
                       else (nominal.gyroscope_offset, nominal.gyroscope_scale))

@@ -1,4 +1,4 @@
-"""The collector of a live calibration: what completed windows leave for residuals, a bounded store, and copies to solve while it goes on."""
+"""The collector of a live calibration: what completed windows leave for residuals, a bounded store, copies to solve meanwhile."""
 
 import copy
 from collections.abc import Callable

@@ -13,13 +13,15 @@ class LiveSettings:
                                  'too small: results come late; too large: the node takes a whole core', live=True)
     residual_rate: float = setting(20.0, 'Hz', 'residuals published per second of data, the others are left out; 0: none', (0.0, 10000.0),
                                    'too large: more time goes into publishing than into calibrating', live=True)
-    store_samples: int = setting(300_000, '1', 'samples in motion kept, so that effects can join the model or be linearised anew (table tilt, delays); '
+    store_samples: int = setting(300_000, '1', 'samples in motion kept, '
+                                 'so that effects can join the model or be linearised anew (table tilt, delays); '
                                  'about 250 bytes each', (0, 100_000_000),
-                                 'too small: what the motion demands cannot join the model, and the answer on a strongly tilted table is that of '
-                                 'the first pass; diagnostics say so',
+                                 'too small: what the motion demands cannot join the model, '
+                                 'and the answer on a strongly tilted table is that of the first pass; diagnostics say so',
                                  fixed='windows that were not kept are gone')
     diagnosis_period: float = setting(60.0, 's', 'ask at most this often what the model gets wrong, in a thread of its own and a fifth '
-                                      'of the time at most; also when the streams stop and with ~/solve and ~/save; what it demands joins the model; '
+                                      'of the time at most; also when the streams stop and with ~/solve and ~/save; '
+                                      'what it demands joins the model; '
                                       '0: never', (0.0, 86400.0), 'too small: the diagnosis takes a core from other programs', live=True)
 
 

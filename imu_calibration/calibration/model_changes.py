@@ -19,13 +19,17 @@ class ModelChanges:
     denied: tuple[str, ...] = ()
     """Not taken in because parts of the recording disagree on them; the standard deviations allow for them."""
     implausible: dict[str, float] = field(default_factory=dict)
-    """Not taken in because their sizes are known of no instrument -> share of what the model leaves that each explains; the standard deviations allow for them."""
+    """
+    Not taken in because their sizes are known of no instrument -> share of what the model leaves that each explains; the standard
+    deviations allow for them.
+    """
     lacking: tuple[str, ...] = ()
     """Demanded, but the motion of before is no longer kept, so that they cannot join; the standard deviations allow for them."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        changes = (('added', list(self.added)), ('denied', list(self.denied)), ('implausible', self.implausible), ('lacking', list(self.lacking)))
+        changes = (('added', list(self.added)), ('denied', list(self.denied)), ('implausible', self.implausible),
+                   ('lacking', list(self.lacking)))
         return {name: value for name, value in changes if value}
 
     @classmethod
@@ -73,11 +77,13 @@ class Demand:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what a saved session keeps of it; the solution of a search is made anew."""
-        return {'added': [list(key) for key in self.added], 'changes': self.changes.to_mapping(), 'moves': [[dict(moved), weight] for moved, weight in self.moves]}
+        return {'added': [list(key) for key in self.added], 'changes': self.changes.to_mapping(),
+                'moves': [[dict(moved), weight] for moved, weight in self.moves]}
 
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any], point: Mapping[str, Any]) -> 'Demand':
         """Return what `to_mapping` kept, with the point of the columns that were saved beside it."""
         added = tuple((str(sensor), str(name)) for sensor, name in known.get('added', ()))
-        return cls(added, {name: np.asarray(point[name], float) for _, name in added if name in point}, ModelChanges.from_mapping(known.get('changes', {})),
+        return cls(added, {name: np.asarray(point[name], float) for _, name in added if name in point},
+                   ModelChanges.from_mapping(known.get('changes', {})),
                    tuple((moved, float(weight)) for moved, weight in known.get('moves', ())))

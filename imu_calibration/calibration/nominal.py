@@ -17,9 +17,9 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     """
     Return a calibration that leaves sensors as they come.
 
-    Biases and matrices of these sensors are their priors', with the priors' standard deviations, which the covariances of corrected readings carry
-    on; their further effects go, but for the limits of their range. So does what the other sensor is corrected by with their readings: a
-    g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
+    Biases and matrices of these sensors are their priors', with the priors' standard deviations, which the covariances of corrected
+    readings carry on; their further effects go, but for the limits of their range. So does what the other sensor is corrected by with their
+    readings: a g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
     names = {section: tuple(effect.name for effect in model.effects if effect.sensor == section and _stays(effect, sensors))

@@ -61,12 +61,14 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     names = table.joint_names
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
     chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, catalogue=options.catalogue) for sensor, text in asked.items()}
-    model = SensorModel(chosen['accelerometer'], chosen['gyroscope'], reference=parse_reference(options.reference_model, table), joint_names=names,
+    model = SensorModel(chosen['accelerometer'], chosen['gyroscope'], reference=parse_reference(options.reference_model, table),
+                        joint_names=names,
                         catalogue=options.catalogue)
     model = with_common_arm(model) if table.mount_xyz is None else model
     for sensor, name in options.added:
         model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)
-    return replace(model, point={**model.point, **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
+    return replace(model, point={**model.point,
+                                 **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
 
 
 def settle_model(model: SensorModel, options: CalibrationOptions, gathered: Gathered) -> SensorModel:

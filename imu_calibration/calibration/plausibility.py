@@ -21,6 +21,6 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
         if effect.surpasses(amplitudes):
             grade, largest, source = effect.plausible[-1]
             size = max(map(abs, amplitudes))
-            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than ten times what is known of {grade} instruments '
-                         f'({largest:.3g}; {source}): check units and axes')
+            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
+                         f'more than ten times what is known of {grade} instruments ({largest:.3g}; {source}): check units and axes')
     return lines

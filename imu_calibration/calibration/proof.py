@@ -81,8 +81,8 @@ def prove(held_out: HeldOut, model: SensorModel, *, folds: Sequence[np.ndarray],
     folds : sequence of array
         Parameters for the blocks of each fold, in turn.
     reference : array, shape (n_params,)
-        Parameters of table and clock: each side may be compared with the table as it was estimated or as it was described, whichever suits it
-        better.
+        Parameters of table and clock: each side may be compared with the table as it was estimated or as it was described, whichever suits
+        it better.
 
     """
     folds = [_as_compensated(model, values) for values in folds]
@@ -113,7 +113,8 @@ def nominal_values(model: SensorModel) -> np.ndarray:
 def model_for(calibration: Calibration, table: Table) -> SensorModel:
     """Return the model with which a recording on a table is gathered to prove a calibration on it."""
     known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
-    sensors = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor and (same_joints or not effect.in_reference))
+    sensors = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor
+                             and (same_joints or not effect.in_reference))
                for sensor in SENSORS}
     model = SensorModel(sensors['accelerometer'], sensors['gyroscope'], reference=known.reference if same_joints else (),
                         joint_names=table.joint_names, temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)

@@ -16,24 +16,25 @@ DELAY_SHARE = 0.1
 
 
 def disproved(proof: Mapping) -> list[str]:
-    """Return a line for each sensor whose error on held-out data is not shown to be smaller with the calibration, or grows in some motion."""
+    """Return a line for each sensor whose error on held-out data is not shown to shrink with the calibration, or grows in some motion."""
     lines = []
     for sensor, found in proof.items():
         if sensor not in SENSORS:
             continue
         if not (found['windows'] and found['after'] < found['before'] and found['ci95'][1] < 1.0):
-            lines.append(f'on {found["windows"]} windows that took no part the {sensor} error is {found["after"]:.3g} {found["unit"]} with it and '
-                         f'{found["before"]:.3g} without ({_ratio(found)}): that it helps is not shown{_cause(found)}')
+            lines.append(f'on {found["windows"]} windows that took no part the {sensor} error is {found["after"]:.3g} {found["unit"]} '
+                         f'with it and {found["before"]:.3g} without ({_ratio(found)}): that it helps is not shown{_cause(found)}')
         elif worse := harmed(found):
             name, part = max(worse.items(), key=lambda item: item[1]['after'] / max(item[1]['before'], 1e-300))
-            lines.append(f'on data that took no part ({name}) the {sensor} error is {part["after"]:.3g} {part.get("unit", found["unit"])} with it and '
-                         f'{part["before"]:.3g} without ({_ratio(part)}): it makes this motion worse{_cause(found)}')
+            lines.append(f'on data that took no part ({name}) the {sensor} error is {part["after"]:.3g} {part.get("unit", found["unit"])} '
+                         f'with it and {part["before"]:.3g} without ({_ratio(part)}): it makes this motion worse{_cause(found)}')
     return lines
 
 
 def harmed(found: Mapping) -> dict[str, Any]:
     """Return {regime: entry} of the regimes in which an entry of a proof says that the error grows."""
-    return {name: part for name, part in (found.get('regimes') or {}).items() if part['after'] > HARM * part['before'] and part['ci95'][0] > 1.0}
+    return {name: part for name, part in (found.get('regimes') or {}).items() if part['after'] > HARM * part['before']
+            and part['ci95'][0] > 1.0}
 
 
 def proven(proof: Mapping) -> list[str]:
@@ -56,7 +57,8 @@ def _cause(found):
     """Return the most likely cause as the end of a sentence."""
     late, share = found.get('delay_s', 0.0), found.get('delay_explains', 0.0)
     if abs(late) > LATE and share > DELAY_SHARE:
-        return f'; the likely cause is that the readings come {abs(late) * 1e3:.0f} ms too {"late" if late > 0 else "early"}, which the model leaves out'
+        return (f'; the likely cause is that the readings come {abs(late) * 1e3:.0f} ms too {"late" if late > 0 else "early"}, '
+                'which the model leaves out')
     regimes = found.get('regimes') or {}
     rest = regimes.get('rest', {'after': 0.0})
     if 'rest' in harmed(found) or rest['after'] > AT_REST * found['after'] > 0.0 and rest.get('unit', found['unit']) == found['unit']:

@@ -1,4 +1,4 @@
-"""What everybody may ask of a calibration that goes on, whatever its reference is: on a table `calibration.live`, by hand `by_hand.live`."""
+"""What everybody may ask of a calibration that goes on, whatever its reference: on a table `calibration.live`, by hand `by_hand.live`."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol

@@ -35,14 +35,16 @@ def summary(calibration: 'Calibration') -> str:
     """Return one line: the frame, the verdict, and how many parameters have which status."""
     counts = {status: sum(own == status for own in calibration.status) for status in Status}
     parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
-    return f'<Calibration of {calibration.frame_id or "an IMU"}: {verdict_text(calibration.verdict, calibration.verdicts) or "no verdict"}, {parts}>'
+    verdict = verdict_text(calibration.verdict, calibration.verdicts) or 'no verdict'
+    return f'<Calibration of {calibration.frame_id or "an IMU"}: {verdict}, {parts}>'
 
 
 def as_text(calibration: 'Calibration') -> str:
     """Return the parameters as a table of plain text."""
     rows = [HEADINGS, *parameter_rows(calibration)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    aligned = ('  '.join(cell.rjust(width) if heading in NUMBERS else cell.ljust(width) for cell, width, heading in zip(row, widths, HEADINGS))
+    aligned = ('  '.join(cell.rjust(width) if heading in NUMBERS else cell.ljust(width)
+                         for cell, width, heading in zip(row, widths, HEADINGS))
                for row in rows)
     return '\n'.join([summary(calibration), *map(str.rstrip, aligned)])
 

@@ -7,7 +7,11 @@ MOST_SAMPLES = 100_000
 
 
 class SpreadWindows:
-    """Every so many-th window of each kind, so that memory and the time of a search are bounded; which ones depends on the recording alone."""
+    """
+    Every so many-th window of each kind, so that memory and the time of a search are bounded.
+
+    Which ones depends on the recording alone.
+    """
 
     def __init__(self) -> None:
         self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []

@@ -58,8 +58,8 @@ def usable(calibration: Calibration) -> Usable:
     """
     refused = refused_sensors(calibration)
     if refused.keys() == set(SENSORS):
-        raise DocumentError(f'a calibration must help before anybody is corrected with it, against this one speaks: {objections(calibration)[0]}; '
-                            'calibrate again, or insist', key='anyway')
+        raise DocumentError('a calibration must help before anybody is corrected with it, against this one speaks: '
+                            f'{objections(calibration)[0]}; calibrate again, or insist', key='anyway')
     return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused)
 
 
@@ -86,7 +86,8 @@ def usage(calibration: Calibration) -> str:
     refused = refused_sensors(calibration)
     if not 0 < len(refused) < len(SENSORS):
         return ''
-    return f'compensation corrects the {next(s for s in SENSORS if s not in refused)} with it, and leaves the {next(iter(refused))} as it comes'
+    corrected = next(s for s in SENSORS if s not in refused)
+    return f'compensation corrects the {corrected} with it, and leaves the {next(iter(refused))} as it comes'
 
 
 def caveats(calibration: Calibration) -> list[str]:
@@ -94,7 +95,8 @@ def caveats(calibration: Calibration) -> list[str]:
     if not calibration.verdict:
         return ['it carries no verdict, as files of earlier versions do: calibrate again to know how good it is']
     why = missing(calibration) or ''.join(calibration.verdict_reasons[:1])
-    return [] if calibration.verdict == GOOD else [f'its verdict is {verdict_text(calibration.verdict, calibration.verdicts)}' + (f': {why}' if why else '')]
+    told = f'its verdict is {verdict_text(calibration.verdict, calibration.verdicts)}' + (f': {why}' if why else '')
+    return [] if calibration.verdict == GOOD else [told]
 
 
 def missing(calibration: Calibration) -> str:

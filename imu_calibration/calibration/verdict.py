@@ -90,9 +90,10 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     Return the Verdict on a calibration.
 
-    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument, residuals in motion far above the noise at rest, or a sensor of which
-    nothing was determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not
-    determined to its tolerance, or what explains the rest has a size that is known of no instrument. Good: neither.
+    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument, residuals in motion far
+    above the noise at rest, or a sensor of which nothing was determined and the whole matrix is held (after a rest in one attitude). Weak:
+    a requested parameter is not determined to its tolerance, or what explains the rest has a size that is known of no instrument. Good:
+    neither.
 
     Parameters
     ----------
@@ -131,7 +132,8 @@ def _disproved(calibration):
 
 
 def _implausible(calibration):
-    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description', sensors=_whose([section]))
+    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description',
+                   sensors=_whose([section]))
             for section in SECTIONS for line in implausible(calibration, section)]
 
 
@@ -145,8 +147,10 @@ def _strange_causes(calibration):
     """Return reasons why a cause that is known stays out of the model."""
     found = calibration.statistics.get('implausible') or {}
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
-    return [Reason(WEAK, f'{name} {beyond_known(share, catalogue.get(name, ""))}; it is not in the model, and the standard deviations allow for it',
-                   f"see 'imu_calibration diagnose'; where {name} is what you expect, name it in the model", sensors=_whose([catalogue.get(name, '')]))
+    return [Reason(WEAK, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
+                   'it is not in the model, and the standard deviations allow for it',
+                   f"see 'imu_calibration diagnose'; where {name} is what you expect, "
+                   "name it in the model", sensors=_whose([catalogue.get(name, '')]))
             for name, share in found.items()]
 
 
@@ -156,13 +160,18 @@ def _ratios(calibration, sensor):
 
 
 def _quiet(calibration):
-    """Return what residuals in motion are compared with; without a rest only their own slow part is there, and lags show in the fast one."""
+    """
+    Return what residuals in motion are compared with.
+
+    Without a rest only their own slow part is there, and lags show in the fast one.
+    """
     windows = calibration.statistics.get('windows')
     return 'the noise at rest' if windows is None or windows.get('static') else 'their slow part (a lag or a late clock leaves that)'
 
 
 def _misfits(calibration):
-    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: the model leaves something out',
+    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: '
+                   'the model leaves something out',
                    "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
             for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if ratio > MISFIT]
 
@@ -173,7 +182,8 @@ def _blind(calibration):
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
         matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
         if own and matrix_held and DETERMINED not in own:
-            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor), sensors=(sensor,)))
+            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor),
+                                  sensors=(sensor,)))
     return reasons
 
 
@@ -184,14 +194,16 @@ def _first_need(calibration, start=''):
 
 def _undetermined(calibration):
     reasons = []
-    for status, text in ((Status.WEAK, 'known less well than its tolerance asks'), (HELD, 'not shown by this recording, held at the prior value')):
+    for status, text in ((Status.WEAK, 'known less well than its tolerance asks'),
+                         (HELD, 'not shown by this recording, held at the prior value')):
         names = [name for name, found in calibration.requested.items() if found == status]
         if status == Status.WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
             what = f'{listed(scale)}: the local gravity was not given, which scales them together'
             reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
         for next_step, members in _by_need(calibration, names).items():
-            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step, sensors=_whose(name.partition('.')[0] for name in members)))
+            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step,
+                                  sensors=_whose(name.partition('.')[0] for name in members)))
     return reasons
 
 
@@ -207,7 +219,8 @@ def _by_need(calibration, names):
         weights = [(abs(d['parameters'].get(name, 0.0)), d['needs']) for d in calibration.undetermined]
         best = max(weights, default=(0.0, ''), key=lambda pair: pair[0])
         if best[0] == 0.0:
-            same = [d['needs'] for d in calibration.undetermined if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])]
+            same = [d['needs']
+                    for d in calibration.undetermined if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])]
             best = (1.0, same[0] if same else 'record the same motion for longer')
         found.setdefault(best[1], []).append(name)
     return found
@@ -228,12 +241,15 @@ def _all_well(calibration, tolerances):
     worst = int(np.argmax(share))
     fit = [ratio for sensor in SENSORS for ratio in _ratios(calibration, sensor).values()]
     more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {_quiet(calibration)}' if fit else ''
-    return Reason(GOOD, f'all {len(calibration.requested)} parameters are within their tolerance (the closest, {calibration.param_names[worst]}, '
-                        f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', or compensator_node")
+    return Reason(GOOD, f'all {len(calibration.requested)} parameters are within their tolerance (the closest, '
+                        f'{calibration.param_names[worst]}, '
+                        f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', "
+                        "or compensator_node")
 
 
 def _notes(calibration, tolerances):
-    return _proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances) + _left_out(calibration) + _lost(calibration)
+    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances)
+            + _left_out(calibration) + _lost(calibration))
 
 
 def _proven(calibration):
@@ -243,21 +259,24 @@ def _proven(calibration):
 def _adopted(calibration):
     """Return notes on what the recording did to the model."""
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
-    notes = [Reason(NOTE, f'added to the model, because the recording demands it: {", ".join(_with_size(calibration, name) for name in added)}',
+    notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
+                    f'{", ".join(_with_size(calibration, name) for name in added)}',
                     "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
     notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
     lacking = calibration.statistics.get('lacking') or []
-    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: the standard deviations '
-                     'allow for it', 'calibrate the recording offline')] if lacking else []
+    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
+                     'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
     strange = calibration.statistics.get('not_believed') or {}
-    return notes + ([Reason(NOTE, f'held, because only what the model misses gives them a value, and one that no sensor has: {_strange(strange)}',
+    return notes + ([Reason(NOTE, 'held, because only what the model misses gives them a value, and one that no sensor has: '
+                            f'{_strange(strange)}',
                             'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
 
 
 def _strange(values):
     """Return names with the values they would have had; of many, the first ones."""
-    return ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES]) + (' ...' if len(values) > SHOWN_NAMES else '')
+    told = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
+    return told + (' ...' if len(values) > SHOWN_NAMES else '')
 
 
 def _with_size(calibration, name):
@@ -285,7 +304,8 @@ def _unstable(calibration, tolerances):
         scatter = float(np.max(calibration.noise(sensor)[1]))
         if scatter > tolerances[calibration.model.slices[offset.key]][0]:
             factor, unit = for_people(offset.unit)
-            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by {significant(scatter * factor, 2)} {unit}, more than '
+            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
+                                        f'{significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',
                                   'let the IMU warm up and the table stand firm, or estimate the bias in use'))
     return reasons
@@ -297,8 +317,10 @@ def _left_out(calibration):
     for sensor in SENSORS:
         times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
         if times:
-            windows = 'a window, whose mean the others contradict' if len(times) == 1 else f'{len(times)} windows, whose means the others contradict'
-            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
+            windows = ('a window, whose mean the others contradict' if len(times) == 1
+                       else f'{len(times)} windows, whose means the others contradict')
+            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, '
+                                f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
                                       + (' ...' if len(times) > SHOWN_NAMES else ''), 'somebody may have touched the table or the IMU'))
     return notes
 

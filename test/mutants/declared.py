@@ -158,8 +158,8 @@ SIGNS = _of(
 )
 LIVE = _of(
     'imu_calibration',
-    ('an open window counts twice', 'calibration/live.py', 'gathered, store = self._collector.snapshot(pending)',
-     'gathered, store = self._collector.snapshot(True)', 'test_live_calibration.py'),
+    ('an open window counts twice', 'calibration/live.py', 'gathered, store = collector.snapshot(pending)',
+     'gathered, store = collector.snapshot(True)', 'test_live_calibration.py'),
     ('what is found live never joins the model', 'calibration/live.py', 'collector.take_model(model)', 'pass', 'test_live_diagnosis.py'),
     ('the model as asked grows live', 'calibration/live.py', 'self.options.as_asked or demand', 'demand', 'test_live_diagnosis.py'),
     ('windows that are gone are taken anew', 'calibration/live_snapshot.py', 'if self.store.complete:', 'if True:', 'test_live_diagnosis.py'),
