@@ -1,7 +1,8 @@
 """
-Which attitude to hold next, by hand: the one planner behind the plan, the terminal, the status, the picture and what a calibration asks for.
+Which attitude to hold next, by hand: the one planner behind plan, terminal, status, picture and what a calibration asks for.
 
-The worth of a step is what it takes off what is missing (the logarithms of standard deviations over tolerances), its price the seconds that it takes.
+The worth of a step is what it takes off what is missing (the logarithms of standard deviations over tolerances), its price the seconds that
+it takes.
 """
 
 from __future__ import annotations
@@ -63,12 +64,13 @@ class HandKnowledge:
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         count = len(ups)
-        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=np.full(count, self.model.model.temperature_ref_c))[1]
+        warmth = np.full(count, self.model.model.temperature_ref_c)
+        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
         rows = self.rows(norms, [turn_rows(self.up, to) for to in ups])
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
     def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray]) -> np.ndarray:
-        """Return what poses say of the parameters, in standard deviations, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        """Return what poses say of the parameters, in sd, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
         rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
@@ -86,7 +88,7 @@ class HandKnowledge:
 
     def best(self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0) -> tuple[HandStep, np.ndarray, np.ndarray]:
         """
-        Return (the step that gives most per second, the share of what is missing that each of `DIRECTIONS` would give, the information after the step).
+        Return (the step that gives most per second, share of what is missing that each of `DIRECTIONS` would give, information after it).
 
         only : sequence of int, optional
             Parameters that it is for; all where not given.
@@ -109,7 +111,7 @@ class HandKnowledge:
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     """
-    Return the steps that are still needed: of the plans that count the seconds of each step and that do not, the one that is sooner at its end.
+    Return the steps still needed: of the plans that count the seconds of each step and that do not, the one that is sooner at its end.
 
     What gives most in each second is not the sooner plan always: it begins with small turns, which leave more to be done.
     """
@@ -143,7 +145,8 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     plan = foretold(knowledge)[:1] if parts else []
 
     def gain(part, step):
-        return float(knowledge.missing(knowledge.information, part) - knowledge.missing(knowledge.then(step).information, part)) / step.seconds
+        after = knowledge.then(step).information
+        return float(knowledge.missing(knowledge.information, part) - knowledge.missing(after, part)) / step.seconds
     found = []
     for sensor, part in parts.items():
         own = knowledge.best(part)[0]
@@ -152,7 +155,8 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     return tuple(found)
 
 
-def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHandSettings, *, noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHandSettings, *,
+                       noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
                        poses: Poses | None = None) -> HandKnowledge:
     """
     Return the HandKnowledge before the first solution: only the poses count, at nominal values and with the scatter of the settings.
@@ -170,7 +174,8 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
     """
     scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
     pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
-    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd, None)
+    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd,
+                              None)
     if poses is None:
         return knowledge
     ups = ups_of(poses)

@@ -58,7 +58,8 @@ def _of_norms(time, residual, base):
     added = np.hstack([power[:, None] * back for power in powers.T])
     known, new = _orthonormal(base), _orthonormal(np.hstack([base, added]))
     spare = len(time) - new.shape[1]
-    if spare < SPARE or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)), new.shape[1] - known.shape[1], spare):
+    if spare < SPARE or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
+                                   new.shape[1] - known.shape[1], spare):
         return None
     both = np.hstack([base, added])
     fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1]:].reshape(-1, 3)
@@ -96,7 +97,7 @@ def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Pos
 
 
 def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]) -> np.ndarray:
-    """Return the covariance with what moved in it: the bias of any moment of the recording lies within one sd of the mean that is reported."""
+    """Return the covariance with what moved in it: the bias of any moment of the recording lies within one sd of the mean reported."""
     grown = covariance.copy()
     for sensor, movement in movements.items():
         index = model.index_of(sensor)[:len(movement.growth)]
@@ -111,5 +112,7 @@ def notes(moved: Mapping[str, float], duration: float) -> tuple[CheckFinding, ..
     """Return what a user should know: sensor -> distance moved in SI, over `duration` s."""
     span = f'{duration / 60:.0f} minutes' if duration >= 90 else f'{duration:.0f} s'
     sizes = {'accelerometer': (1e3 / STANDARD_GRAVITY, 'mg'), 'gyroscope': (1 / DEG, 'deg/s')}
-    return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, which is in its sd; let the '
-                              'sensor warm up before recording, or record imu/temperature and ask for a thermal bias') for sensor, size in moved.items())
+    return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '
+                              'which is in its sd; let the sensor warm up before recording, '
+                              'or record imu/temperature and ask for a thermal bias')
+                              for sensor, size in moved.items())

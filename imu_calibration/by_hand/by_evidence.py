@@ -53,7 +53,8 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
     changes = ModelChanges(added, tuple(question.name for question in found.denied),
                            {question.name: found.inquiry.share(found.named, question) for question in found.implausible})
     base = found.baseline.model.model
-    if not (found.denied or found.implausible) and all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS):
+    same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
+    if same and not (found.denied or found.implausible):
         return EvidentHand(found.baseline, found, changes)   # it is solved already
     return EvidentHand(extended_by_hand(data, found, options), found, changes)
 
@@ -71,7 +72,8 @@ def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOpti
 
 
 def _asked(data, options):
-    return {'accelerometer': options.accelerometer or BASE, 'gyroscope': options.gyroscope or default_gyroscope(data.poses, options.settings)[0]}
+    return {'accelerometer': options.accelerometer or BASE,
+            'gyroscope': options.gyroscope or default_gyroscope(data.poses, options.settings)[0]}
 
 
 def _joined(asked, found):

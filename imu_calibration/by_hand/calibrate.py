@@ -115,7 +115,8 @@ class HandCalibration:
     def norm_residuals(self, force: np.ndarray | None = None) -> np.ndarray:
         """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
         if force is None:
-            return self.model.norm_rows(self.state.values, self.poses.force, time=self.poses.time, temperature_c=self.poses.temperature_c)[0]
+            poses = self.poses
+            return self.model.norm_rows(self.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
         return self.model.norm_rows(self.state.values, force)[0]
 
 
@@ -183,7 +184,11 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: By
 
 
 def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = None) -> HandCalibration:
-    """Estimate from poses and turns that are at hand; see `calibrate_by_hand`. `point`: effect -> values where its columns are first taken."""
+    """
+    Estimate from poses and turns that are at hand.
+
+    See `calibrate_by_hand`. `point`: effect -> values where its columns are first taken.
+    """
     poses, turns, settings = data.poses, data.turns, options.settings
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
     default, evidence = default_gyroscope(poses, settings)
@@ -212,7 +217,8 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     goals = model.tolerances(options.tolerances)
     status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
-                  'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()}, **_statistics(model, found, poses, turns)}
+                  'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
+                  **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
     index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
     covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
@@ -249,7 +255,8 @@ def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str
 
 
 def _statistics(model, found, poses, turns):
-    before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0] for values in (model.nominal, found.state.values))
+    before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+                     for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
     result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,

@@ -25,9 +25,9 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
     """
     Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
 
-    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle by which it carries gravity
-    past the pose that a turn ends in, and its mean reading at rest. Before: readings as they come; after: as compensation corrects them. Directions of
-    gravity are those of the corrected accelerometer for both.
+    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle by which it
+    carries gravity past the pose that a turn ends in, and its mean reading at rest. Before: readings as they come; after: as compensation
+    corrects them. Directions of gravity are those of the corrected accelerometer for both.
 
     Parameters
     ----------
@@ -67,12 +67,14 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
-    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNITS['accelerometer'], seconds=rested)
+    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNITS['accelerometer'],
+                   seconds=rested)
     rest = _entry(raw_rate, rate, unit=UNITS['gyroscope'], seconds=rested)
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
-        missed = (np.array([[_missed(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)] for turn in turns])
+        missed = (np.array([[_missed(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)]
+                            for turn in turns])
                   for imu in (before, after))
         angles = _entry(*missed, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}

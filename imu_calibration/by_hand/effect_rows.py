@@ -126,7 +126,8 @@ def _rest_block(hand, space, at_rest, sensor_of):
     """Three rows per pose: the rate at rest."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
-    more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
+    more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                      temperature_c=poses.temperature_c)
     rows = np.zeros((count, 3, space.size + 1))
     rows[:, :, 9:12] = np.eye(3)
     rows[:, :, hand.model.extra_index('gyroscope')] = slopes

@@ -144,7 +144,8 @@ def _pose_rows(model, state, poses, across):
     bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
+    more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                 temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
     for column, (i, j) in enumerate(LOWER):
@@ -161,7 +162,8 @@ def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)
+    more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                 temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
     main[:, :, GYRO_BIAS] = np.eye(3)
     main[:, :, model.extra_index('gyroscope')] = slopes
@@ -186,7 +188,8 @@ def _integrated(model, state, data, bias, key, memory):
     matrix, further = unpack(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
         (old_bias, old_matrix, old_further), turn = memory[key]
-        psi = turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel() + turn.by_further @ (further - old_further)
+        psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
+               + turn.by_further @ (further - old_further))
         if np.linalg.norm(psi) < NEAR:
             return small_rotation(-psi) @ turn.mat_ji, turn
     turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, state, data, bias))
@@ -204,7 +207,8 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
 def turned(model: HandModel, values: np.ndarray, data: TurnData) -> np.ndarray:
     """Return the matrix that carries directions from the beginning to the end of a turn, as these parameters integrate it, shape (3, 3)."""
     bias, matrix = values[GYRO_BIAS], unpack(values)[3]
-    return integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)).mat_ji
+    further = _further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)
+    return integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further).mat_ji
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):

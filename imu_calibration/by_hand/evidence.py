@@ -121,7 +121,7 @@ class HandEvidence(Evidence):
 
 
 def _basis(columns, least=1e-9):
-    """Return an orthonormal basis of the span of columns, which may be empty or dependent: singular values above `least` of the largest count."""
+    """Return an orthonormal basis of the span of columns, maybe empty or dependent: singular values above `least` of the largest count."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.shape[1]:

@@ -1,4 +1,4 @@
-"""Does the gyroscope at rest follow gravity? Asked of the poses beside time: a warm-up follows the order of the poses, and so may gravity."""
+"""Does the gyroscope at rest follow gravity? Asked of the poses beside time: a warm-up follows their order, and so may gravity."""
 
 import numpy as np
 import scipy.linalg
@@ -23,8 +23,8 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     """
     Test whether the gyroscope's readings at rest follow the direction of gravity, beyond what time and temperature explain.
 
-    ``rate = bias(time, temperature) + sensitivity @ force + error``: the bias is a parabola in time, with a term in temperature where that was
-    recorded, and the error wanders, by a share and with a correlation time that restricted likelihood chooses beside all columns.
+    ``rate = bias(time, temperature) + sensitivity @ force + error``: the bias is a parabola in time, with a term in temperature where that
+    was recorded, and the error wanders, by a share and with a correlation time that restricted likelihood chooses beside all columns.
 
     Returns
     -------

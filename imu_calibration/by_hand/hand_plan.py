@@ -61,7 +61,8 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
     for step in steps:
         knowledge = knowledge.then(step)
         history.append(knowledge.sd(knowledge.information))
-    return HandPlan(tuple(steps), sum(step.seconds for step in steps), model.param_names, history[-1], tolerances, np.array(history) / tolerances)
+    return HandPlan(tuple(steps), sum(step.seconds for step in steps), model.param_names, history[-1], tolerances,
+                    np.array(history) / tolerances)
 
 
 def hand_plan_to_mapping(plan: HandPlan, provenance: dict[str, Any]) -> dict[str, Any]:
@@ -74,7 +75,8 @@ def hand_plan_to_mapping(plan: HandPlan, provenance: dict[str, Any]) -> dict[str
 
 
 def _step(step):
-    found = {'kind': 'turn' if step.is_turn else 'pose', 'text': step.words, 'seconds': round(step.seconds, 3), 'up': [float(f'{c:.6g}') for c in step.up]}
+    found = {'kind': 'turn' if step.is_turn else 'pose', 'text': step.words, 'seconds': round(step.seconds, 3),
+             'up': [float(f'{c:.6g}') for c in step.up]}
     if step.is_turn:
         found |= {'turn_axis': [float(f'{c:.6g}') for c in step.axis], 'turn_deg': round(float(np.degrees(step.angle)), 1)}
     return found

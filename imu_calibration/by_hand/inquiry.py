@@ -47,7 +47,11 @@ class Inquiry:
         return [block for block in blocks if block.known.size > 3]
 
     def named(self) -> list[Question]:
-        """Return the findings: chosen, and each explaining most of what was unexplained; sizes known of no instrument only for what others leave."""
+        """
+        Return the findings: chosen, and each explaining most of what was unexplained.
+
+        Sizes that are known of no instrument come in only for what others leave.
+        """
         named = list(pruned(self.search.run(), self.share))
         if self.rest(named):
             wide = Search(self.evidence, self.search.baseline, self.questions, any_size=True)
@@ -61,17 +65,23 @@ class Inquiry:
     def rest(self, chosen: Sequence[Question], sensor: str | None = None) -> float:
         """Return what a choice leaves in excess of noise in held-out poses, where it is significant, of one sensor or of both."""
         left = self.evidence.heldout_residuals(self.search.used(chosen))
-        excess = [(np.sum(new**2 / block.floor) - new.size, new.size) for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
+        excess = [(np.sum(new**2 / block.floor) - new.size, new.size)
+                  for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
         return sum(value for value, size in excess if value > SIGNIFICANT_REST * np.sqrt(2 * size))
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
         after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
-        removed = sum(np.sum((old**2 - new**2) / block.floor) for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
+        removed = sum(np.sum((old**2 - new**2) / block.floor)
+                      for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
         return removed / (removed + self.rest(chosen, question.sensor)) if removed > 0 else 0.0
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the poses before and after the middle show an effect alike (`halves.agree`); smooth in time they differ by nature."""
+        """
+        Return whether the poses before and after the middle show an effect alike (`halves.agree`).
+
+        Smooth in time they differ by nature.
+        """
         if question.effect.smooth:
             return True
         used = self.search.used(chosen)
@@ -211,7 +221,8 @@ def _why_not(effect, poses, turns, follows_gravity):
     if 'temperature' in effect.needs and poses.temperature_c is None:
         return 'no temperature was recorded', 'record imu/temperature'
     if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
-        return f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only', 'record while the sensor warms up by at least some kelvins'
+        return (f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
+                'record while the sensor warms up by at least some kelvins')
     if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
         return ('beside a bias that moves in time the rates at rest do not show it', 'hold each attitude again later, in another order')
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)

@@ -64,8 +64,8 @@ class HandModel:
         """Refuse what cannot be seen by hand."""
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
-            raise InputError(f'calibration by hand knows gravity and the turns between poses, {", ".join(strange)} cannot be seen from them; '
-                             'give a table, or leave it out', key='table')
+            raise InputError('calibration by hand knows gravity and the turns between poses, '
+                             f'{", ".join(strange)} cannot be seen from them; give a table, or leave it out', key='table')
 
     @cached_property
     def extras(self) -> list[Effect]:
@@ -166,7 +166,8 @@ class HandModel:
         true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
         for _ in range(REPEATS if self.extras else 0):
             more_f, more_w = (self.further(s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c)[0] for s in SENSORS)
-            true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
+            true_f = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T
+            true_w = np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
         return true_f, true_w
 
     def norm_rows(self, values: np.ndarray, force: np.ndarray, *, time: np.ndarray | None = None,

@@ -15,8 +15,8 @@ def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: lis
     """
     Return by how much parts of a recording by hand ask for different parameters than noise and scatter explain.
 
-    A block is a pose with the turn that begins in it. Directions of gravity and drifts of the bias are estimated along, so that what noise allows
-    the parts' sums is that of rows from which these, and the parameters, have been fitted.
+    A block is a pose with the turn that begins in it. Directions of gravity and drifts of the bias are estimated along, so that what noise
+    allows the parts' sums is that of rows from which these, and the parameters, have been fitted.
 
     Parameters
     ----------

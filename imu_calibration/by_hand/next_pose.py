@@ -32,4 +32,5 @@ def hand_coverage(found: Findings, result: HandResult | None, options: HandOptio
     if not steps:
         return Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
     first, worth = steps[0], knowledge.best()[1]
-    return Coverage(worth, seen, up, Step(first.words, first.up, first.axis, first.angle), sum(step.seconds for step in steps), frame_id=frame_id)
+    return Coverage(worth, seen, up, Step(first.words, first.up, first.axis, first.angle), sum(step.seconds for step in steps),
+                    frame_id=frame_id)

@@ -82,4 +82,5 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
                                 for sensor, text in zip(SENSORS, asked, strict=True))
     gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, 0.0)
-    return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope, catalogue=options.catalogue)
+    return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope,
+                       catalogue=options.catalogue)

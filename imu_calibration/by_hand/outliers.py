@@ -18,7 +18,9 @@ SHARE = 0.1
 LEAST_SPARE = 3.0
 """Degrees of freedom that the others must leave to judge by."""
 CONTRADICTED = 0.35
-"""rad; gravity after a turn that is so far from where the rates carry it is not the rates' doing: scales that are off by a tenth leave less."""
+"""
+rad; gravity after a turn that is so far from where the rates carry it is not the rates' doing: scales that are off by a tenth leave less.
+"""
 SEEN = 0.05
 """A combination of a unit's rows that keeps less than this share of its error after the fit says nothing."""
 LOOSE = 1e3
@@ -26,7 +28,7 @@ LOOSE = 1e3
 
 
 def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
-    """Return (turns that carry gravity to about where it is found, number of the others): with a recorder that paused, the rates miss the turn."""
+    """Return (turns that carry gravity to about where it is found, number of the others): where a recorder paused, rates miss the turn."""
     kept = [turn for turn in turns if turn.rotation is not None
             or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED]
     return kept, len(turns) - len(kept)
@@ -34,7 +36,7 @@ def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Seque
 
 def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
     """
-    Return (poses, turns, {kind: number}) without what is improbable beside the others of its kind: F tests of leaving one out, for as many as there are.
+    Return (poses, turns, {kind: number}) without what is improbable beside its kind: F tests of leaving one out, for as many as there are.
 
     Poses that are left out stay in their place, with means that count for nothing.
     """

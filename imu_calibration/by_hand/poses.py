@@ -61,7 +61,7 @@ def noise_statistics(poses: Poses) -> dict:
 
 
 def _pooled_noise(parts, pieces=8):
-    """Return the NoiseModel of samples, from the median of the intervals and from how much means of pieces scatter more than white noise."""
+    """Return the NoiseModel of samples, from the median of the intervals and how much means of pieces scatter more than white noise."""
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
     within = np.sqrt(np.median([p.var(0, ddof=1) for p in parts], axis=0)) + floor
     ratios = []

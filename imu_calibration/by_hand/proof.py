@@ -28,9 +28,9 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     """
     Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
 
-    Every eighth pose is left out with the turns that begin or end there: one step from the solution with their rows left out. The error of the
-    accelerometer is the length of its corrected reading in a pose less gravity; that of the gyroscope the angle by which it carries gravity past the
-    pose that a turn ends in. What is too few to leave any out has no entry.
+    Every eighth pose is left out with the turns that begin or end there: one step from the solution with their rows left out. The error of
+    the accelerometer is the length of its corrected reading in a pose less gravity; that of the gyroscope the angle by which it carries
+    gravity past the pose that a turn ends in. What is too few to leave any out has no entry.
 
     Parameters
     ----------
@@ -49,7 +49,8 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
             return {}
         values, part = known.values_without(out), _selected(poses, out)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last])]
-        norms.append([model.norm_rows(each, part.force, time=part.time, temperature_c=part.temperature_c)[0]**2 for each in (plain, values)])
+        norms.append([model.norm_rows(each, part.force, time=part.time, temperature_c=part.temperature_c)[0]**2
+                      for each in (plain, values)])
         if len(turns) - len(left) >= TURNS_LEAST:
             angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
     proof = {'accelerometer': _entry(norms, 'm/s^2')}
@@ -69,7 +70,8 @@ class _Rows:
         held = np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == HELD for name in model.param_names])
         self.values, self.free = hand.state.values, ~held
         self.rows = np.column_stack([system.nuisance, system.main[:, self.free], system.residual]) * weight[:, None]
-        ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns for _ in range(2 if turn.rotation is None else 3)]
+        ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
+                for _ in range(2 if turn.rotation is None else 3)]
         self.poses = np.concatenate([np.tile(np.repeat(np.arange(count), 3)[:, None], (3, 2)), np.array(ends, int).reshape(-1, 2)])
         prior = np.diag(1.0 / model.priors)[self.free][:, self.free]
         self.known = np.column_stack([np.zeros((len(prior), system.nuisance.shape[1])), prior,

@@ -106,7 +106,8 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = A
     """
     require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
-    a, b = (PairedImu.make(imu, start, gravity, calibration=given, settings=settings) for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
+    a, b = (PairedImu.make(imu, start, gravity, calibration=given, settings=settings)
+            for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
     rotation = relative_rotation(a, b, settings)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
@@ -201,4 +202,5 @@ def _require_seen(seen, sd):
     worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
         raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
-                                 f'it shows is not noise and the sd is {np.max(sd):.2g} m; twist fast about the axes other than {"xyz"[worst]} too')
+                                 f'it shows is not noise and the sd is {np.max(sd):.2g} m; '
+                                 f'twist fast about the axes other than {"xyz"[worst]} too')

@@ -93,7 +93,8 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     def shows(place, mate, gain):
         if gain.sensor not in sensors_of(mate.effect):
             return False
-        own, other = (gain_in_turn(attempt, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction for each in (named[place], mate))
+        own, other = (gain_in_turn(attempt, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
+                      for each in (named[place], mate))
         return MATE * own <= other
 
     def motion_of(question, mate):
@@ -102,7 +103,8 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
     strange = found.implausible
-    findings += [finding(attempt.search, named, place, solution=solution if named[place] in strange else told_by, share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
+    findings += [finding(attempt.search, named, place, solution=solution if named[place] in strange else told_by,
+                         share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)

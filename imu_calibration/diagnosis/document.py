@@ -53,7 +53,8 @@ def _gain(gain):
 
 
 def _rest(sensor, rest):
-    return {'significant': rest.significant, 'rms': rest.rms, 'unit': rest.unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor], 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
+    unit = rest.unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor]
+    return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
             'share': rest.share, 'where': rest.where, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
             'tones': [tone.to_mapping() for tone in rest.tones],
             'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping()]}

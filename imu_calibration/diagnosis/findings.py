@@ -39,13 +39,17 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     question = named[place]
     score = search.score([q for q in named if q is not question], question)
     gain, explained = gain_of(place), share(named, question)
-    parameters = parameters_of(solution, question.sensor, question.name) if question.effect.key in solution.model.slices else fitted(search, named, question)
+    if question.effect.key in solution.model.slices:
+        parameters = parameters_of(solution, question.sensor, question.name)
+    else:
+        parameters = fitted(search, named, question)
     text = sentence(question.effect, parameters, gain)
     if score.implausible:
         text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless asked for.'
     mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
                         if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
-    return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain, tuple(mate.name for mate in mates),
+    return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,
+                   tuple(mate.name for mate in mates),
                    motion_of(question, mates[0]) if mates else '', question.effect.against,
                    {mate.name: _in_its_place(search, named, place, mate) for mate in mates}, score.implausible)
 
@@ -59,4 +63,5 @@ def _in_its_place(search, named, place, mate):
 def fitted(search: Search, named: Sequence[Question], question: Question) -> dict[str, tuple[float, float, str]]:
     """Return parameter name -> (value, sd, unit) of a chosen effect as the search fitted it."""
     names = question.effect.param_names()
-    return {name: (float(value), float(sd), question.effect.unit_of(k)) for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}
+    return {name: (float(value), float(sd), question.effect.unit_of(k))
+            for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}

@@ -37,7 +37,10 @@ class Finding:
     against: tuple = ()
     """What its residual is drawn against, as in ``Effect.against``."""
     sizes_of_mates: dict = field(default_factory=dict)
-    """Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: how large this recording would have it in the place of the finding."""
+    """
+    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: how large this recording would have it in the place of the
+    finding.
+    """
     implausible: bool = False
     """Whether its size is beyond what is known of any instrument: it is in no model then."""
 

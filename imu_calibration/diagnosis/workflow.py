@@ -93,7 +93,8 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
     if report:
         report(1.0)
-    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options), proposed)
+    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
+                           proposed)
 
 
 def _with_proposals(source, table, options, result, diagnosis, provenance):
@@ -138,8 +139,10 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
         raise too_few_poses(len(evident.hand.poses.start))
     if report:
         report(1.0)
-    return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed, result.observations,
-                           replace(options, accelerometer_model=options.accelerometer_model or BARE, gyroscope_model=options.gyroscope_model or BARE))
+    return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
+                           result.observations,
+                           replace(options, accelerometer_model=options.accelerometer_model or BARE,
+                                   gyroscope_model=options.gyroscope_model or BARE))
 
 
 def _percent(advance):
@@ -158,13 +161,15 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
-            lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; to separate them: {finding.separating_motion}')
+            lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; '
+                         f'to separate them: {finding.separating_motion}')
     if not diagnosis.findings:
         lines.append(nothing_named(diagnosis))
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
-            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}' + (f'; {rest.where}' if rest.where else ''))
+            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
+                         + (f'; {rest.where}' if rest.where else ''))
         lines += [f'   {line}' if rest.significant else line for line in beyond_lines(sensor, rest)]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
@@ -189,8 +194,8 @@ def nothing_named(diagnosis: Diagnosis) -> str:
     much = [row for row in diagnosis.candidates if row.verdict == LEAVES_MOST and row.gain_alone > MUCH]
     if not much:
         return 'nothing found: no effect of the catalogue explains more than noise does'
-    return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), but leaves most of the rest, '
-            'so that something else may be the cause of both')
+    return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
+            'but leaves most of the rest, so that something else may be the cause of both')
 
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:

@@ -98,21 +98,24 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     which = _some(windows, length)
     windows = [windows[k] for k in which]
     parts = [_cut(window, length) for window in windows]
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, f.name)[part.rows] for w, part in zip(windows, parts)]) for f in fields(JointMotion)))
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, f.name)[part.rows] for w, part in zip(windows, parts)])
+                           for f in fields(JointMotion)))
     warm = all(w.temperature_c is not None for w in windows)
     temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
     per_block = np.concatenate([part.per_block for part in parts])
     place = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
     number = which[place]
     count = np.concatenate([part.count for part in parts])
-    common = {'starts': np.cumsum(np.append(0, per_block[:-1])), 'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
+    common = {'starts': np.cumsum(np.append(0, per_block[:-1])),
+              'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
               'window': number, 'locked': attempt.locked[number]}
     references = References(attempt.recording.model, table, motion, temperature_c=temperature)
     found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
     for sensor, residual in residuals(windows, table, attempt.recording.model, values=attempt.recording.values).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
-        variance = floor.low_variance * _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])[place] / count[:, None]
+        busier = _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])
+        variance = floor.low_variance * busier[place] / count[:, None]
         # A step, or what heats up, is a wander to a filter that has learnt from it: the place is sought beside what every bias does.
         processes = natural_processes(floor, attempt.recording.period)
         found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, processes)
@@ -131,7 +134,8 @@ def _busier(windows, sensor, floor, kinds, judged):
     """
     Return by how much each window's white noise exceeds that at rest, shape (k, 3).
 
-    By kind, from second differences of the windows `judged` (mask), in which a cause that goes with the motion hardly shows; at most what its misfit allows.
+    By kind, from second differences of the windows `judged` (mask), in which a cause that goes with the motion hardly shows; at most what
+    its misfit allows.
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))
@@ -144,7 +148,7 @@ def _busier(windows, sensor, floor, kinds, judged):
 
 
 def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse for it."""
+    """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
     motion, temperature, rows = all_samples(windows)
     predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
     outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
@@ -154,7 +158,8 @@ def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, va
 def _of_sensor(sensor, attempt, references, table, residual, common, variance, processes):
     recording, space = attempt.recording, attempt.space
     ref = references.at(sensor)
-    taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=references.temperature_c, references=references),
+    taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=references.temperature_c,
+                     references=references),
              *(entry.columns(ref) for entry in recording.bank[sensor])]
     blocks = RestBlocks(sensor, ref, **common, design=(), index=(), variance=variance, processes=processes)
     rows = np.concatenate([blocks.means(np.concatenate(taken, axis=1)), residual], axis=1)

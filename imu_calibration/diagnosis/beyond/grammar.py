@@ -150,14 +150,16 @@ def _of_joint_rates(n_joints):
         yield Formula((f'abs({text})',), own)
         yield Formula((f'sign({text})',), ())
         yield Formula((f'{text} * abs({text})',), own * 2)
-    yield from (Formula((text,), own) for degree in (1, 2) for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree)))
+    yield from (Formula((text,), own) for degree in (1, 2)
+                for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree)))
 
 
 def _with_the_table(n_joints, thermal):
     """Yield vectors that stay with the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
-    befores = [('', ())] + [(f'{WARMTH} * ', ('temperature',))] * thermal + [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
+    befores = [('', ())] + [(f'{WARMTH} * ', ('temperature',))] * thermal
+    befores += [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
     for before, factors in befores:
         yield Formula(tuple(tuple(before + text for text in vector) for vector in vectors), factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):

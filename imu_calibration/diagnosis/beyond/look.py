@@ -56,9 +56,10 @@ def superseded(found: Investigation, table: Table, rests: dict[str, Unexplained]
     """
     Return the findings that a formula does without: they stood in for the part of it that looks like them.
 
-    A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside a wrong name. So each
-    finding of a sensor that has a formula is left out once, and counts where the windows held out miss it. What follows the temperature is left out without a
-    formula too: what settles while the sensor warms up looks like it, so well that hardly a rest stays.
+    A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside
+    a wrong name. So each finding of a sensor that has a formula is left out once, and counts where the windows held out miss it. What
+    follows the temperature is left out without a formula too: what settles while the sensor warms up looks like it, so well that hardly a
+    rest stays.
     """
     asked = [question for question in found.named
              if question.sensor in rests and (rests[question.sensor].proposal is not None or 'temperature' in question.effect.needs)]

@@ -75,7 +75,8 @@ class Proposal:
         text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
                 + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
         if self.nearest is not None:
-            text += f'; it is none of the catalogue: {self.nearest[0]}, which comes nearest, would remove {100 * max(self.nearest[1], 0.0):.0f} %'
+            text += (f'; it is none of the catalogue: {self.nearest[0]}, which comes nearest, '
+                     f'would remove {100 * max(self.nearest[1], 0.0):.0f} %')
             text += ' here, but the other axes or the other sensor speak against it' * (self.nearest[1] > LEAST_SHARE)
         if self.alike:
             text += f'; this recording cannot tell it from {" or ".join(self.alike)}'
@@ -85,7 +86,8 @@ class Proposal:
         """Return the proposal as plain data."""
         terms = [{'name': effect.name, 'definition': effect.definition, 'value': value.tolist(), 'sd': sd.tolist(), 'rms': size}
                  for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes)]
-        return {'terms': terms, 'axes': list(self.axes), 'share_of_unexplained': self.share, 'ci95': list(self.ci95), 'rms_reduction': self.reduction,
+        return {'terms': terms, 'axes': list(self.axes), 'share_of_unexplained': self.share, 'ci95': list(self.ci95),
+                'rms_reduction': self.reduction,
                 'p_value': self.p_value, 'indistinguishable_from': list(self.alike),
                 'nearest_of_the_catalogue': None if self.nearest is None else {'effect': self.nearest[0], 'share': self.nearest[1]},
                 'confirming_motion': self.motion, 'sentence': self.sentence}
@@ -98,7 +100,8 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
     Formulas are chosen on the windows that choose, with everything that the catalogue could plausibly make projected out; the share is
     that of the locked windows beside the model that was found, and both halves of the choosing windows must show the same.
     """
-    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt), reference_temperature=attempt.recording.model.temperature_ref_c)
+    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt),
+                           reference_temperature=attempt.recording.model.temperature_ref_c)
     plain = fits.fit()
     if plain.excess <= 0:
         return None
@@ -165,7 +168,8 @@ def _told(blocks, attempt, fits, plain, choices):
     strong = (np.abs(after.amplitudes) * rms).sum(axis=0)
     axes = tuple(axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max())
     return Proposal(
-        blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)), axes,
+        blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)),
+        axes,
         share, share_interval(plain, after, np.random.default_rng(1)), 1.0 - float(np.sqrt(max(1.0 - share, 0.0))), choices[0].p_value,
         tuple(_shown(formula) for formula in choices[0].alike[:SHOWN_ALIKE]), _nearest(fits, plain, attempt), _motion(effects),
         tuple(float(np.sqrt((rms[k]**2 * amplitude**2).sum())) for k, amplitude in enumerate(after.amplitudes)))
@@ -188,7 +192,8 @@ def _shapes(fits, choices, choice):
             phase = float(f'{np.arctan2(weights[1], weights[0]):.4g}')
             weights, text = np.array([np.cos(phase), np.sin(phase)]), formula.phased.format(phase=phase).replace('- -', '+ ')
         else:
-            weights = np.where(np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale), np.array([float(f'{w:.4g}') for w in weights]), 0.0)
+            weights = np.where(np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale),
+                               np.array([float(f'{w:.4g}') for w in weights]), 0.0)
             text = _summed(formula.columns, weights)
         found.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
     return found

@@ -76,9 +76,9 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
     """
     Return the regimes of a sensor's axes, the clearest of each axis first.
 
-    For every variable and every range of it either the model is fitted to the blocks outside and those inside scatter by themselves, or those
-    inside have an offset of their own; the likeliest range is found on every other window and tested on those between, by an F test whose
-    degrees of freedom count windows. Of all tests the false discoveries are held at 5 % (Benjamini, Hochberg 1995).
+    For every variable and every range of it either the model is fitted to the blocks outside and those inside scatter by themselves, or
+    those inside have an offset of their own; the likeliest range is found on every other window and tested on those between, by an F test
+    whose degrees of freedom count windows. Of all tests the false discoveries are held at 5 % (Benjamini, Hochberg 1995).
     """
     variables = _variables(blocks, joint_names)
     white = blocks.whitener(np.ones(len(blocks.time), bool))
@@ -108,7 +108,7 @@ def _of_variable(blocks, axis, rows, prior, variable, white):
 
 
 def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
-    """Return the RestRegime of a range of bins, tested on the windows that it was not found on, or None where it is too much or too little of them."""
+    """Return the RestRegime of a range of bins, tested on windows that it was not found on, or None where it is too many or too few."""
     training, chosen = blocks.window % 2 == 0, np.isin(variable.bins, best)
     inside, outside = ~training & chosen, ~training & ~chosen
     windows = [len(np.unique(blocks.window[part])) for part in (inside, outside)]
@@ -124,7 +124,8 @@ def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
         share, p_value = _tested_scatter(left, inside, outside, windows)
         cost = sum(_cost(float((left[part]**2).sum()), part.sum()) for part in (inside, outside))
     bounds = None if variable.edges is None else (float(variable.edges[best[0]]), float(variable.edges[best[-1] + 1]))
-    return RestRegime(blocks.sensor, AXES[axis], variable.name, variable.words(best) + (', by another offset' if offset else ''), share, p_value, chosen,
+    return RestRegime(blocks.sensor, AXES[axis], variable.name, variable.words(best) + (', by another offset' if offset else ''), share,
+                      p_value, chosen,
                   blocks.time, offset, float(cost), bounds)
 
 
@@ -187,7 +188,8 @@ def _cleanest(rows, marks, prior, bins, cyclic):
 
 def _energies(inside, outside, prior):
     """Return the sums of squares inside and outside under the model fitted outside, each (r,)."""
-    values = np.linalg.solve(outside[:, :-1, :-1] + np.diag(prior[0] + TINY), (outside[:, :-1, -1] + prior[0] * prior[1])[..., None])[..., 0]
+    right = (outside[:, :-1, -1] + prior[0] * prior[1])[..., None]
+    values = np.linalg.solve(outside[:, :-1, :-1] + np.diag(prior[0] + TINY), right)[..., 0]
     weights = np.concatenate([-values, np.ones((len(values), 1))], axis=1)
     return [np.einsum('ri,rij,rj->r', weights, part, weights) for part in (inside, outside)]
 
@@ -262,7 +264,8 @@ def _ranged(name, values, unit, least=1e-3):
         low, high = edges[chosen[0]], edges[chosen[-1] + 1]
         if chosen[0] == 0:
             return f'while the {name} is below {high:.3g} {unit}'
-        return f'while the {name} is {low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'while the {name} is {low:.3g} to {high:.3g} {unit}'
+        span = f'{low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'{low:.3g} to {high:.3g} {unit}'
+        return f'while the {name} is {span}'
     return [_Variable(name, np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2), edges, False, words)]
 
 

@@ -24,7 +24,10 @@ LEAST_CYCLES = 3.0
 HIGHEST = 0.45
 """Highest frequency in that of the samples."""
 CLEAR, BY_CHANCE = 4.0, 0.05
-"""Power above its surroundings that counts in a stretch, and how often noise reaches it there: e^-4, and more where few frequencies tell what is around."""
+"""
+Power above its surroundings that counts in a stretch, and how often noise reaches it there: e^-4, and more where few frequencies tell what
+is around.
+"""
 SIGNIFICANT = 1e-4
 """Chance of a tone by noise, times the number of frequencies, axes and joints."""
 MOSTLY = 0.5
@@ -75,9 +78,10 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     """
     Return sensor -> the tones in what is left beside the findings, the surest first.
 
-    The rest of every stretch of at most ten seconds, or of at most ten turns of a joint that keeps turning, is taken apart into frequencies. One
-    counts where its power is four times the median around it; a tone counts in most stretches, which noise does by chance (binomial law).
-    Rests and motions both tell of seconds; what stays at a multiple of a speed stands still in turns and wanders in seconds.
+    The rest of every stretch of at most ten seconds, or of at most ten turns of a joint that keeps turning, is taken apart into
+    frequencies. One counts where its power is four times the median around it; a tone counts in most stretches, which noise does by chance
+    (binomial law). Rests and motions both tell of seconds; what stays at a multiple of a speed stands still in turns and wanders in
+    seconds.
     """
     attempt = found.attempt
     values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
@@ -147,7 +151,8 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
         # The highest peak among what stands out: what is around it is known by octaves only.
         best = int(np.argmax(np.where(chance[:, axis] < SIGNIFICANT, plain[:, axis] / np.maximum(count, 1), -1.0)))
         if chance[best, axis] < SIGNIFICANT:
-            yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])), float(chance[best, axis]),
+            yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])),
+                       float(chance[best, axis]),
                        float(hits[best, axis] / count[best]), grid[count > 0], mean[count > 0])
 
 

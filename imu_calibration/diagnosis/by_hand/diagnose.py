@@ -54,5 +54,6 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
                      for place in range(len(named)))
     gain = found.gain([], named, named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
-    return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS}, candidates_of(inquiry.search, named),
+    return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},
+                     candidates_of(inquiry.search, named),
                      tuple(found.not_testable), before, after, gain, traces_of(found.baseline, hand), count, count if named else 0)

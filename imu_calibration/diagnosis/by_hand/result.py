@@ -36,7 +36,8 @@ def as_solution(hand: HandCalibration) -> Solution:
 def _rates_left(hand):
     """Return the rates at rest that the model leaves, shape (k, 3)."""
     poses, true = hand.poses, hand.gravity * hand.state.up
-    more = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)[0]
+    more = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+                              temperature_c=poses.temperature_c)[0]
     return poses.rate - hand.gyroscope[0] - more
 
 
