@@ -118,9 +118,8 @@ HAND = _of(
 )
 TRUST = _of(
     'imu_calibration',
-    ('bad verdicts are used', 'calibration/trust.py', 'if calibration.verdict == BAD else []', 'if False else []', 'test_trust.py'),
-    ('disproven calibrations are used', 'calibration/trust.py', '*disproved(calibration.proof)]', ']', 'test_trust.py'),
-    ('the compensator takes what speaks against itself', 'nodes/adoption.py', 'if not settings.anyway:', 'if False:', 'test_adoption.py'),
+    ('bad verdicts are used', 'calibration/trust.py', 'if word == BAD else []', 'if False else []', 'test_trust.py'),
+    ('disproven calibrations are used', 'calibration/trust.py', '*disproved(proof)]', ']', 'test_trust.py'),
     ('a calibration for another sensor is taken', 'nodes/adoption.py', 'calibration.frame_id != known:', 'False:', 'test_adoption.py'),
     ('whatever a document does ends the node', 'nodes/adoption.py', 'except Exception as error:   # whatever', 'except ZeroDivisionError as error:   # whatever',
      'test_adoption.py'),
@@ -140,8 +139,8 @@ FILES = _of(
      'test_disk_faults.py test_cli_bad_input.py'),
     ('no limit to nesting', 'documents.py', 'DEEPEST = 20', 'DEEPEST = 10**9', 'test_documents.py'),
     ('aliases allowed', 'documents.py', "if kind == 'AliasEvent':", 'if False:', 'test_documents.py'),
-    ('another model is resumed', 'calibration/accumulator_state.py', 'if not same or known.point.keys()', 'if known.point.keys()', 'test_session_files.py test_live_calibration.py'),
-    ('another temperature is resumed', 'calibration/accumulator_state.py', ' and known.temperature_ref_c == model.temperature_ref_c', '',
+    ('another model is resumed', 'calibration/accumulator_state.py', 'if not known.has_columns_of(model):', 'if False:', 'test_session_files.py test_live_calibration.py'),
+    ('another temperature is resumed', 'effects/sensor_model.py', ", 'temperature_ref_c', 'definitions')", ", 'definitions')",
      'test_live_calibration.py test_session_files.py'),
 )
 SIGNS = _of(
