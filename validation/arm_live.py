@@ -206,7 +206,7 @@ def run(folder, plots):
         before, after, ahead = rms(found['turned']), rms(found['moved']), looking_ahead(case)
         lost = 2 * len(case.imu_a) - sum(count.values())
         section.claim(f'{name}: one IMU predicts another\'s accelerometer live, rms without and with the arm', 'falls',
-                      f'{before:.2f} → {after:.2f} m/s² ({100 * (1 - after / before):.0f} % less)', after < before, headline=True)
+                      f'{before:.2f} → {after:.2f} m/s² ({100 * (1 - after / before):.0f} % less)', after < before)
         section.claim(f'{name}: messages lost between player, nodes and listener', '0', f'{lost} of {2 * len(case.imu_a)}', lost == 0)
         per_axis = [f'{rms(found[which][:, k]):.2f}' for which in ('turned', 'moved') for k in range(3)]
         lengths = [f'{typical(found[which]):.1f}' for which in ('turned', 'moved')]

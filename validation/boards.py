@@ -31,11 +31,9 @@ def run(folder, plots):
     errors = {name: np.array([1e3 * arms[name][pair].arm - design_mm(folder, name, pair) for pair in pairs]) for name in NAMES}
     apart = errors[NAMES[1]] - errors[NAMES[0]]
     worst = max(np.max(np.linalg.norm(e, axis=1)) for e in errors.values())
-    section.claim('arm of every pair against the design, length of the difference', 'within 1 mm', f'at most {worst:.2f} mm', worst < 1.0,
-                  headline=True)
+    section.claim('arm of every pair against the design, length of the difference', 'within 1 mm', f'at most {worst:.2f} mm', worst < 1.0)
     largest = np.max(np.abs(apart))
-    section.claim('arm of a pair from the two recordings, per axis', 'within 0.3 mm', f'at most {largest:.2f} mm', largest < 0.3,
-                  headline=True)
+    section.claim('arm of a pair from the two recordings, per axis', 'within 0.3 mm', f'at most {largest:.2f} mm', largest < 0.3)
     length = np.linalg.norm(apart, axis=1)
     section.claim('arm of a pair from the two recordings, length of the difference', 'within 0.3 mm',
                   f'at most {length.max():.2f} mm, rms {_rms(length):.2f} mm', length.max() < 0.3)

@@ -23,7 +23,7 @@ def run(folder, plots):
     section = Section('Published biases: MPU-9150 (mpu9150_0)')
     found, difference = figures(folder)
     section.claim('mpu9150_0: accelerometer biases against the published ones', 'within 10 mm/s²', f'{listed(1e3 * difference, 1)} mm/s²',
-                  np.max(np.abs(difference)) < 0.010, headline=True)
+                  np.max(np.abs(difference)) < 0.010)
     statistics = found.statistics
     section.say(text('mpu9150', sds=', '.join(f'{1e3 * sd:.1f}' for sd in found.sd[:3]), poses=statistics['poses'],
                      turns=statistics['turns'], residual=1e3 * statistics['norm_residual_rms']))

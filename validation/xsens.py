@@ -36,9 +36,9 @@ def run(folder, plots):
     found, differences = figures(folder)
     (offset, scale), (offset_w, scale_w) = differences['accelerometer'], differences['gyroscope']
     section.claim('xsens_counts: accelerometer offsets against the factory', 'within 10 counts', f'{listed(offset, 1)} counts',
-                  np.max(np.abs(offset)) < 10, headline=True)
+                  np.max(np.abs(offset)) < 10)
     section.claim('xsens_counts: accelerometer scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale, 2)} %',
-                  np.max(np.abs(scale)) < 0.003, headline=True)
+                  np.max(np.abs(scale)) < 0.003)
     section.claim('gyroscope scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale_w, 2)} %',
                   np.max(np.abs(scale_w)) < 0.003)
     section.claim('gyroscope offsets against the factory', 'another turn-on', f'{listed(offset_w, 1)} counts')

@@ -1,4 +1,4 @@
-"""Every `ros2` command of the README, as it is printed, from where the README puts the user: ~/ws with the package built in it."""
+"""Every `ros2` command of the README and of docs/on-your-robot.md, as printed, from where they put the user: ~/ws with the package built in it."""
 
 import os
 import re
@@ -27,9 +27,13 @@ ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': 
 """Beginnings of questions -> what stands in the answer."""
 
 
+PAGES = ('README.md', 'docs/on-your-robot.md')
+
+
 def commands():
-    """Every command of the README's fenced blocks that calls ros2, its lines joined, without comments."""
-    blocks = re.findall(r'^```\w*\n(.*?)^```', (ROOT / 'README.md').read_text(), re.DOTALL | re.MULTILINE)
+    """Every command of the fenced blocks that calls ros2, its lines joined, without comments."""
+    pages = '\n'.join((ROOT / name).read_text() for name in PAGES)
+    blocks = re.findall(r'^```\w*\n(.*?)^```', pages, re.DOTALL | re.MULTILINE)
     lines = '\n'.join(blocks).replace('\\\n', ' ').splitlines()
     return [re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line]
 
