@@ -219,9 +219,12 @@ def check_the_poses(station, expected):
     messages = [message for name, _, message in station.history if name == 'calibration_node: poses']
     assert any('hold it still with' in message and 'not seen yet' in message for message in messages)
     assert any('at rest for' in message for message in messages)
-    figures = values_of(station, 'poses')
     windows = expected.statistics['windows']
-    assert (int(figures['poses']), int(figures['turns'])) == (windows['static'], windows['turns'])
+
+    def counted():
+        figures = values_of(station, 'poses')
+        return (int(figures['poses']), int(figures['turns'])) == (windows['static'], windows['turns'])
+    station.until(counted, 'the poses and turns of the recording')
     assert station.status['calibration_node: accelerometer bias'].level == b'\0'
     print(f'by hand, live: {messages[0]} ... {messages[-1]}')
 

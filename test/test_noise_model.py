@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.estimation.band_misfit import misfit_along
+from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
 from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel, dof_factor, white_noise
 
 
@@ -46,3 +46,14 @@ def test_misfit_along_the_columns_shows_how_correlated_it_is(smooth, least, most
     squares, dimensions = misfit_along(np.array(products))
     assert dimensions == 240
     assert least < squares / dimensions < most
+
+
+def test_a_column_of_which_rounding_left_less_than_nothing_says_nothing():
+    """Products about the mean of a window can come out below zero: such a column made the misfit along the others 1e95 times larger."""
+    rng = np.random.default_rng(5)
+    rows = np.column_stack([rng.normal(size=(200, 3)), np.full(200, 1e-7), rng.normal(size=200)])
+    products = rows.T @ rows
+    products[3, 3] = -1e-22
+    whole, kept = np.delete(np.delete(products, 3, 0), 3, 1), products[None]
+    np.testing.assert_allclose(misfit_along(kept), misfit_along(whole[None]), rtol=1e-12)
+    np.testing.assert_allclose(least_misfit(products), least_misfit(whole), rtol=1e-12)

@@ -95,7 +95,7 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
 
     """
     gram, gradient = products[:, :-1, :-1], products[:, :-1, -1]
-    scale = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', gram), 1e-300))
+    scale = _scales(np.einsum('kii->ki', gram))
     eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
     along = np.einsum('kij,ki->kj', vectors, gradient * scale)
     strong = eigenvalues > STRONG * eigenvalues[:, -1:]
@@ -104,9 +104,14 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
     """Return the squares that the best fit leaves of products of ``[design | output]``, shape (q + 1, q + 1), and the design's rank."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(products), 1e-300))
+    scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
     seen = eigenvalues > SEEN * max(eigenvalues[-1], 1e-300)
     along = (vectors.T @ scaled[:-1, -1])[seen]
     return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1]**2, int(seen.sum())
+
+
+def _scales(squares):
+    """Return what makes columns of unit length; 0 for one of which rounding left nothing, or less: it says nothing along it."""
+    return np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
