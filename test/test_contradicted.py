@@ -7,7 +7,7 @@ import pytest
 
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
 from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.verdict import _left_out
+from imu_calibration.calibration.verdict_notes import _left_out
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve

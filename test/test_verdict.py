@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.reasons import BAD, GOOD, NOTE
 from imu_calibration.calibration.status import DETERMINED, HELD, WEAK, tolerances_of
-from imu_calibration.calibration.verdict import BAD, GOOD, NOTE, judge
+from imu_calibration.calibration.verdict import judge
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import SensorModel
 

@@ -10,9 +10,10 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.reasons import BAD
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
-from imu_calibration.calibration.verdict import BAD, Verdict
+from imu_calibration.calibration.verdict import Verdict
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.segmentation.window import Window
 

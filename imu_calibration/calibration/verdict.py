@@ -1,66 +1,24 @@
 """Good, weak or bad: whether a calibration may be used, why, and what to do next."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
-from imu_calibration.calibration.proof_words import disproved, proven
+from imu_calibration.calibration.proof_words import disproved
+from imu_calibration.calibration.reasons import BAD, GOOD, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet
 from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
+from imu_calibration.calibration.verdict_notes import notes_on
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import with_hint
-from imu_calibration.units import for_people, significant
 
-
-class Judgement(StrEnum):
-    """What a reason, or all of them together, say of a calibration."""
-
-    GOOD = 'good'
-    """Use it."""
-    WEAK = 'weak'
-    """Usable, with gaps."""
-    BAD = 'bad'
-    """Do not use it as it is."""
-    NOTE = 'note'
-    """A reason that leaves the verdict alone."""
-
-
-GOOD, WEAK, BAD, NOTE = Judgement
-MISFIT = 10.0
-"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
-LOOSE = 2.0
-"""From this factor on the misfit is worth a note."""
-LOST_SHARE = 0.05
-"""Losing more than this share of the samples is worth a look at the recording."""
 SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
 HAND_AXES = 'accelerometer_lower_triangular'
 """The axes of a calibration by hand."""
-SHOWN_NAMES = 6
-"""Names listed one by one; of more, the groups are named."""
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One thing that speaks for or against the calibration."""
-
-    word: Judgement
-    """What it says."""
-    what: str
-    """What was seen."""
-    next: str
-    """What to do about it; empty when nothing has to be done."""
-    key: str | None = None
-    """What has to be given for it, a key of `errors.KEYS`."""
-    sensors: tuple[str, ...] = SENSORS
-    """Whose parameters it concerns."""
-
-
 @dataclass(frozen=True)
 class Verdict:
     """The verdict with its reasons, the gravest first."""
@@ -107,7 +65,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     favour = [] if against else [_all_well(calibration, tolerances)]
     order = (BAD, WEAK)
     against = sorted(against, key=lambda r: order.index(r.word))
-    return Verdict(_worst(against), tuple(favour + against + _notes(calibration, tolerances)), words)
+    return Verdict(_worst(against), tuple(favour + against + notes_on(calibration, tolerances)), words)
 
 
 def _worst(against):
@@ -154,26 +112,11 @@ def _strange_causes(calibration):
             for name, share in found.items()]
 
 
-def _ratios(calibration, sensor):
-    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
-
-
-def _quiet(calibration):
-    """
-    Return what residuals in motion are compared with.
-
-    Without a rest only their own slow part is there, and lags show in the fast one.
-    """
-    windows = calibration.statistics.get('windows')
-    return 'the noise at rest' if windows is None or windows.get('static') else 'their slow part (a lag or a late clock leaves that)'
-
-
 def _misfits(calibration):
-    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}: '
+    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
                    'the model leaves something out',
                    "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
-            for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if ratio > MISFIT]
+            for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
 
 
 def _blind(calibration):
@@ -226,110 +169,12 @@ def _by_need(calibration, names):
     return found
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return names in a sentence; of many, the groups with their numbers."""
-    if len(names) <= SHOWN_NAMES:
-        return ', '.join(names)
-    groups = {}
-    for name in names:
-        groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
-    return ', '.join(f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items())
-
-
 def _all_well(calibration, tolerances):
     share = np.where(calibration.model.requested, calibration.sd / tolerances, 0.0)
     worst = int(np.argmax(share))
-    fit = [ratio for sensor in SENSORS for ratio in _ratios(calibration, sensor).values()]
-    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {_quiet(calibration)}' if fit else ''
+    fit = [ratio for sensor in SENSORS for ratio in misfit_ratios(calibration, sensor).values()]
+    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {quiet(calibration)}' if fit else ''
     return Reason(GOOD, f'all {len(calibration.requested)} parameters are within their tolerance (the closest, '
                         f'{calibration.param_names[worst]}, '
                         f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', "
                         "or compensator_node")
-
-
-def _notes(calibration, tolerances):
-    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances)
-            + _left_out(calibration) + _lost(calibration))
-
-
-def _proven(calibration):
-    return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
-
-
-def _adopted(calibration):
-    """Return notes on what the recording did to the model."""
-    added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
-    notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
-                    f'{", ".join(_with_size(calibration, name) for name in added)}',
-                    "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
-    notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
-                     "see 'imu_calibration diagnose'")] if denied else []
-    lacking = calibration.statistics.get('lacking') or []
-    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
-                     'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
-    strange = calibration.statistics.get('not_believed') or {}
-    return notes + ([Reason(NOTE, 'held, because only what the model misses gives them a value, and one that no sensor has: '
-                            f'{_strange(strange)}',
-                            'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
-
-
-def _strange(values):
-    """Return names with the values they would have had; of many, the first ones."""
-    told = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
-    return told + (' ...' if len(values) > SHOWN_NAMES else '')
-
-
-def _with_size(calibration, name):
-    """Return an effect with its plainest parameter, in units that people use."""
-    effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
-    if effect is None:
-        return name
-    part = calibration.model.slices[effect.key]
-    best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
-    factor, unit = for_people(effect.unit_of(best - part.start))
-    return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
-
-
-def _loose(calibration):
-    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {_quiet(calibration)}',
-                   "see 'imu_calibration diagnose' when that matters to you")
-            for sensor in SENSORS for kind, ratio in _ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
-
-
-def _unstable(calibration, tolerances):
-    """Return notes on biases that move from window to window by more than the tolerance on their mean."""
-    reasons = []
-    for sensor in SENSORS:
-        offset = calibration.model.find(sensor, Role.OFFSET)
-        scatter = float(np.max(calibration.noise(sensor)[1]))
-        if scatter > tolerances[calibration.model.slices[offset.key]][0]:
-            factor, unit = for_people(offset.unit)
-            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
-                                        f'{significant(scatter * factor, 2)} {unit}, more than '
-                                        'the tolerance on its bias: the mean is well known, the bias of the moment is not',
-                                  'let the IMU warm up and the table stand firm, or estimate the bias in use'))
-    return reasons
-
-
-def _left_out(calibration):
-    """Return notes on windows that the others contradict."""
-    notes = []
-    for sensor in SENSORS:
-        times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
-        if times:
-            windows = ('a window, whose mean the others contradict' if len(times) == 1
-                       else f'{len(times)} windows, whose means the others contradict')
-            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, '
-                                f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
-                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'somebody may have touched the table or the IMU'))
-    return notes
-
-
-def _lost(calibration):
-    dropped = calibration.statistics.get('dropped')
-    if not dropped:
-        return []
-    total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
-    text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
-    many = total > LOST_SHARE * max(used, 1)
-    return [Reason(NOTE, text, "look at the recording with 'imu_calibration inspect'" if many else '')]

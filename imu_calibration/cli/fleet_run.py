@@ -10,7 +10,7 @@ from pathlib import Path
 from imu_calibration import files
 from imu_calibration.calibration.fleet import FleetStep, Spread, UnitResult, fleet_exit_code, summarise
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.verdict import BAD, GOOD, WEAK
+from imu_calibration.calibration.reasons import BAD, GOOD, WEAK
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of

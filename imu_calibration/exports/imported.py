@@ -7,8 +7,8 @@ import numpy as np
 import imu_calibration
 from imu_calibration.calibration.document import UNKNOWN, Calibration, from_mapping
 from imu_calibration.calibration.document_checks import check_numbers
+from imu_calibration.calibration.reasons import Judgement
 from imu_calibration.calibration.status import HELD, WEAK
-from imu_calibration.calibration.verdict import Judgement
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.exports.affine import AffineImu, moved

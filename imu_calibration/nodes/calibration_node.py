@@ -28,7 +28,7 @@ from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_view import CalibrationView
-from imu_calibration.nodes.calibration_worker import CalibrationWorker, Listeners
+from imu_calibration.nodes.calibration_worker import CalibrationWorker
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import markers_of
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
@@ -41,6 +41,7 @@ from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.session_reference import reference_of
+from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting

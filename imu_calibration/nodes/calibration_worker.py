@@ -1,11 +1,14 @@
-"""The thread behind calibration_node: takes what arrived, solves when it is due, saves; the node's own thread only listens."""
+"""
+The thread behind calibration_node: takes what arrived, solves when it is due, saves; the node's own thread only listens.
+
+Somewhat above 300 lines, because what one thread does to one session is read in one place.
+"""
 
 import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 from imu_calibration.calibration.coverage import bars_of
 from imu_calibration.calibration.document import calibration_to_text
@@ -19,8 +22,8 @@ from imu_calibration.errors import ImuCalibrationError, InputError, NotObservabl
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.worker_requests import Listeners, Request
 from imu_calibration.preflight.stream_watch import StreamWatch
-from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_settings import WindowSettings
 from msg_adapters.live import LiveGatherer
 
@@ -28,20 +31,6 @@ PERIOD = 0.1
 """Seconds between two looks at what arrived."""
 IDLE = 3.0
 """Seconds without messages after which the windows that are still open count as well."""
-
-
-@dataclass(frozen=True)
-class Listeners:
-    """Who hears of what the worker makes."""
-
-    calibration: Callable[[str], None]
-    """Called with the text of each new calibration document."""
-    residuals: Callable[[Any], None]
-    """Called with ImuSamples."""
-    coverage: Callable[[Any], None] = lambda coverage: None
-    """Called with each new Coverage."""
-    solution: Callable[[CalibrationResult, list[Window]], None] = lambda result, windows: None
-    """Called with each new solution and the windows that are still there with their samples; none by hand."""
 
 
 class CalibrationWorker(threading.Thread):
@@ -321,16 +310,3 @@ class CalibrationWorker(threading.Thread):
     def _diagnosis_state(self) -> DiagnosisState:
         state = self._diagnosis.state
         return replace(state, values={**state.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
-
-
-class Request:
-    """Something asked of the worker."""
-
-    def __init__(self, action: Callable[[], tuple[bool, str]]):
-        self.action, self.done = action, threading.Event()
-        self.success, self.message = False, ''
-
-    def answer(self, success: bool, message: str) -> None:
-        """Give the answer."""
-        self.success, self.message = success, message
-        self.done.set()

@@ -10,7 +10,6 @@ out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_jo
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -40,6 +39,7 @@ from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
 from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.planner_settings import PlannerNodeSettings
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
@@ -49,8 +49,6 @@ from imu_calibration.planning.planner import make_planner
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file
-from imu_calibration.settings import setting
-from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.joint_state import joint_row
 from msg_adapters.stamps import UnusableMessage
 
@@ -59,30 +57,6 @@ PERIOD = 0.1
 ANSWER_PATIENCE = 60.0
 """Seconds to wait for a solution, and for a diagnosis that has begun."""
 _LEVELS = {DriveState.STOPPED: ERROR_LEVEL}
-
-
-@dataclass(frozen=True)
-class PlannerNodeSettings:
-    """What is moved, for which parameters, and how it is commanded."""
-
-    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
-                              'config/table_three_axis.yaml, or with urdf_file nothing',
-                              symptom='other joints, or limits that are not theirs', session=True)
-    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='motions go on for too long, or end too early', session=True)
-    accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
-    gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
-    reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
-    grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
-                         symptom='the predicted standard deviations are not those that are reached')
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
-                              symptom='the predicted standard deviations are not those that are reached', session=True)
-    imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
-                              'the predicted standard deviations are not those that are reached')
-    command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
-                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
-    calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows',
-                                    symptom='~/start says that nobody calibrates')
 
 
 class PlannerNode(Node):

@@ -128,7 +128,7 @@ TRUST = _of(
      'test_proof.py test_trust.py'),
     ('proof on windows that were fitted', 'calibration/held_out.py', 'for k, part in enumerate(parts) if k != fold)', 'for k, part in enumerate(parts))',
      'test_proof.py'),
-    ('misfit is not a reason', 'calibration/verdict.py', 'MISFIT = 10.0', 'MISFIT = 1e9', 'test_verdict.py'),
+    ('misfit is not a reason', 'calibration/reasons.py', 'MISFIT = 10.0', 'MISFIT = 1e9', 'test_verdict.py'),
     ('weak called determined', 'calibration/status.py', 'DETERMINED if s <= t else WEAK', 'DETERMINED if s <= 9 * t else WEAK', 'test_status.py'),
     ('held called determined', 'calibration/status.py', 'HELD if h else DETERMINED', 'DETERMINED if h else DETERMINED', 'test_status.py'),
     ('weak values applied whatever they cost', 'compensation/compensate.py', 'applied_values(', '(lambda known: known.values)(', 'test_believing.py'),

@@ -1,0 +1,101 @@
+"""What a calibration's reader is told beside the verdict: what was added, left out, lost, or moves from window to window."""
+
+import numpy as np
+
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.proof_words import disproved, proven
+from imu_calibration.calibration.reasons import LOOSE, MISFIT, NOTE, SHOWN_NAMES, Reason, misfit_ratios, quiet
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.units import for_people, significant
+
+LOST_SHARE = 0.05
+"""Losing more than this share of the samples is worth a look at the recording."""
+
+
+def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
+    """Return what leaves the verdict alone and is worth knowing; arguments as in `verdict.judge`."""
+    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances)
+            + _left_out(calibration) + _lost(calibration))
+
+
+def _proven(calibration):
+    return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
+
+
+def _adopted(calibration):
+    """Return notes on what the recording did to the model."""
+    added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
+    notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
+                    f'{", ".join(_with_size(calibration, name) for name in added)}',
+                    "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
+    notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
+                     "see 'imu_calibration diagnose'")] if denied else []
+    lacking = calibration.statistics.get('lacking') or []
+    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
+                     'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
+    strange = calibration.statistics.get('not_believed') or {}
+    return notes + ([Reason(NOTE, 'held, because only what the model misses gives them a value, and one that no sensor has: '
+                            f'{_strange(strange)}',
+                            'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
+
+
+def _strange(values):
+    """Return names with the values they would have had; of many, the first ones."""
+    told = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
+    return told + (' ...' if len(values) > SHOWN_NAMES else '')
+
+
+def _with_size(calibration, name):
+    """Return an effect with its plainest parameter, in units that people use."""
+    effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
+    if effect is None:
+        return name
+    part = calibration.model.slices[effect.key]
+    best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
+    factor, unit = for_people(effect.unit_of(best - part.start))
+    return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
+
+
+def _loose(calibration):
+    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}',
+                   "see 'imu_calibration diagnose' when that matters to you")
+            for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
+
+
+def _unstable(calibration, tolerances):
+    """Return notes on biases that move from window to window by more than the tolerance on their mean."""
+    reasons = []
+    for sensor in SENSORS:
+        offset = calibration.model.find(sensor, Role.OFFSET)
+        scatter = float(np.max(calibration.noise(sensor)[1]))
+        if scatter > tolerances[calibration.model.slices[offset.key]][0]:
+            factor, unit = for_people(offset.unit)
+            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
+                                        f'{significant(scatter * factor, 2)} {unit}, more than '
+                                        'the tolerance on its bias: the mean is well known, the bias of the moment is not',
+                                  'let the IMU warm up and the table stand firm, or estimate the bias in use'))
+    return reasons
+
+
+def _left_out(calibration):
+    """Return notes on windows that the others contradict."""
+    notes = []
+    for sensor in SENSORS:
+        times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
+        if times:
+            windows = ('a window, whose mean the others contradict' if len(times) == 1
+                       else f'{len(times)} windows, whose means the others contradict')
+            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, '
+                                f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
+                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'somebody may have touched the table or the IMU'))
+    return notes
+
+
+def _lost(calibration):
+    dropped = calibration.statistics.get('dropped')
+    if not dropped:
+        return []
+    total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
+    text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
+    many = total > LOST_SHARE * max(used, 1)
+    return [Reason(NOTE, text, "look at the recording with 'imu_calibration inspect'" if many else '')]

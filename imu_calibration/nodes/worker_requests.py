@@ -1,0 +1,36 @@
+"""What the thread behind calibration_node is asked, and who hears of what it makes."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.segmentation.window import Window
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Who hears of what the worker makes."""
+
+    calibration: Callable[[str], None]
+    """Called with the text of each new calibration document."""
+    residuals: Callable[[Any], None]
+    """Called with ImuSamples."""
+    coverage: Callable[[Any], None] = lambda coverage: None
+    """Called with each new Coverage."""
+    solution: Callable[[CalibrationResult, list[Window]], None] = lambda result, windows: None
+    """Called with each new solution and the windows that are still there with their samples; none by hand."""
+
+
+class Request:
+    """Something asked of the worker."""
+
+    def __init__(self, action: Callable[[], tuple[bool, str]]):
+        self.action, self.done = action, threading.Event()
+        self.success, self.message = False, ''
+
+    def answer(self, success: bool, message: str) -> None:
+        """Give the answer."""
+        self.success, self.message = success, message
+        self.done.set()
