@@ -110,12 +110,16 @@ def _xsens(section, document):
                   not named and rest.get('significant'), headline=True)
 
 
+LAGS = ('time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter')
+"""Effects whose parameters are times by which the gyroscope is late."""
+
+
 def _shaft(section, name, document):
-    claim, wanted = f'{name}: the lag is found by itself', 'time_offset or gyro_bandwidth, together 12 to 14 in whole ms (12.0 to 14.0 until 11.97 was seen)'
+    claim, wanted = f'{name}: the lag is found by itself', 'a lag of the gyroscope, of whichever kind, together 12 to 14 in whole ms (12.0 to 14.0 until 11.97 was seen; time_offset or gyro_bandwidth while there were no others)'
     if isinstance(document, str):
         section.claim(claim, wanted, document, False)
         return
-    lags = [finding for finding in document['findings'] if finding['effect'] in ('time_offset', 'gyro_bandwidth')]
+    lags = [finding for finding in document['findings'] if finding['effect'] in LAGS]
     shown = '; '.join(f'{found_text(finding)}, gain {gain_text(finding)}' for finding in lags) or 'not found'
     lag = sum(parameter['value'] for finding in lags for parameter in finding['parameters'].values())
     section.claim(claim, wanted, f'{1e3 * lag:.1f} ms: {shown}', 12 <= round(1e3 * lag) <= 14, headline=True)

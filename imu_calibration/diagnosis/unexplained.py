@@ -65,7 +65,8 @@ def _rest(attempt, explained, sensor, excess, values):
     space, recording = attempt.space, attempt.recording
     residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
-    noise_sd = np.sqrt(floor.mean_variance(recording.kind, recording.count) + floor.bias_variance)
+    white = floor.mean_variance(recording.kind, recording.count)
+    noise_sd = np.sqrt(white + floor.bias_variance)
     sigma = sigma_means = excess[0] / np.sqrt(2 * explained.n_means)
     if excess[1] > WITHIN_SHARE * explained.n_within:
         sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
@@ -76,6 +77,8 @@ def _rest(attempt, explained, sensor, excess, values):
     if sigma_means <= SIGNIFICANT:
         inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
         return Unexplained(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
+    if rms == 0:   # less than biases may wander, and more than neighbours may differ
+        rms = float(np.sqrt(np.mean(white) * excess[0] / explained.n_means))
     name, share = correlate(_explanations(recording), residual / noise_sd)
     return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
 

@@ -1,0 +1,22 @@
+"""A rest that is significant has a size, also where biases may wander by more than it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from imu_calibration.diagnosis import unexplained
+
+
+def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monkeypatch):
+    """Plain squares of the means are less than noise and wander allow; whitened ones are not: "0 deg/s, significant" was told."""
+    monkeypatch.setattr(unexplained, 'correlate', lambda explanations, residual: ('time', 0.5))
+    monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
+    monkeypatch.setattr(unexplained, 'where_most', lambda *arguments: None)
+    n = 40
+    noise = SimpleNamespace(mean_variance=lambda kind, count: np.full((n, 3), 4e-6), bias_variance=1e-2)
+    attempt = SimpleNamespace(space=SimpleNamespace(mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]),
+                              recording=SimpleNamespace(kind=None, count=None, time=np.arange(n)))
+    explained = SimpleNamespace(floor=SimpleNamespace(noise={'gyroscope': noise}), n_means=3 * n, n_within=1)
+    rest = unexplained._rest(attempt, explained, 'gyroscope', (9.0 * 3 * n, 0.0), np.ones(1))
+    assert rest.significant
+    np.testing.assert_allclose(rest.rms, 3 * 2e-3)
