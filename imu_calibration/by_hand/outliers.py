@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtrc
 
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State, TurnData, build_system
 from imu_calibration.by_hand.full_scale import missed_angle
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.solver import HandSolution
+from imu_calibration.estimation.f_test import chance_of_fall
 
 P_VALUE = 1e-3
 """Chance that a recording without outliers loses a pose or turn, per kind."""
@@ -93,7 +93,7 @@ def _p_value(rest, basis, total, spare):
     square, count = _distance(rest, basis, SEEN)
     if not count or spare - count < LEAST_SPARE:
         return 1.0
-    return float(fdtrc(count, spare - count, square / count / max((total - square) / (spare - count), 1e-12)))
+    return chance_of_fall(square, count, rest=total - square, spare=spare - count)
 
 
 def _loosened(sem, index):

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtrc
 
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.f_test import chance_of_fall
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -96,4 +96,4 @@ class _Fit:
         if spare < LEAST_SPARE:
             return 1.0
         total, others = ((part[own]**2).sum() for part in (self.rest, better))
-        return float(fdtrc(3, spare, max(total - others, 0.0) / 3 / max(others / spare, 1e-12)))
+        return chance_of_fall(total - others, 3, rest=others, spare=spare)

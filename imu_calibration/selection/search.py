@@ -94,10 +94,10 @@ class Search:
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
-        smaller, larger = self.used(chosen), self.used([*chosen, question])
+        beside = [*chosen, question]
+        smaller, larger = self.used(chosen), self.used(beside)
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
-        beside = [*chosen, question]
         return Score(question, gain, p_value, self.allowed(beside, question), self.implausible(beside, question))
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
