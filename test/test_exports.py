@@ -19,7 +19,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
-from imu_calibration.errors import InputError
+from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.exports.export import export
 from imu_calibration.exports.gauges import lower_times_rotation, upper_times_rotation
 from imu_calibration.exports.holdings import holding_of
@@ -215,7 +215,7 @@ def test_what_px4_takes_no_notice_of_is_said():
     large = with_values(small, OFFSET=lambda b: np.full(3, 0.4), LINEAR=lambda m: np.eye(3) * 1.02)
     assert not any('unchanged' in line for line in export(large, find_target('px4')).lines)
     assert any('arming will be refused' in line for line in export(with_values(small, OFFSET=lambda b: b + 4.0),
-                                                                   find_target('ardupilot')).lines)
+                                                                   find_target('ardupilot'), anyway=True).lines)
 
 
 # Noise
@@ -497,5 +497,8 @@ def test_a_file_of_ours_brings_the_frame_back_and_none_where_there_was_none():
 
 def test_what_speaks_against_a_calibration_travels_along():
     bad = random_calibration(3, (), verdict='bad', verdict_reasons=('the recording says nothing',))
-    assert 'its verdict is bad: the recording says nothing' in export(bad, find_target('px4')).content.decode()
+    assert 'its verdict is bad: the recording says nothing' in export(bad, find_target('px4'), anyway=True).content.decode()
+    with pytest.raises(DocumentError, match='the recording says nothing'):
+        export(bad, find_target('px4'))
+    assert export(bad, find_target('json')).exit_code == 0   # it brings its verdict
     assert not any('of the calibration' in line for line in export(replace(bad, verdict='good'), find_target('px4')).lines)

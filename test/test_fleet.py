@@ -9,9 +9,11 @@ import yaml
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.fleet import UnitResult, summarise
+from imu_calibration.cli.fleet_run import summary_html, units_csv
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.files import read_calibration
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.simulation.profiles import make_profile
@@ -65,7 +67,7 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     assert code == 3
     units = {row['name']: row for row in read_csv(output / 'units.csv')}
     assert list(units) == ['unit_a', 'unit_b', 'unit_c']
-    assert units['unit_c']['verdict'] == 'refused'
+    assert units['unit_c']['verdict'] == units['unit_c']['gyroscope'] == 'refused'
     assert 'unit_c.mcap' in units['unit_c']['error']
     assert '\n' not in units['unit_c']['error']
     assert not (output / 'unit_c').exists()
@@ -95,6 +97,15 @@ def test_the_summary_is_that_of_the_units(result):
     np.testing.assert_allclose([float(found['mean']), float(found['spread'])], [values.mean(), values.std(ddof=1)], rtol=1e-12)
     assert found['highest_unit'] == units[int(np.argmax(values))]['name']
     assert float(found['spread_over_sd']) > 10, 'units of one grade differ by far more than a calibration is uncertain'
+
+
+def test_a_unit_has_the_word_of_each_sensor(result):
+    known = read_calibration(result[1] / 'unit_a' / 'calibration.yaml')
+    unit = UnitResult('unit_d', replace(known, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}), 'bad')
+    row = next(iter(csv.DictReader(units_csv([unit]).splitlines())))
+    assert (row['verdict'], row['accelerometer'], row['gyroscope']) == ('bad', 'bad', 'good')
+    page = summary_html([unit], summarise([unit]))
+    assert 'bad (accelerometer bad, gyroscope good)' in page and '<span class="tag bad">' in page
 
 
 @pytest.mark.slow

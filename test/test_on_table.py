@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.on_table import _a_period_late, same_motion, signs_or_delay
 from imu_calibration.reference.joint_motion import JointMotion
@@ -136,3 +137,11 @@ def test_the_imu_on_the_bench_is_refused(recordings):
     folder = recordings / 'shaft_yaw_medium'
     with pytest.raises(InputError, match='does not turn when the table does'):
         calibrate(folder, folder / 'table.yaml', imu_topic='/imu_fixed/data_raw')
+
+
+def test_a_live_session_tells_the_same_causes(gimbals):
+    block, table = gimbals
+    session = LiveCalibration(table)
+    session.push(joints(block, ('middle', 'outer', 'inner')))
+    with pytest.raises(InputError, match='outer turns as middle should'):
+        session.solve(pending=True)

@@ -14,6 +14,8 @@ from imu_calibration.calibration.verdict import HAND_AXES, grave_reasons
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import DocumentError
+from imu_calibration.exports.export import export
+from imu_calibration.exports.registry import find_target
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
 from msg_adapters.bag import open_recording
@@ -76,6 +78,18 @@ def test_compensate_corrects_the_one_and_leaves_the_other(yaw, block, tmp_path, 
     assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]) == 3
     told = capsys.readouterr().out
     assert told.count('the accelerometer is left as it comes') == 1 and 'written' in told
+
+
+def test_other_programs_get_numbers_of_a_data_sheet_for_the_sensor_that_is_refused(tmp_path, capsys):
+    known = harmed('accelerometer', verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'})
+    whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
+    plain = export(with_nominal(known, ['accelerometer']), find_target('px4'), anyway=True)
+    assert found.numbers == plain.numbers != whole.numbers and found.numbers.keys() == whole.numbers.keys()
+    assert any('the accelerometer is left as it comes' in line for line in found.lines) and found.exit_code == 3 and whole.exit_code == 0
+    files.write_text(tmp_path / 'calibration.yaml', calibration_to_text(known))
+    command = ['export', str(tmp_path / 'calibration.yaml'), '--to', 'px4', '--output', str(tmp_path / 'px4.params')]
+    assert [main([*command, *more]) for more in ([], ['--anyway'])] == [3, 0]
+    assert 'note: of the calibration: the accelerometer is left as it comes' in capsys.readouterr().out
 
 
 def test_what_the_refused_sensor_would_correct_goes_as_well():

@@ -9,7 +9,9 @@ from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import HELD
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.reference.table import Table
 
@@ -46,6 +48,17 @@ class UnitResult:
     """What has to be given, a key of `errors.KEYS`."""
     files: dict | None = None
     """File name -> text."""
+
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """Sensor -> its own word; the same for both where nobody judged them apart."""
+        known = self.calibration.verdicts if self.calibration is not None else {}
+        return {sensor: known.get(sensor, self.verdict) for sensor in SENSORS}
+
+    @property
+    def verdict_text(self) -> str:
+        """The verdict in words, sensor by sensor where they differ."""
+        return verdict_text(self.verdict, self.verdicts)
 
 
 @dataclass(frozen=True)

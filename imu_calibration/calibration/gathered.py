@@ -63,6 +63,11 @@ class Gathered:
         return fresh
 
     @property
+    def moving(self) -> list:
+        """Moving windows with all their samples, as far as they are kept: live those that are asked for effects."""
+        return self.kept or [window for spread in self.spreads for window in spread.windows if window.kind != 'static']
+
+    @property
     def duration(self) -> float:
         """Seconds from the first to the last IMU stamp, recordings added."""
         return 0.0 if self.first_stamp_ns is None or self.last_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9

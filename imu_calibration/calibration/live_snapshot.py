@@ -48,7 +48,7 @@ class LiveSnapshot:
         Where the windows are no longer kept, the columns are those that were gathered.
         """
         model, total, moved = self.model, self.gathered, self.model_for(options)
-        check_units(total, model)
+        check_units(total, model, self.table)
         if not self.store.complete or moved.has_columns_of(model):
             moved = model
         for _ in range(PASSES):

@@ -23,6 +23,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
     parser.add_argument('--output', metavar='FILE', help='the file to write')
     parser.add_argument('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
+    parser.add_argument('--anyway', action='store_true', help='also the numbers of a sensor whose verdict is bad or whose proof failed; '
+                        'without it they are those of a data sheet, where the other sensor is shown to be helped')
     add_stand_arguments(parser, 'what says how the recording moved; without it: its own readings')
     add_topic_arguments(parser)
 
@@ -40,11 +42,11 @@ def run(options: Namespace) -> int:
         raise InputError('a table or arm says how a recording moved and must come with --bag BAG, none came; give both')
     topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic)
     found = export_calibration(options.document, options.to, output=options.output, noise=options.noise, rate=options.rate,
-                               bag=options.bag, stand=stand, topics=topics)
+                               bag=options.bag, stand=stand, topics=topics, anyway=options.anyway)
     for line in found.lines:
         print(line)
     print(f'written: {options.output}')
-    return 0
+    return found.exit_code
 
 
 def _show_targets():

@@ -15,6 +15,7 @@ from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.show import console, warn
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, with_hint
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
@@ -74,16 +75,16 @@ def parameters_csv(spreads: Sequence[Spread]) -> str:
 
 
 def units_csv(results: Sequence[UnitResult]) -> str:
-    """Return one row per unit: verdict, exit code, why it was refused, samples lost, and each parameter with its sd, SI."""
+    """Return one row per unit: verdict, those of the sensors, exit code, why refused, samples lost, each parameter with its sd, SI."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
     headings = [heading for name in names for heading in (name, f'{name}.sd')]
-    rows: list[list] = [['name', 'verdict', 'exit_code', 'error', 'dropped', *headings]]
+    rows: list[list] = [['name', 'verdict', *SENSORS, 'exit_code', 'error', 'dropped', *headings]]
     for result in results:
         known, dropped = {}, ''
         if result.calibration is not None:
             known = dict(zip(result.calibration.param_names, zip(result.calibration.values, result.calibration.sd)))
             dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
-        row = [result.name, result.verdict, result.exit_code, result.error, dropped]
+        row = [result.name, result.verdict, *result.verdicts.values(), result.exit_code, result.error, dropped]
         rows.append(row + [number for name in names for number in known.get(name, ('', ''))])
     return _csv(rows)
 
@@ -119,7 +120,7 @@ def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder:
         table.add_row(*shown(spread))
     out.print(table)
     for result in results:
-        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict}', soft_wrap=True, markup=False)
+        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}', soft_wrap=True, markup=False)
         if result.calibration is not None:
             warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
     calibrated = sum(result.calibration is not None for result in results)

@@ -1,6 +1,7 @@
 """The export itself: a calibration and its noise become a file for a target, with what that loses."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -8,7 +9,7 @@ import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
-from imu_calibration.calibration.trust import caveats, objections
+from imu_calibration.calibration.trust import Usable, caveats, objections, usable
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import InputError
 from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
@@ -34,12 +35,22 @@ class Export:
     """What is lost."""
     lines: tuple[str, ...]
     """What to know about it: the same in the file and on the terminal."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Sensor whose numbers are those of a data sheet -> why."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 written, 3 without the numbers of one sensor."""
+        return 3 if self.refused else 0
 
 
 def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | None = None, rate: float | None = None,
-           motion: TrialMotion | None = None) -> Export:
+           motion: TrialMotion | None = None, anyway: bool = False) -> Export:
     """
     Return the file of a target.
+
+    A sensor that compensation would leave as it comes is left so here, too: its numbers are those of a data sheet. A target that holds the
+    whole document gets its verdicts with it.
 
     Parameters
     ----------
@@ -51,13 +62,19 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
         Rate at which the target gets the readings, Hz; default that of the noise document.
     motion : TrialMotion, optional
         Where the loss is measured; default `motion.standard_motion`.
+    anyway : bool
+        Also the numbers of a sensor whose verdict is bad or whose proof failed.
 
     Raises
     ------
     InputError
         When the target needs noise that is not there, or the calibration cannot be brought into its axes.
+    DocumentError
+        When nobody should be corrected with the calibration.
 
     """
+    used = Usable(calibration) if anyway or target.whole or target.only_noise else usable(calibration)
+    calibration = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it')
     found, unknown = _noise_numbers(calibration, target, noise, rate)
@@ -65,13 +82,13 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     motion = motion or standard_motion(calibration)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
     lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
-             *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(calibration), *target.ignored(numbers), *unknown)),
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(used), *target.ignored(numbers), *unknown)),
              *(f'note: {hint}' for hint in [target.hint] if hint)]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
     assert target.write is not None   # `registry.find_target` gives no other
     content = target.write(Page(numbers, found, [*head, *lines], calibration, rate))
-    return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines))
+    return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines), used.refused)
 
 
 def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement, Numbers]:
@@ -101,9 +118,9 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
     return target.noise(found), _walk_lines(found) if target.needs_walk else []
 
 
-def _trust_lines(calibration: Calibration) -> list[str]:
+def _trust_lines(used: Usable) -> list[str]:
     """Say what speaks against the calibration, and what should be known about it."""
-    return [f'of the calibration: {line}' for line in objections(calibration) or caveats(calibration)]
+    return [f'of the calibration: {line}' for line in used.lines or objections(used.calibration) or caveats(used.calibration)]
 
 
 def _walk_lines(noise: Noise) -> list[str]:

@@ -33,8 +33,8 @@ class Reduced(Protocol):
         """The `estimation.accumulator.Accumulator` of its windows."""
 
     @property
-    def kept(self) -> list:
-        """Some windows with their samples."""
+    def moving(self) -> list:
+        """Moving windows with their samples, as far as they are kept."""
 
 
 def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = None) -> tuple[CheckFinding, ...]:
@@ -55,8 +55,8 @@ def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = 
     for sensor in ('gyroscope', 'accelerometer'):
         moments = _moments(gathered.accumulator, model, sensor)
         if moments is not None:
-            found += _rates(moments, gathered.kept, table) if sensor == 'gyroscope' else []
-            found += _axes(sensor, moments, table, gathered.kept)
+            found += _rates(moments, gathered.moving, table) if sensor == 'gyroscope' else []
+            found += _axes(sensor, moments, table, gathered.moving)
     return tuple(found)
 
 

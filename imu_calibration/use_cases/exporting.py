@@ -19,7 +19,7 @@ from imu_calibration.use_cases.stand import Stand, table_of
 
 def export_calibration(calibration: str | PathLike | Calibration, to: str, *, output: str | PathLike | None = None,
                        noise: str | PathLike | None = None, rate: float | None = None, bag: str | PathLike | None = None,
-                       stand: Stand | None = None, topics: Topics = Topics()) -> Export:
+                       stand: Stand | None = None, topics: Topics = Topics(), anyway: bool = False) -> Export:
     """
     Write a calibration as another program wants it.
 
@@ -40,18 +40,21 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
         What says how the recording truly moved; default its compensated readings.
     topics : Topics
         Of the bag.
+    anyway : bool
+        Also the numbers of a sensor whose verdict is bad or whose proof failed; without it they are those of a data sheet, where the other
+        sensor is shown to be helped.
 
     Raises
     ------
     ImuCalibrationError
-        When a file cannot be read or written, or the target needs what is not there.
+        When a file cannot be read or written, nobody should be corrected with the calibration, or the target needs what is not there.
 
     """
     target = find_target(to)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
     figures = None if noise is None else files.read_noise(noise)
     motion = None if bag is None else _motion(known, bag, stand, topics)
-    found = export(known, target, noise=figures, rate=rate, motion=motion)
+    found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:
         files.write_whole(output, found.content)
     return found
