@@ -54,6 +54,7 @@ From the ground up; each package imports only what stands above it. The words ar
 `compensation`    the model inverted: corrected samples with their covariance
 `allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
 `selection`       which effects the evidence of a recording asks for, proven on windows that are held out
+`beyond`          what no effect of the catalogue explains: how much, where, and the formula that it follows
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
 `planning`        which motion next: the gain of motions per second, and the least time that any plan takes

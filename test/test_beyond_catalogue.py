@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from imu_calibration import files
+from imu_calibration.beyond import proposals
+from imu_calibration.beyond.blocks import rest_blocks
+from imu_calibration.beyond.fitting import BlockFits, share_interval, share_removed
+from imu_calibration.beyond.grammar import grammar
+from imu_calibration.beyond.proposals import propose
+from imu_calibration.beyond.regimes import find_regimes
 from imu_calibration.cli.main import main
-from imu_calibration.diagnosis.beyond import proposals
-from imu_calibration.diagnosis.beyond.blocks import rest_blocks
-from imu_calibration.diagnosis.beyond.fitting import BlockFits, share_interval, share_removed
-from imu_calibration.diagnosis.beyond.grammar import grammar
-from imu_calibration.diagnosis.beyond.proposals import propose
-from imu_calibration.diagnosis.beyond.regimes import find_regimes
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.diagnosis.workflow import diagnosis_lines
 from imu_calibration.effects.column_group import ColumnGroup

@@ -24,7 +24,8 @@ from imu_calibration.selection.rivals import Rival, same_questions, settle_rival
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair
-from worlds.physics import TABLES
+from worlds.physics import TABLES, make_session
+from worlds.physics_beyond import Beyond
 
 TABLE = Table.from_mapping(TABLES['three_axis'])
 NAMES = tuple(TABLE.joint_names)
@@ -187,3 +188,13 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     assert 'time_offset' in faint.statistics['denied'] and 'added' not in faint.statistics and OFFSET not in faint.param_names
     place, was = (calibration.param_names.index('gyroscope.matrix.xx') for calibration in (faint, asked.calibration))
     assert faint.sd[place] > 5 * asked.calibration.sd[was]
+
+
+def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
+    """Three quarters of a response to the cube of a force look like one to the force: with a formula for the cube that name is in no model."""
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)   # another guard, which sees to it here too
+    session = make_session(141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141))
+    found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
+    assert not {'added', 'denied'} & set(found.statistics)
+    bias = [found.param_names.index(f'gyroscope.bias.{axis}') for axis in 'xyz']
+    assert np.all(np.abs(found.values[bias] - session.truth['gyroscope'].bias) < 4 * found.sd[bias])

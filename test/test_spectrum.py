@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis.beyond.spectrum import find_tones, of_stretches
+from imu_calibration.beyond.spectrum import find_tones, of_stretches
 from imu_calibration.report.spectrum_figure import draw_tones
 from imu_calibration.selection.investigation import investigate
 

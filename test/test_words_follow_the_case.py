@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.beyond.unexplained import where_most
 from imu_calibration.calibration.comparison import compare
 from imu_calibration.calibration.from_solution import motions_needed
-from imu_calibration.diagnosis.unexplained import where_most
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT
 from imu_calibration.reference.table import Table

@@ -2,8 +2,9 @@
 One mind for `calibrate` and `diagnose`: what a recording demands is in the model.
 
 The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
-names joins the model; what parts of the recording deny, or what is no more than chance once the standard deviations allow for all that the
-model misses, does not, and widens the standard deviations instead, as does what would do nearly as well as a choice.
+names joins the model; what a formula beyond the catalogue does without, what parts of the recording deny, or what is no more than chance
+once the standard deviations allow for all that the model misses, does not, and widens the standard deviations instead, as does what would
+do nearly as well as a choice.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from functools import partial
 import numpy as np
 from scipy.stats import chi2
 
+from imu_calibration.beyond.inquiry import inquire
 from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import Demand, ModelChanges
@@ -27,7 +29,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.extended_model import extended_solution
-from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation, investigate
+from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE
 
@@ -109,7 +111,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     if not parts:
         return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
-    found, *others = (investigate(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
+    found, *others = (inquire(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):
@@ -148,8 +150,8 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*solved, known)
-    found = investigate(parts[0], table, baseline_model(options, table, solution.model), progress=asking,
-                        bias_processes=options.bias_processes)
+    found = inquire(parts[0], table, baseline_model(options, table, solution.model), progress=asking,
+                    bias_processes=options.bias_processes)
     found = _without_faint(found, solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # a search that met a limit is the solution itself
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))

@@ -1,17 +1,17 @@
 """From windows to findings: the one function that asks every effect, and puts into words what was found."""
 
-from dataclasses import replace
 from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.diagnosis.beyond.look import look_beyond, superseded
+from imu_calibration.beyond.inquiry import inquire
+from imu_calibration.beyond.look import look_beyond
+from imu_calibration.beyond.unexplained import unexplained
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import candidates_of, sentence
 from imu_calibration.diagnosis.separating_motion import separating_motion
 from imu_calibration.diagnosis.traces import residual_traces
-from imu_calibration.diagnosis.unexplained import unexplained
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -20,7 +20,7 @@ from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
-from imu_calibration.selection.investigation import Investigation, investigate
+from imu_calibration.selection.investigation import Investigation
 
 MATE = 0.5
 """What would do as well as a finding takes at least this share of what the finding takes off the residual of the sensor that shows it."""
@@ -60,7 +60,7 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, pro
         When there are too few windows to hold any out.
 
     """
-    result = told(windows, table, investigate(windows, table, model, progress=progress, bias_processes=bias_processes))
+    result = told(windows, table, inquire(windows, table, model, progress=progress, bias_processes=bias_processes))
     if progress:
         progress(1.0)
     return result
@@ -79,10 +79,6 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     """
     attempt, named, limits = found.attempt, found.named, found.limits
     rests = look_beyond(found, table, unexplained(attempt, found.explained, named))
-    gone = superseded(found, table, rests)
-    if gone:
-        others = replace(found, named=[question for question in named if question not in gone], doubtful=[*found.doubtful, *gone])
-        return told(windows, table, others, calibrated=calibrated)
     baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
     solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline

@@ -1,7 +1,7 @@
 """Residuals before and after as a person looks at them: averaged over short blocks, and dead reckoning with both models."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,9 +10,8 @@ from imu_calibration.effects.columns import INPUT_OF, warped_reference
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.navigation import drift_over
-from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window import Window, all_samples
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""
@@ -81,20 +80,6 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
                   mean(motion.position[rows]), mean(first['accelerometer'].force_s[rows]), mean(first['gyroscope'].rate_s[rows]),
                   None if temperature is None else mean(temperature[rows]), {s: mean(errors[0][s]) for s in SENSORS},
                   {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
-
-
-def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
-    """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
-    lengths = [len(w.motion) for w in windows]
-    starts = np.cumsum([0] + lengths)
-    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
-                           for w, s, n in zip(windows, starts, lengths)])
-    known = [(w.temperature_c, n) for w, n in zip(windows, lengths) if w.temperature_c is not None]
-    if len(known) < len(windows):
-        return motion, None, rows
-    parts = [warm if n == len(warm) else np.full(n, warm.mean()) for warm, n in known]
-    return motion, np.concatenate(parts), rows
 
 
 def _blocks(windows):

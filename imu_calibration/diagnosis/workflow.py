@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.beyond.unexplained import Unexplained
 from imu_calibration.by_hand.inquiry import too_few_poses
 from imu_calibration.by_hand.workflow import evident_result, read_by_hand
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
@@ -17,7 +18,6 @@ from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import LEAVES_MOST
-from imu_calibration.diagnosis.unexplained import Unexplained
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight

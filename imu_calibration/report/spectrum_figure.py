@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.diagnosis.beyond.spectrum import CLEAR
-from imu_calibration.diagnosis.unexplained import Unexplained
+from imu_calibration.beyond.spectrum import CLEAR
+from imu_calibration.beyond.unexplained import Unexplained
 from imu_calibration.report.figures import AFTER, GREY, INK, draw
 
 

@@ -1,6 +1,7 @@
 """What a window is, and how samples become one."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from enum import StrEnum
 
 import numpy as np
@@ -111,6 +112,20 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
     motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
                   samples.joint_step.max(axis=0))
+
+
+def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
+    """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
+    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
+    lengths = [len(w.motion) for w in windows]
+    starts = np.cumsum([0] + lengths)
+    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
+                           for w, s, n in zip(windows, starts, lengths)])
+    known = [(w.temperature_c, n) for w, n in zip(windows, lengths) if w.temperature_c is not None]
+    if len(known) < len(windows):
+        return motion, None, rows
+    parts = [warm if n == len(warm) else np.full(n, warm.mean()) for warm, n in known]
+    return motion, np.concatenate(parts), rows
 
 
 def _mean_motion(samples):

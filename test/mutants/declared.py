@@ -92,15 +92,15 @@ SEARCH = _of(
     ('coarse outputs pass for clipped ones', 'saturation.py', 'return bool(at > 3 * repeats[-5:].max(initial=1))', 'return True', 'test_saturation.py'),
     ('clipped samples stay', 'saturation.py', 'good &= ~(near | at).any(axis=1)', 'good &= ~(near & ~near | at & ~at).any(axis=1)', 'test_saturation.py'),
 )
-DIAGNOSIS = _of(
-    'imu_calibration/diagnosis',
+BEYOND = _of(
+    'imu_calibration/beyond',
     ('threshold of what is unexplained', 'unexplained.py', 'SIGNIFICANT = 5.0', 'SIGNIFICANT = 50.0', 'test_search.py'),
     ('any correlation is told', 'unexplained.py', 'if p_value < ALPHA and share > max(best[1], 0.15):', 'if share > best[1]:', 'test_search.py'),
-    ('a line of few stretches is a tone', 'beyond/spectrum.py', 'np.where(hits > MOSTLY * count[:, None], binom',
+    ('a line of few stretches is a tone', 'spectrum.py', 'np.where(hits > MOSTLY * count[:, None], binom',
      'np.where(hits > 0, 0 * binom', 'test_spectrum.py'),
-    ('a finding that a formula does without stays', 'beyond/look.py', 'if beside < NOT_NEEDED * alone:', 'if False:',
+    ('a finding that a formula does without stays', 'inquiry.py', 'if beside < NOT_NEEDED * alone:', 'if False:',
      'test_beyond_catalogue.py'),
-    ('a finding goes for any formula', 'beyond/look.py', 'if beside < NOT_NEEDED * alone:', 'if True:',
+    ('a finding goes for any formula', 'inquiry.py', 'if beside < NOT_NEEDED * alone:', 'if True:',
      'test_beyond_catalogue.py'),
 )
 HAND = _of(
@@ -187,4 +187,4 @@ BY_SENSOR = _of(
     ('who corrects takes the refused sensor too', 'nodes/adoption.py', 'if settings.anyway else trust.usable(calibration)', 'if True else trust.usable(calibration)',
      'test_adoption.py'),
 )
-MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *DIAGNOSIS, *HAND, *TRUST, *FILES, *SIGNS, *LIVE, *BY_SENSOR)
+MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *BEYOND, *HAND, *TRUST, *FILES, *SIGNS, *LIVE, *BY_SENSOR)

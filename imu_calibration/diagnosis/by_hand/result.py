@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.beyond.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.diagnosis.traces import Traces
-from imu_calibration.diagnosis.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.questions import Question
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.linalg import svd
 from scipy.stats import chi2
 
-from imu_calibration.diagnosis.beyond.blocks import RestBlocks
-from imu_calibration.diagnosis.beyond.grammar import Formula
+from imu_calibration.beyond.blocks import RestBlocks
+from imu_calibration.beyond.grammar import Formula
 from imu_calibration.effects.expressions import array_function, read
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.selection.search import FAMILY_WISE, TIE

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from imu_calibration.diagnosis.traces import all_samples
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import predict
@@ -14,7 +13,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window import Window, all_samples
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.noise_beside_effects import natural_processes

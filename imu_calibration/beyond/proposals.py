@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.diagnosis.beyond.blocks import RestBlocks
-from imu_calibration.diagnosis.beyond.fitting import BlockFit, BlockFits, share_interval, share_removed
-from imu_calibration.diagnosis.beyond.formulas import FormulaChoice, FormulaSearch
-from imu_calibration.diagnosis.beyond.grammar import Formula, grammar
+from imu_calibration.beyond.blocks import RestBlocks
+from imu_calibration.beyond.fitting import BlockFit, BlockFits, share_interval, share_removed
+from imu_calibration.beyond.formulas import FormulaChoice, FormulaSearch
+from imu_calibration.beyond.grammar import Formula, grammar
 from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
 from imu_calibration.effects.term import term
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.signal import detrend
 from scipy.stats import binom
 
+from imu_calibration.beyond.blocks import residuals
 from imu_calibration.constants import DEG
-from imu_calibration.diagnosis.beyond.blocks import residuals
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from imu_calibration.beyond.blocks import RestBlocks
 from imu_calibration.constants import DEG
-from imu_calibration.diagnosis.beyond.blocks import RestBlocks
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.diagnosis.beyond.blocks import RestBlocks
+from imu_calibration.beyond.blocks import RestBlocks
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.scaled_solve import solve_normal
 
