@@ -8,7 +8,7 @@ import pytest
 from imu_calibration.diagnosis import diagnose as on_a_table
 from imu_calibration.diagnosis.by_hand import diagnose as by_hand
 from imu_calibration.diagnosis.findings import finding
-from imu_calibration.diagnosis.sentences import candidates_of
+from imu_calibration.diagnosis.sentences import candidates_of, sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -124,3 +124,9 @@ def test_rounding_replaces_nothing_and_neither_does_what_makes_another_lag_negat
     delay, gyroscope, accelerometer = asked = [Question(effect, (k,), 1, effect.name) for k, effect in enumerate(effects)]
     found = forward.Search(LagsAndDelay(better), (), asked).reconsidered([delay, gyroscope])
     assert found == [delay, gyroscope]
+
+
+@pytest.mark.parametrize('after, words', [(1.0, 'falls by 50 %'), (1.9998, 'falls by 0.01 %')])
+def test_a_small_gain_is_not_told_as_none(after, words):
+    gain = Gain('accelerometer', 'samples', 2.0, after, (0.0, 0.6), 5)
+    assert sentence(FIRST.effect, {'accelerometer.accel_quadratic.x': (1e-5, 1e-6, '(m/s^2)^-1')}, gain).endswith(f'{words}.')

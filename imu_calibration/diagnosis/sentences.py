@@ -47,8 +47,12 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
     which = '' if len(values) == 1 else f' (largest: {label})'
     text = f'{effect.explanation} Its size is {size}{which}.'
     if gain is not None and gain.reduction > 0:
-        text += f' With it the {gain.sensor} residual of held-out {gain.measure} falls by {100 * gain.reduction:.0f} %.'
+        text += f' With it the {gain.sensor} residual of held-out {gain.measure} falls by {_percent(gain.reduction)}.'
     return text
+
+
+def _percent(share):
+    return f'{100 * share:.0f} %' if share >= 0.01 else f'{100 * share:.1g} %'
 
 
 def _size(value, sd, unit):
