@@ -12,6 +12,7 @@ from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.cli.main import main
+from imu_calibration.effects.columns import columns
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
@@ -21,11 +22,11 @@ from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import DONE, make_planner
 from imu_calibration.planning.separation import make_separator
-from imu_calibration.planning.windows import WindowPredictor
+from imu_calibration.planning.windows import SAMPLING, WindowPredictor
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.samples import SampleBlock
-from imu_calibration.simulation.motion_builder import Profile
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
@@ -221,3 +222,28 @@ def tight(folder):
     """Return a file with the tolerances TIGHT."""
     (folder / 'tight.yaml').write_text(yaml.safe_dump(TIGHT))
     return folder / 'tight.yaml'
+
+
+def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
+    """Against the dense covariance of the samples: what varies within, the mean, and how certain that is."""
+    model = choose_model(CalibrationOptions(), table)
+    noise = noise_of_grade(GRADES['navigation'].noise, 100.0)
+    coordinates = Coordinates(model, tolerances_of(model))
+    builder = MotionBuilder(3)
+    builder.move_to([1.0, -0.5, 2.0])
+    segments = tuple(builder.segments)
+    found, still = (WindowPredictor(table, coordinates, of, rate=100.0).predict([segments])[0][0]
+                    for of in (noise, {s: replace(own, bias_processes=()) for s, own in noise.items()}))
+    count = int(np.ceil(found.length * SAMPLING))
+    offsets = ((np.arange(count) + 0.5) / count - 0.5) * found.length
+    own, process = noise['accelerometer'], noise['accelerometer'].bias_processes[0]
+    wander = [[process.sd**2 * (np.exp(-abs(a - b) / process.time) - np.exp(-(abs(a) + abs(b)) / process.time)) for b in offsets] for a in offsets]
+    inverse = np.linalg.inv(np.diag(np.full(count, own.low_variance[0] * count / found.samples)) + wander)
+    motion = Profile('', segments).at(offsets + found.length / 2)
+    design = columns(model, 'accelerometer', table, motion=motion)
+    slope = coordinates.slopes['accelerometer']
+    total = sum(slope[:, axis].T @ design.T @ inverse @ design @ slope[:, axis] for axis in range(3))
+    mean = found.means['accelerometer']
+    np.testing.assert_allclose(found.variance['accelerometer'], 1 / inverse.sum(), rtol=1e-9)
+    np.testing.assert_allclose(found.within['accelerometer'] + mean.T @ mean * inverse.sum(), total, rtol=1e-7, atol=1e-9 * total.max())
+    assert np.trace(found.within['accelerometer']) < 0.9 * np.trace(still.within['accelerometer'])

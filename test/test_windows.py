@@ -1,5 +1,7 @@
 """Windows found in simulated sessions, whatever the rates, the faults and the way the streams arrive."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,8 @@ from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.segmentation.spike_filter import REACH
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
+from imu_calibration.segmentation.wander_limit import SHORTEST, WanderLimit
+from imu_calibration.segmentation.window import Window, WindowKind
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -44,7 +48,7 @@ def rest(duration, angles=(0, 0, 0)):
     return Profile('rest', tuple(builder.segments[-1:]))
 
 
-def record(profile, imu_hz=200, joint_hz=100, joint_noise=1e-5, step=0.0, seed=0, phase=0.0013):
+def record(profile, imu_hz=200, joint_hz=100, joint_noise=1e-5, step=0.0, seed=0, phase=0.0013, force_noise=5e-3):
     rng = np.random.default_rng(seed)
     imu_ns = np.round(np.arange(0, profile.duration, 1 / imu_hz) * 1e9).astype(np.int64)
     joint_ns = np.round((phase + np.arange(0, profile.duration - phase, 1 / joint_hz)) * 1e9).astype(np.int64)
@@ -52,7 +56,7 @@ def record(profile, imu_hz=200, joint_hz=100, joint_noise=1e-5, step=0.0, seed=0
     position = profile.at(joint_ns / 1e9).position
     position = position + joint_noise * rng.standard_normal(position.shape)
     position = np.round(position / step) * step if step else position
-    imu = ImuSamples(START + imu_ns, reference.force_s + 5e-3 * rng.standard_normal((len(imu_ns), 3)),
+    imu = ImuSamples(START + imu_ns, reference.force_s + force_noise * rng.standard_normal((len(imu_ns), 3)),
                      reference.rate_s + 5e-4 * rng.standard_normal((len(imu_ns), 3)), 'imu_link')
     return imu, JointSamples(START + joint_ns, position, np.full(position.shape, np.nan), NAMES)
 
@@ -475,3 +479,29 @@ def test_stream_statistics_are_at_hand():
     statistics = gatherer.cleaner.statistics()
     assert statistics['imu'].rate == pytest.approx(200) and statistics['joints'].rate == pytest.approx(100)
     assert statistics['temperature'].count == 0
+
+
+def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
+    """A bias that wanders by 10 ug shows within 20 s beside 1 ug/sqrt(Hz), and not beside 120."""
+    rng, time = np.random.default_rng(4), np.arange(1000) * 0.01
+    limits = {}
+    for density in (1e-5, 1e-4, 1.2e-3):
+        limit = WanderLimit()
+        assert limit.longest(20.0) == 20.0
+        force_s = rng.normal(0.0, 10.0 * density, (1000, 3))
+        window = Window(WindowKind.STATIC, (time * 1e9).astype(np.int64), time, force_s, force_s, None)
+        limit.take(replace(window, kind=WindowKind.DYNAMIC))
+        assert limit.longest(20.0) == 20.0
+        limit.take(window)
+        limits[density] = limit.longest(20.0)
+    assert limits[1e-5] == SHORTEST and limits[1e-4] == pytest.approx(7.1, rel=0.4) and limits[1.2e-3] == 20.0
+
+
+def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():
+    builder = MotionBuilder(3)
+    builder.rest(8.0)
+    builder.oscillate([[40.0], [30.0], [20.0]], [[0.3], [0.4], [0.5]], 12.0)
+    builder.rest(8.0)
+    found = [gather(*record(Profile('', tuple(builder.segments)), force_noise=noise))[0] for noise in (1e-4, 5e-3)]
+    longest = [max(window.time[-1] - window.time[0] for window in of_kind(windows, kind)) for windows in found for kind in ('dynamic', 'static')]
+    assert longest[0] <= SHORTEST + 0.01 and longest[2] > 10.0 and min(longest[1], longest[3]) > 7.0

@@ -88,6 +88,12 @@ class NoiseModel:
         factors = {kind: moving.means for kind, moving in self.moving.items()}
         return self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
 
+    def wander_within(self, offsets: np.ndarray) -> np.ndarray:
+        """Return the covariance of the bias at instants about the middle of a window, s, beside its value there, shape (n, n)."""
+        away, apart = np.abs(offsets), np.abs(np.subtract.outer(offsets, offsets))
+        return sum((process.sd**2 * (np.exp(-apart / process.time) - np.exp(-np.add.outer(away, away) / process.time))
+                    for process in self.bias_processes), np.zeros(apart.shape))
+
     def row_variance(self, kind: str) -> np.ndarray:
         """Return the variance per centred row of windows of `kind`, shape (3,)."""
         return self.low_variance * self.moving[kind].every if kind in self.moving else self.low_variance

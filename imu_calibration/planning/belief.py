@@ -57,7 +57,7 @@ class Belief:
                 for number in range(3 * len(noise.bias_processes)):
                     rows[number % 3, first + number] = 1.0
                 first += 3 * len(noise.bias_processes)
-                variance = noise.low_variance / window.samples + noise.offset_sd**2
+                variance = window.variance[sensor] + noise.offset_sd**2
                 total += rows.T @ (rows / variance[:, None])
         return total
 
@@ -107,10 +107,9 @@ def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise
 
     """
     total = np.sum([window.within[sensor] for window in windows for sensor in SENSORS], axis=0)
-    samples = np.array([window.samples for window in windows])
     for sensor in SENSORS:
         model = noise[sensor]
-        variance = model.low_variance / samples[:, None] + model.offset_sd**2
+        variance = np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
         whitening = Whitening(variance, times, [np.arange(len(times))], processes=model.bias_processes)
         rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(-1, len(total))
         total = total + rows.T @ rows
@@ -132,7 +131,7 @@ def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share
     for sensor in SENSORS:
         model = noise[sensor]
         floor = share * sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
-        variance = model.low_variance / window.samples + model.offset_sd**2 + floor
+        variance = window.variance[sensor] + model.offset_sd**2 + floor
         rows = window.means[sensor]
         total += window.within[sensor] + rows.T @ (rows / variance[:, None])
     return total

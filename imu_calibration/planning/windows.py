@@ -18,6 +18,8 @@ from imu_calibration.simulation.motion_builder import Profile, Segment
 
 SAMPLING = 16.0
 """Instants per second at which columns are taken: a turn at 300 deg/s has 19."""
+LEAST_INSTANTS = 4
+"""Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
 """Segment -> window; everything else is dynamic."""
 
@@ -34,6 +36,8 @@ class PlannedWindow:
     """Number of samples in it."""
     means: dict[str, np.ndarray]
     """Sensor -> rows of the means, shape (3, n)."""
+    variance: dict[str, np.ndarray]
+    """Sensor -> variance of the means beside the bias in the middle of the window, shape (3,)."""
     within: dict[str, np.ndarray]
     """Sensor -> information of what varies within, for the noise of that sensor, shape (n, n)."""
 
@@ -83,24 +87,27 @@ class WindowPredictor:
             lost = 0.0 if kind == 'dynamic' else self.settings.settling
             seconds = segment.duration - lost
             if seconds >= getattr(self.settings, f'{kind}_minimum'):
-                count = 1 if kind == 'static' else max(int(np.ceil(seconds * SAMPLING)), 4)
+                count = LEAST_INSTANTS if kind == 'static' else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
                 time = lost + (np.arange(count) + 0.5) / count * seconds
                 yield Profile('', (segment,)).at(time), begin + lost + seconds / 2, segment.duration, seconds
             begin += segment.duration
 
     def _window(self, cut, designs):
         motion, middle, length, seconds = cut
-        samples = seconds * self.rate
-        means, within = {}, {}
+        samples, count = seconds * self.rate, len(motion)
+        offsets = ((np.arange(count) + 0.5) / count - 0.5) * seconds
+        means, variance, within = {}, {}, {}
         for sensor, design in designs.items():
-            slope = self.coordinates.slopes[sensor]
-            mean = design.mean(axis=0)
-            means[sensor] = np.einsum('c,cap->ap', mean, slope)
-            total = np.zeros((slope.shape[2],) * 2)
-            if len(design) > 1:
-                centred = design - mean
-                gram = centred.T @ centred * (samples / len(design))
-                for axis in range(3):
-                    total += slope[:, axis].T @ gram @ slope[:, axis] / self.noise[sensor].low_variance[axis]
-            within[sensor] = total
-        return PlannedWindow(middle, length, samples, means, within)
+            slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
+            means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
+            within[sensor] = np.zeros((slope.shape[2],) * 2)
+            wander, turned = np.linalg.eigh(noise.wander_within(offsets))
+            rows, ones = turned.T @ design, turned.sum(axis=0)
+            for axis in range(3):
+                weight = 1 / (noise.low_variance[axis] * count / samples + wander)
+                variance[sensor][axis] = 1 / (weight @ ones**2)
+                mean = variance[sensor][axis] * ((weight * ones) @ rows)
+                centred = (rows - np.outer(ones, mean)) @ slope[:, axis]
+                means[sensor][axis] = mean @ slope[:, axis]
+                within[sensor] += centred.T @ (centred * weight[:, None])
+        return PlannedWindow(middle, length, samples, means, variance, within)

@@ -4,6 +4,7 @@
 import numpy as np
 
 from imu_calibration.segmentation.joint_phases import MOVING, STEADY, STILL
+from imu_calibration.segmentation.wander_limit import WanderLimit
 from imu_calibration.segmentation.window import PhasedSamples, UnusedReason, Window, WindowKind, make_window
 from imu_calibration.segmentation.window_settings import WindowSettings
 
@@ -28,6 +29,7 @@ class WindowCutter:
         self._phase_before = None
         self._disturbed = self._ramped = -np.inf
         self._open = None
+        self._wander = WanderLimit()
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:
         """Decide by other settings from now on."""
@@ -146,7 +148,8 @@ class WindowCutter:
 
     def _longest(self, kind):
         # halves of a window that is a little too long must still be long enough
-        return max(self._settings.window_maximum, 2 * self._least(kind))
+        most = self._settings.window_maximum
+        return max(self._wander.longest(most) if kind == DYNAMIC else most, 2 * self._least(kind))
 
     def _finished(self, samples, kind, reason):
         n = len(samples)
@@ -155,7 +158,11 @@ class WindowCutter:
             kind, reason = UNUSED, _TOO_SHORT
         key = _REASONS[reason] if kind == UNUSED else _KINDS[kind]
         self.counts[key] = self.counts.get(key, 0) + n
-        return [make_window(samples, _KINDS[kind], _REASONS[reason])] if kind != UNUSED or self._keep_unused else []
+        if kind == UNUSED and not self._keep_unused:
+            return []
+        window = make_window(samples, _KINDS[kind], _REASONS[reason])
+        self._wander.take(window)
+        return [window]
 
 
 def _runs(value, broken):

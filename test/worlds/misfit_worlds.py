@@ -9,7 +9,7 @@ gives way, the filter runs, the driver stamps.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import cont2discrete, lfilter
 
 from imu_calibration.reference.joint_motion import JointMotion
@@ -172,7 +172,8 @@ class RateDependentLag(Cause):
     def delivered(self, time, outputs, rate_s):
         """Read the outputs at a time that lies back by the lag."""
         lag = self.size * (self.AT_REST + self.PER_RATE * np.linalg.norm(rate_s, axis=1))
-        return [np.stack([np.interp(time - lag, time, column) for column in out.T], axis=1) for out in outputs]
+        # straight lines between the samples would take 7e-4 off a ripple of 6 Hz
+        return [CubicSpline(time, out)(np.maximum(time - lag, time[0])) for out in outputs]
 
 
 class DriverLag(RateDependentLag):
