@@ -67,6 +67,8 @@ class TemperatureSamples(_Columns):
     """Header stamps, int64, shape (n,)."""
     temperature_c: np.ndarray
     """Temperature, degrees Celsius, shape (n,)."""
+    branch: np.ndarray | None = None
+    """Which way it came (`reference.thermal_branch`), in [-1, 1], shape (n,); None where nobody asked."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """The catalogue's forward equations reproduce what the physics made: one convention for signs, units and order of every parameter."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -10,16 +11,19 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
+from imu_calibration.reference.thermal_branch import ThermalBranch
 
+from worlds.hiding import options_of
 from worlds.physics import encoder_reading, make_session
 from worlds.physics_draw import EFFECTS
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 LEFT = {'load_compliance': 3e-3, 'axis_wobble': 3e-3, 'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02,
-        'accel_cross_axis_lag': 0.03, 'gyro_cross_axis_lag': 0.03, 'time_offset': 2e-3}
+        'accel_cross_axis_lag': 0.03, 'gyro_cross_axis_lag': 0.03, 'time_offset': 2e-3,
+        'accel_thermal_hysteresis': 0.1, 'gyro_thermal_hysteresis': 0.1}
 """
 Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; the mount's turn to first order; the world's differences
-in time; what a neighbour feels along its own crooked axis; else 1 ns stamps.
+in time; what a neighbour feels along its own crooked axis; the branches of a thermal hysteresis are one play, not grains of unlike friction; else 1 ns stamps.
 """
 
 
@@ -55,12 +59,19 @@ def predicted(session, name=None):
     for key, value in parts.items():
         values[model.slices[key]] = np.ravel(value)
     table = Table.from_mapping(session.table | {'gravity': session.truth['gravity']})
-    return predict(model, values, table, motion=told_motion(session), temperature_c=session.truth['temperature_c'])
+    motion = replace(told_motion(session), thermal_branch=branch_of(session))
+    return predict(model, values, table, motion=motion, temperature_c=session.truth['temperature_c'])
+
+
+def branch_of(session):
+    """Return which way the temperature came to the IMU's stamps, as the thermometer shows it."""
+    published, start_ns = session.temperature, session.truth['start_ns']
+    return np.interp(session.imu.stamp_ns - start_ns, published.stamp_ns - start_ns, ThermalBranch().of(published.temperature_c))
 
 
 @pytest.mark.parametrize('name', EFFECTS)
 def test_forward_equation_reproduces_the_physics(name):
-    session = make_session(11, {name: None}, 'none', **OPTIONS)
+    session = make_session(11, {name: None}, 'none', **OPTIONS, **options_of(name))
     without, with_effect = predicted(session), predicted(session, name)
     measured = session.imu.force_s, session.imu.rate_s
     acts = 0

@@ -1,7 +1,7 @@
 """The rest of one sensor in short blocks, beside the columns of everything that was asked: what regimes and formulas are judged on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -97,8 +97,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     which = _some(windows, length)
     windows = [windows[k] for k in which]
     parts = [_cut(window, length) for window in windows]
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, f.name)[part.rows] for w, part in zip(windows, parts)])
-                           for f in fields(JointMotion)))
+    motion = JointMotion.joined([w.motion.select(part.rows) for w, part in zip(windows, parts)])
     warm = all(w.temperature_c is not None for w in windows)
     temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
     per_block = np.concatenate([part.per_block for part in parts])

@@ -104,7 +104,7 @@ class Uncertainty:
 
     def at(self, force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
            rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
-           derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0), *, dt: float = 0.0,
+           derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0), *, dt: float = 0.0, branch: float = 0.0,
            slope_error: SlopeError | None = None) -> Sensitivity:
         """
         Return the Sensitivity at a measured sample.
@@ -115,24 +115,26 @@ class Uncertainty:
             Measured specific force, rate, and derivative of the rate.
         dt : float
             Temperature above the calibration's reference temperature, K.
+        branch : float
+            Which way it came (`reference.thermal_branch`).
         slope_error : rate_slope.SlopeError, optional
             How far the derivative is off; None: only by the noise.
 
         """
         sample = np.concatenate([force, rate, derivative])
-        gain = np.stack([self._slope(sample, step, dt) for step in np.diag(STEPS)], axis=1)
-        true = self._inside(*sample.tolist(), dt)
-        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], dt)
+        gain = np.stack([self._slope(sample, step, (dt, branch)) for step in np.diag(STEPS)], axis=1)
+        true = self._inside(*sample.tolist(), dt, branch)
+        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], (dt, branch))
         jacobian = gain[:, :6] @ jacobian
         return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier, slope_error or SlopeError())
 
-    def _slope(self, sample, step, dt):
-        above, below = self._kernel(*(sample + step).tolist(), dt), self._kernel(*(sample - step).tolist(), dt)
+    def _slope(self, sample, step, warmth):
+        above, below = self._kernel(*(sample + step).tolist(), *warmth), self._kernel(*(sample - step).tolist(), *warmth)
         return (np.array(above) - below) / (2 * step.sum())
 
-    def _parameter_slopes(self, true, alpha, dt):
+    def _parameter_slopes(self, true, alpha, warmth):
         """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
-        temperature = np.full(1, self._model.temperature_ref_c + dt)
-        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature)
+        temperature = np.full(1, self._model.temperature_ref_c + warmth[0])
+        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature, np.full(1, warmth[1]))
         rows = [columns_at_point(self._model, sensor, ref)[0] for sensor in SENSORS]
         return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])

@@ -12,6 +12,7 @@ from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.reference.thermal_branch import ThermalBranch
 
 
 class SampleCompensation:
@@ -33,13 +34,14 @@ class SampleCompensation:
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
         self.needs_temperature = invertible(calibration.model).needs_temperature
         self.dt = None if self.needs_temperature else 0.0
+        self.branch = ThermalBranch()
         self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
         self._follows = self.needs_slope or calibration.knows_density   # the stamps say how large the noise of a sample is
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer), self._take_derivative)
         self._kernel = make_kernel(calibration, transfer)
-        self.last = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0)
+        self.last = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0, 0.0)
         self.revision = 0
         """Counts how often the covariances were taken anew."""
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -47,7 +49,10 @@ class SampleCompensation:
 
     def set_temperature(self, temperature_c: float) -> None:
         """Tell the temperature near the sensor, degrees Celsius."""
-        if self.needs_temperature and temperature_c - temperature_c == 0.0:
+        if temperature_c - temperature_c != 0.0:
+            return
+        self.branch.push(temperature_c)
+        if self.needs_temperature:
             self.dt = temperature_c - self.calibration.model.temperature_ref_c
 
     def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...] | None:
@@ -57,12 +62,12 @@ class SampleCompensation:
             self.refuse('no temperature yet' if dt is None else 'not finite')
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
-        ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt)
+        ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
             self.refuse('beyond what can be undone')
             return None
-        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt)
+        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now)
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         self.corrected += 1
@@ -84,7 +89,7 @@ class SampleCompensation:
 
     def refresh(self) -> None:
         """Take the covariances of the corrected readings anew at the latest sample."""
-        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3],
+        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3], branch=self.last[4],
                                                  slope_error=self.slope.error() if self.needs_slope else None)
         self.revision += 1
 
@@ -98,7 +103,8 @@ class SampleCompensation:
         """Go on where another compensation stops: same past of the rate, same temperature, same counts."""
         self.counts, self.corrected, self.fastest_squared = before.counts, before.corrected, before.fastest_squared
         if before.dt is not None and before.needs_temperature and self.dt is None:
-            self.set_temperature(before.dt + before.calibration.model.temperature_ref_c)
+            self.dt = before.dt + before.calibration.model.temperature_ref_c - self.calibration.model.temperature_ref_c
+        self.branch = before.branch
         self.slope.follow(before.slope)
 
     def _take_derivative(self):

@@ -1,6 +1,7 @@
 """Compensation of a stream of blocks: the state that has to go from one block to the next, and what is noticed on the way."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
+from imu_calibration.reference.thermal_branch import ThermalBranch
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
 
@@ -38,6 +40,8 @@ class CompensationStream:
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
         if invertible(calibration.model).needs_temperature and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
+        if temperature is not None and invertible(calibration.model).uses('thermal branch'):
+            self.temperature = replace(temperature, branch=ThermalBranch().of(temperature.temperature_c))
         self.count, self.flagged, self.frame_id = 0, 0, ''
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -54,39 +58,42 @@ class CompensationStream:
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
             self.slope.settle(describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
-        temperature = self._temperature_at(imu.stamp_ns)
+        temperature, branch = self._warmth_at(imu.stamp_ns)
         finite = np.isfinite(imu.rate_s).all(axis=1)
         slope = np.zeros_like(imu.rate_s)
         slope[finite] = self.slope.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
         force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
                            for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
         corrected = compensate(self.calibration, force_s, rate_s, alpha_s=slope @ self._inverse_rate.T, temperature_c=temperature,
-                               transfer=self.transfer)
+                               thermal_branch=branch, transfer=self.transfer)
         corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
         corrected.rate[~finite] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
         if finite.any():
             self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
-        self._remember(imu, slope, temperature)
+        self._remember(imu, slope, temperature, branch)
         return corrected
 
-    def _remember(self, imu, slope, temperature):
+    def _remember(self, imu, slope, temperature, branch):
         usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
         if len(usable):
             k = usable[-1]
             dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
-            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k], 'dt': dt}
+            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k], 'dt': dt,
+                          'branch': 0.0 if branch is None else float(branch[k])}
 
-    def _temperature_at(self, stamp_ns):
+    def _warmth_at(self, stamp_ns):
+        """Return (temperatures, thermal branches) at stamps; None where there are none or nobody asks for them."""
         if self.temperature is None or not len(self.temperature):
-            return None
+            return None, None
         origin = self.temperature.stamp_ns[0]
-        values = np.interp((stamp_ns - origin) * 1e-9, (self.temperature.stamp_ns - origin) * 1e-9, self.temperature.temperature_c)
+        at, known = (stamp_ns - origin) * 1e-9, (self.temperature.stamp_ns - origin) * 1e-9
+        values = np.interp(at, known, self.temperature.temperature_c)
         if len(values):
             self._temperatures += [float(values.min()), float(values.max())]
             self._temperatures = [min(self._temperatures), max(self._temperatures)]
-        return values
+        return values, None if self.temperature.branch is None else np.interp(at, known, self.temperature.branch)
 
     def propagate(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """

@@ -26,6 +26,7 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MOST_JOINTS)},
     'time': {'time': ('time',)},
     'temperature': {'temperature_c': ('temperature_c',)},
+    'thermal branch': {'thermal_branch': ('thermal_branch',)},
     'reference temperature': {'temperature_ref_c': (None,)},
     'time constant': {'tau': (None,)},
 }
@@ -33,7 +34,8 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
 Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints
 from the base outwards.
 """
-KNOWN = 'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, temperature_ref_c, tau'
+KNOWN = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
+         'temperature_ref_c, tau')
 """The names for people."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}

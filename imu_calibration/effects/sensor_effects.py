@@ -78,6 +78,15 @@ def _pair(sensor):
             motion=('warm_up',), compensation='exact', needs=('temperature',),
             groups=(regressors.TEMPERATURE_SQUARED,), coefficients=Amplitudes(f'{short}_thermal_bias_2', 'temperature_squared')),
         Effect(
+            name=f'{short}_thermal_hysteresis', sensor=sensor, components=VECTOR, shape=(3,), unit=unit, against=('temperature',),
+            smooth=True,
+            explanation=f'The {sensor} bias depends on which way the temperature came: cooling it takes another branch than warming up, '
+            'by twice this.',
+            tolerance=small, tolerance_reason='as the bias', prior_sd=20 * small,
+            plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
+            motion=('warm_and_cool',), compensation='exact', needs=('temperature', 'cooling'),
+            groups=(regressors.BRANCH,), coefficients=Amplitudes(f'{short}_thermal_hysteresis', 'thermal_branch')),
+        Effect(
             name=f'{short}_thermal_scale', sensor=sensor, components=VECTOR, shape=(3,), unit='1/K', against=('temperature',),
             explanation=f'The {sensor} scale factor follows the temperature.',
             tolerance=1e-4, tolerance_reason='1e-3 over 10 K', prior_sd=0.01,

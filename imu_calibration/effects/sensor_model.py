@@ -120,6 +120,10 @@ class SensorModel:
         """Whether an effect depends on temperature."""
         return any('temperature' in effect.needs for effect in self.effects)
 
+    def uses(self, quantity: str) -> bool:
+        """Return whether a column is made of a quantity of `expressions.QUANTITIES`."""
+        return any(quantity in group.uses for effect in self.effects for group in effect.groups)
+
     @cached_property
     def requested(self) -> np.ndarray:
         """Whether somebody asks for each parameter; table, clock and the common arm are nuisances. Shape (n_params,)."""

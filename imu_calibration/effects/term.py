@@ -12,11 +12,12 @@ from imu_calibration.errors import InputError
 JOINTS = {'joint angle', 'joint rate'}
 """Quantities that only a table knows."""
 MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
-           ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('temperature', ('warm_up',)), ('time', ('warm_up',)),
+           ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
+           ('temperature', ('warm_up',)), ('time', ('warm_up',)),
            ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
 """Standard motions that show a quantity; the first that a column uses is taken."""
-DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'time': 'time', 'force': 'force',
-                 'rate': 'rate'}
+DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'thermal branch': 'temperature',
+                 'time': 'time', 'force': 'force', 'rate': 'rate'}
 """Quantity -> what a residual is drawn against where a column uses it; the first."""
 MANY = 100.0
 """Tolerances in the prior's standard deviation, where nobody says more."""
@@ -74,7 +75,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it")
     group = ColumnGroup(name, columns, name)
     try:
-        settles, thermal = 'time constant' in group.uses, 'temperature' in group.uses
+        settles, thermal, turns = (quantity in group.uses for quantity in ('time constant', 'temperature', 'thermal branch'))
     except InputError as error:
         raise error.named(f"effect '{name}'") from error
     definition = {'sensor': sensor, 'column': column if isinstance(column, str) else list(columns), 'unit': unit, 'text': text,
@@ -82,7 +83,8 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
     if not settles:
         del definition['time_constant']
     spread = MANY * tolerance if prior_sd is None else prior_sd
-    needs = ('temperature',) * thermal + ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
+    needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
+    needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
     shape: dict[str, Any] = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
     if settles:
         shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
@@ -92,7 +94,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINTS} else 'exact', groups=(group,),
         coefficients=Amplitudes(name, name, len(columns) == 3, settles),
-        smooth=not group.uses - {'time', 'temperature', 'reference temperature', 'time constant'},
+        smooth=not group.uses - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])

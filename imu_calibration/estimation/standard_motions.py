@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.reference.thermal_branch import ThermalBranch
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and what a table or a person takes from one to the next."""
@@ -39,7 +40,7 @@ class Motion:
         return self.axis is not None and abs(float(np.dot(self.axis, axis_s))) > ALONG
 
 
-def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None):
+def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None, branch=None):
     """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
     axis, up = np.asarray(axis, float) / np.linalg.norm(axis), np.asarray(up, float) / np.linalg.norm(up)
     cos, sin = np.cos(angle)[:, None], -np.sin(angle)[:, None]
@@ -48,7 +49,7 @@ def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=N
     force = gravity * up_s
     if arm is not None:
         force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
-    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c)
+    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c, branch)
 
 
 def _attitudes(up_s):
@@ -82,9 +83,11 @@ def _oscillation(axis, degrees, hertz):
 
 def _poses(directions, temperatures=(None,)):
     def make(gravity):
-        one = np.zeros(1)
-        return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, None if t is None else np.full(1, t))
-                for t in temperatures for k, up in enumerate(directions)]
+        one, way, pieces = np.zeros(1), ThermalBranch(), []
+        for t in temperatures:
+            warmth = {} if t is None else {'temperature_c': np.full(1, t), 'branch': way.of(np.full(1, t))}
+            pieces += [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, **warmth) for k, up in enumerate(directions)]
+        return pieces
     return make
 
 
@@ -134,6 +137,8 @@ MOTIONS = (
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
     Motion('warm_up', 'rest in six faces, cold and warm',
            _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
+    Motion('warm_and_cool', 'rest in six faces while it warms up by ten kelvins, and again while it cools',
+           _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (20.0, 25.0, 30.0, 25.0, 20.0))),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
 

@@ -1,6 +1,6 @@
 """One window of data, reduced to what least squares needs of it."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Callable, Sequence
 
 import numpy as np
@@ -105,8 +105,7 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
     temperatures = np.concatenate(known) if len(known) == len(windows) else None
     if len(windows) == 1:
         return windows[0].motion, temperatures
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
-    return motion, temperatures
+    return JointMotion.joined([window.motion for window in windows]), temperatures
 
 
 def _reduced(window, designs, session, inputs):

@@ -76,7 +76,7 @@ def _again(entry, model, table):
 
 def owned_window(window: Window) -> Window:
     """Return the window in memory of its own: slices would keep the whole chunk that they were cut from."""
-    motion = JointMotion(*(np.array(getattr(window.motion, name)) for name in ('time', 'position', 'rate', 'acceleration', 'jerk')))
+    motion = JointMotion.joined([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
     return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
                   joint_step=window.joint_step)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class WindowPredictor:
         flat = [cut for one in cuts for cut in one]
         if not flat:
             return [[] for _ in cuts]
-        motion = JointMotion(*(np.concatenate([getattr(cut[0], field.name) for cut in flat]) for field in fields(JointMotion)))
+        motion = JointMotion.joined([cut[0] for cut in flat])
         edges = np.cumsum([0] + [len(cut[0]) for cut in flat])
         model = self.coordinates.model
         temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None

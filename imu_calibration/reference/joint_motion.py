@@ -1,5 +1,6 @@
 """The joints' motion at given instants: angles and three derivatives."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -19,10 +20,19 @@ class JointMotion:
     """Second derivative, rad/s^2, shape (n, n_joints)."""
     jerk: np.ndarray
     """Third derivative, rad/s^3, shape (n, n_joints)."""
+    thermal_branch: np.ndarray | None = None
+    """Which way the temperature came to these instants (`reference.thermal_branch`), shape (n,); None: nobody knows."""
 
     def __len__(self) -> int:
         return len(self.time)
 
     def select(self, index: np.ndarray | slice) -> 'JointMotion':
         """Return the motion at `index` (slice, mask or integer array)."""
-        return JointMotion(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        return JointMotion(**{name: None if values is None else values[index] for name, values in known.items()})
+
+    @classmethod
+    def joined(cls, parts: Sequence['JointMotion']) -> 'JointMotion':
+        """Return motions one after the other; what one of them does not know nobody knows."""
+        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(cls)}
+        return cls(**{name: None if any(each is None for each in some) else np.concatenate(some) for name, some in columns.items()})

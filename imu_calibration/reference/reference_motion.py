@@ -27,11 +27,18 @@ class Reference:
     """Local gravity, m/s^2."""
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,)."""
+    branch: np.ndarray | None = None
+    """Which way the temperature came to the samples (`reference.thermal_branch`), shape (n,); None: nobody knows."""
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def thermal_branch(self) -> np.ndarray:
+        """Which way the temperature came, in [-1, 1], shape (n,); zero, between the branches, where nobody knows."""
+        return np.zeros(len(self)) if self.branch is None else self.branch
 
     @property
     def joint_angle(self) -> np.ndarray:

@@ -1,9 +1,11 @@
 """Streams brought together, chunk by chunk of a fixed grid in time: the joints at the IMU's stamps and what they do."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.reference.thermal_branch import ThermalBranch
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.segmentation import joint_phases
 from imu_calibration.segmentation.joint_phases import LOST, STILL
@@ -35,6 +37,7 @@ class MotionChunks:
         self.time_origin = 0.0
         self._settings, self._noise_rad, self._floor = settings, noise_rad, floor
         self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
+        self._branch = ThermalBranch()
         self.margin = max(settings.overlap, _LEAST_MARGIN)
         self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
         self._start_ns: int | None = None
@@ -75,7 +78,7 @@ class MotionChunks:
                 self._first_joint_ns = int(joints.stamp_ns[0])
             self._joints.add(self._not_late(joints, None))
         if temperature is not None and len(temperature):
-            self._temperature.add(temperature)
+            self._temperature.add(replace(temperature, branch=self._branch.of(temperature.temperature_c)))
 
     def take(self, final: bool = False) -> Iterator[PhasedSamples]:
         """Yield the chunks that can be worked on (all with `final`) as `PhasedSamples` without those that have no joints."""
@@ -151,9 +154,9 @@ class MotionChunks:
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
-        temperature = self._temperatures(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        warmth = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
         return self._without_lost(PhasedSamples(
-            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, temperature, phase[core],
+            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, *warmth, phase[core],
             quiet[core], after_gap, np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):
@@ -200,11 +203,13 @@ class MotionChunks:
         self._previous_ns = int(stamp_ns[-1])
         return np.diff(np.concatenate([[before], stamp_ns])) > _ns(limit)
 
-    def _temperatures(self, stamp_ns, last_ns):
+    def _warmth(self, stamp_ns, last_ns):
+        """Return (temperatures, thermal branches) at the stamps."""
         readings = self._temperature.between(-NEVER, last_ns)
         if readings is None or not len(readings):
-            return np.full(len(stamp_ns), np.nan)
-        return np.interp((stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9, readings.temperature_c)
+            return np.full((2, len(stamp_ns)), np.nan)
+        at, known = (stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9
+        return np.interp(at, known, readings.temperature_c), np.interp(at, known, readings.branch)
 
     def _at_edge(self, stamp_ns, limit, final):
         """Tell which samples are so close before the first joint state or after the last that nothing is missing."""

@@ -1,7 +1,7 @@
 """What a window is, and how samples become one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -93,6 +93,8 @@ class PhasedSamples(_Columns):
     """Shape (n, n_joints)."""
     temperature_c: np.ndarray
     """NaN where unknown, shape (n,)."""
+    thermal_branch: np.ndarray
+    """Which way the temperature came, NaN where it is unknown, shape (n,)."""
     phase: np.ndarray
     """STILL, STEADY or MOVING, shape (n,)."""
     quiet: np.ndarray
@@ -108,7 +110,8 @@ class PhasedSamples(_Columns):
 def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
     """Return the `Window` of a kind that holds all of `samples`."""
     temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
-    moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk)
+    moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk,
+                         None if temperature is None else samples.thermal_branch)
     motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
                   samples.joint_step.max(axis=0))
@@ -116,7 +119,7 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
     """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
-    motion = JointMotion(*(np.concatenate([getattr(w.motion, field.name) for w in windows]) for field in fields(JointMotion)))
+    motion = JointMotion.joined([window.motion for window in windows])
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
@@ -138,5 +141,5 @@ def _mean_motion(samples):
     distance = np.abs(slope) * (time[-1] - time[0])
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
-    zero = np.zeros((1, len(mean)))
-    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero)
+    zero, branch = np.zeros((1, len(mean))), samples.thermal_branch.mean(keepdims=True)
+    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero, None if np.isnan(branch).any() else branch)

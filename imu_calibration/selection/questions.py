@@ -8,10 +8,15 @@ import numpy as np
 from imu_calibration.effects.base import SECTIONS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
+from imu_calibration.reference.thermal_branch import HALF_WIDTH
 from imu_calibration.segmentation.window import Window
 
+TURN = 4 * HALF_WIDTH
+"""What is enough of a turn, K."""
 TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
+BRANCHES_APART = 1.5
+"""Least span of the thermal branch, from -1 to 1, that tells cooling from warming up."""
 N_TIME_CONSTANTS = 12
 """Warm-ups are asked for at this many time constants."""
 
@@ -57,7 +62,8 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     kinds = {window.kind for window in windows}
     span = _temperature_span(windows)
     have = {e.key for e in model.effects}
-    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span))
+    turned = _branch_span(windows) >= BRANCHES_APART
+    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned))
 
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
@@ -84,6 +90,17 @@ def _temperature_span(windows):
         return None
     means = [float(np.mean(window.temperature_c)) for window in windows]
     return max(means) - min(means) if means else None
+
+
+def _branch_span(windows):
+    branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
+    return max(branches) - min(branches) if branches else 0.0
+
+
+def _not_turned(effect, turned):
+    if 'cooling' in effect.needs and not turned:
+        return 'the temperature did not turn, so that it came one way only', f'record while it warms up and while it cools, by {TURN:g} K'
+    return None
 
 
 def _why_not(effect, have, table, kinds, span):

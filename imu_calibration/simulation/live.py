@@ -1,7 +1,7 @@
 """A simulated table with an IMU on it, block after block: what a live simulator publishes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.simulation.hidden_causes import Cause, Felt
 from imu_calibration.simulation.sensor_noise import quantise, read_encoders
-from imu_calibration.simulation.session import SimulationOptions, temperature_at
+from imu_calibration.simulation.session import SimulationOptions, branch_at, temperature_at
 from imu_calibration.simulation.table_controller import TableController
 
 TEMPERATURE_RATE = 1.0
@@ -99,6 +99,7 @@ class LiveSimulation:
 
     def _answered(self, time, motion):
         """Return what the sensors answer without noise."""
+        motion = replace(motion, thermal_branch=branch_at(time, self.options))
         answered = predict(self.model, self.values, self.table, motion=motion, temperature_c=temperature_at(time, self.options))
         if not self.causes:
             return answered

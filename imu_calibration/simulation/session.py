@@ -1,6 +1,6 @@
 """Simulated sessions: a table that follows a profile and carries an IMU made of the catalogue's effects."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
+from imu_calibration.reference.thermal_branch import HALF_WIDTH
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders
@@ -117,7 +118,8 @@ def _outputs(model, values, table, profile, time, options):
     parts = []
     for start in range(0, len(time), BLOCK):
         now = time[start:start + BLOCK]
-        parts.append(predict(model, values, table, motion=profile.at(now), temperature_c=temperature_at(now, options)))
+        motion = replace(profile.at(now), thermal_branch=branch_at(now, options))
+        parts.append(predict(model, values, table, motion=motion, temperature_c=temperature_at(now, options)))
     return tuple(np.concatenate(sensor) for sensor in zip(*parts))
 
 
@@ -126,6 +128,12 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
     if options.temperature_start_c is None:
         return None
     return options.temperature_start_c + options.temperature_rise_c * (1 - np.exp(-time / options.temperature_time))
+
+
+def branch_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
+    """Return the thermal branch of the warm-up (`reference.thermal_branch`), or None without a temperature topic: it never turns."""
+    warmth = temperature_at(time, options)
+    return None if warmth is None else np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0)
 
 
 def _temperature_topic(profile, options):

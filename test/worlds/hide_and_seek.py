@@ -30,7 +30,7 @@ from worlds import hide_and_seek_record as record_kept  # noqa: E402
 from worlds.beyond_catalogue import rows_of_seed  # noqa: E402
 from worlds.hide_and_seek_figures import write_figures  # noqa: E402
 from worlds.hide_and_seek_report import report  # noqa: E402
-from worlds.hiding import NOT_SIZED, Sizes, all_effects, options_of, record  # noqa: E402
+from worlds.hiding import NOT_SIZED, all_effects, options_of, record, sizes_for  # noqa: E402
 from worlds.physics_beyond import KINDS  # noqa: E402
 from worlds.physics_draw import OUTSIDE  # noqa: E402
 
@@ -92,11 +92,9 @@ def oracle(recording, effect):
 def effects_of_seed(seed, noise, effects, factor=5.0, profile='random', table='three_axis', part='effects', **options):
     """Hide each effect in one session; the session that hides nothing gives the sizes."""
     labels, options = dict(options), {'profile': profile, 'table': table, **options}
-    empty = record(seed, None, noise, **options)
-    sizes = Sizes(empty)
     rows = []
     for effect in effects:
-        hidden = {effect: sizes.hidden(effect, seed, factor)}
+        hidden = {effect: sizes_for(seed, noise, [effect], options).hidden(effect, seed, factor)}
         recording = record(seed, hidden, noise, **options | options_of(effect))
         row = seek(recording, hidden, part=part, seed=seed, noise=noise, **labels)
         if part == 'effects' and seed % 4 == 0:
@@ -127,10 +125,11 @@ def outside_of_seed(seed, noise, names):
 
 def pairs_of_seed(seed, noise, pairs):
     """Hide two effects at once, each pair in one session."""
-    sizes, rows = Sizes(record(seed, None, noise)), []
+    rows = []
     for pair in pairs:
+        sizes = sizes_for(seed, noise, pair, {})
         hidden = {name: sizes.hidden(name, seed, 5.0) for name in pair}
-        rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part='pairs', seed=seed, noise=noise, beside=sizes.beside(hidden)))
+        rows.append(seek(record(seed, hidden, noise, through_bag=False, **options_of(*pair)), hidden, part='pairs', seed=seed, noise=noise, beside=sizes.beside(hidden)))
     return rows
 
 
@@ -150,12 +149,12 @@ def traps_of_seed(seed, names):
 
 def sizes_of_seed(seed, noise, effects, factors, part='sizes'):
     """Hide effects at several times the smallest detectable size; those of part 'power' are around it."""
-    sizes = Sizes(record(seed, None, noise))
     rows = []
     for effect in sorted(set(effects) - NOT_SIZED):
+        sizes = sizes_for(seed, noise, [effect], {})
         for factor in factors:
             hidden = {effect: sizes.hidden(effect, seed, factor)}
-            rows.append(seek(record(seed, hidden, noise, through_bag=False), hidden, part=part, factor=factor, seed=seed, noise=noise))
+            rows.append(seek(record(seed, hidden, noise, through_bag=False, **options_of(effect)), hidden, part=part, factor=factor, seed=seed, noise=noise))
     return rows
 
 

@@ -59,9 +59,19 @@ def record(seed, hidden=None, noise='white', through_bag=True, **options):
     return Recording(table, windows, session.truth['values'])
 
 
-def options_of(effect):
-    """Return the options of sessions that hide an effect."""
-    return {'grade': 'tactical'} if effect in NOT_SIZED else {}
+def options_of(*effects):
+    """Return the options of sessions that hide effects."""
+    return {**({'grade': 'tactical'} if NOT_SIZED & set(effects) else {}), **({'temperature': 'cycle'} if any(name.endswith('_hysteresis') for name in effects) else {})}
+
+
+@lru_cache(maxsize=8)
+def _empty(seed, noise, options):
+    return Sizes(record(seed, None, noise, **dict(options)))
+
+
+def sizes_for(seed, noise, effects, options):
+    """Return the Sizes in the session of a seed that hides nothing, of the kind that shows the effects."""
+    return _empty(seed, noise, tuple(sorted({**options, **options_of(*(set(effects) - NOT_SIZED))}.items())))
 
 
 def pattern(effect, seed, n_joints=3):

@@ -33,6 +33,8 @@ class Triad:
     thermal_bend: np.ndarray | float = 0.0
     """Bias by the square of the temperature."""
     thermal_scale: np.ndarray | float = 0.0
+    hysteresis: np.ndarray | float = 0.0
+    """Half of what the bias differs between the branches of warming up and cooling: strain that grains of unlike friction let go one after the other."""
     drift: np.ndarray | float = 0.0
     drift_constant: float = 1.0
     """Bias warm-up: drift (1 - exp(-t / constant))."""
@@ -66,12 +68,13 @@ class Triad:
         """
         warm = temperature_c - TEMPERATURE_REF_C
         output = np.empty((len(time), 3))
+        strained = _friction(temperature_c, time) if np.any(self.hysteresis) else 0.0
         for i in range(3):
             scale = np.linalg.norm(self.matrix[i])
             along = inputs[i] @ (self.matrix[i] / scale)
             output[:, i] = (_of(self.bias, i) + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
                             + _of(self.quadratic, i) * along**2 + _of(self.cubic, i) * along**3 + _of(self.asymmetry, i) * np.abs(along)
-                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
+                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 + _of(self.hysteresis, i) * strained - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
             if self.products is not None:
                 x, y, z = inputs[i].T
                 output[:, i] += self.products[i, 0] * x * y + self.products[i, 1] * y * z + self.products[i, 2] * x * z
@@ -81,6 +84,24 @@ class Triad:
                 x, y, z = force_s.T
                 output[:, i] += np.stack([x * x, y * y, z * z, x * y, y * z, x * z], axis=1) @ self.to_force_squared[i]
         return output
+
+
+FRICTION = np.linspace(0.3, 1.5, 9)
+"""By how much the temperature moves each grain before it slips, K."""
+
+
+def _friction(temperature_c, time):
+    """
+    Return the strain of grains that hold until they slip, over its largest, shape (n,): Jenkin's elements, spring and slider, side by side.
+
+    Each spring is stretched by the change of the temperature and cannot hold more than its friction; it starts without load.
+    """
+    steps = np.arange(time[0], time[-1] + 0.1, 0.1)
+    load, total = np.zeros(len(FRICTION)), []
+    for change in np.diff(np.interp(steps, time, temperature_c), prepend=temperature_c[0]):
+        load = np.clip(load + change, -FRICTION, FRICTION)
+        total.append(load.sum())
+    return np.interp(time, steps, np.array(total) / FRICTION.sum())
 
 
 def _of(value, i):
