@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis import unexplained as rests
+from imu_calibration.beyond import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel
 from imu_calibration.selection import gain, investigation
