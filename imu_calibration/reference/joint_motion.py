@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +30,13 @@ class JointMotion:
     def select(self, index: np.ndarray | slice) -> 'JointMotion':
         """Return the motion at `index` (slice, mask or integer array)."""
         known = {f.name: getattr(self, f.name) for f in fields(self)}
-        return JointMotion(**{name: None if values is None else values[index] for name, values in known.items()})
+        selected: dict[str, Any] = {name: None if values is None else values[index] for name, values in known.items()}
+        return JointMotion(**selected)
 
     @classmethod
     def joined(cls, parts: Sequence['JointMotion']) -> 'JointMotion':
         """Return motions one after the other; what one of them does not know nobody knows."""
         columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(cls)}
-        return cls(**{name: None if any(each is None for each in some) else np.concatenate(some) for name, some in columns.items()})
+        joined: dict[str, Any] = {name: None if any(each is None for each in some) else np.concatenate(some)
+                                  for name, some in columns.items()}
+        return cls(**joined)
