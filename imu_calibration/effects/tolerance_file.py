@@ -20,7 +20,7 @@ def rendered(catalogue: Catalogue = CATALOGUE) -> str:
     lines = [HEAD]
     for section in SECTIONS:
         effects = [effect for effect in catalogue.effects().values() if effect.sensor == section]
-        lines += [f'{section}:', *(f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT}}# {e.unit_of(0)}: {e.tolerance_reason}'
+        lines += [f'{section}:', *(f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT - 1}} # {e.unit_of(0)}: {e.tolerance_reason}'
                                    for e in effects), '']
     return '\n'.join(lines[:-1]) + '\n'
 
