@@ -17,7 +17,7 @@ from imu_calibration.calibration.coverage_look import line_of
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import NotObservableError
-from imu_calibration.estimation.standard_motions import MOTIONS
+from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 
@@ -164,7 +164,7 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
 
 def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(begun, monkeypatch):
     live, result = begun
-    monkeypatch.setattr('imu_calibration.calibration.coverage.only_axis', lambda table: np.array([0.6, 0.0, 0.8]))
+    monkeypatch.setattr('imu_calibration.calibration.coverage.possible_motions', lambda table: motions_about([0.6, 0.0, 0.8], [0.0, 0.0, 1.0]))
     shown = table_coverage(result)
     assert np.isnan(shown.seconds) and shown.next.text and 'left' not in line_of(shown)
 

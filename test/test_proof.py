@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration import held_out, trust
+from imu_calibration.calibration import held_out, proof, trust
 from imu_calibration.calibration.proof_words import disproved
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.pieces import Regime, moving_pieces
@@ -32,6 +34,15 @@ def clean():
 @pytest.fixture(scope='module')
 def late():
     return calibrated(make_pair('driver_lag', 1, table='shaft', profile='sweeps'), reference_model='table_tilt', model_as_asked=True)
+
+
+def test_both_sides_are_compared_with_the_same_table():
+    """What belongs to the table and the clock stays where compensation would undo nothing: a mount that bends went from one side alone."""
+    names = [effect.name for effect in CATALOGUE.effects().values() if effect.sensor == 'reference']
+    model = SensorModel(reference=tuple(names))
+    values = np.arange(1.0, 1.0 + len(model.prior()[0]))
+    kept = proof._as_compensated(model, values)
+    assert names and all((kept[model.slices[effect.key]] == values[model.slices[effect.key]]).all() for effect in model.effects if effect.sensor == 'reference')
 
 
 def test_a_good_calibration_is_proven_in_every_motion(clean):

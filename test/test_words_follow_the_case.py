@@ -9,13 +9,17 @@ from imu_calibration.beyond.unexplained import where_most
 from imu_calibration.calibration.comparison import compare
 from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.errors import InputError
-from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT
+from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.reference.table import Table
+from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.compensate import compensate
 
 from worlds.compensation_cases import random_calibration
-from worlds.misfit_worlds import make_pair
+from worlds.misfit_worlds import SHAFT, make_pair, sweeps
+from worlds.physics import make_session
+
+VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 
 
 def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
@@ -23,9 +27,24 @@ def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
     table = Table.from_mapping(pair.table)
     result = calibrate(pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True).result
     needs = {text for text, _ in motions_needed(result.solution, result.tolerances, table).values()}
-    possible = {motion.text for motion in MOTIONS if motion.possible_about((1.0, 0.0, 0.0))}
+    possible = {motion.text for motion in motions_about((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))}
     assert OTHER_MOUNT in needs and needs <= {OTHER_MOUNT} | possible
     assert possible == {motion.text for motion in MOTIONS if motion.name in ('spin_x', 'oscillate_x')}
+
+
+def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
+    """Spins about a level axis would show every entry of the matrix; about the vertical one gravity stays where it is."""
+    table = Table.from_mapping(VERTICAL)
+    session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
+    result = calibrate(SampleBlock(session.imu, session.joints), table, accelerometer_model='bias+matrix', model_as_asked=True).result
+    needed = motions_needed(result.solution, result.tolerances, table)
+    held = [name for name, status in zip(result.calibration.param_names, result.calibration.status) if status == 'held' and name.startswith('accelerometer.matrix')]
+    assert held and {needed[name][0] for name in held} == {OTHER_MOUNT}
+    reasons = [reason for reason in result.verdict.reasons if held[0] in reason.what or 'accelerometer.matrix (' in reason.what]
+    assert reasons and all(reason.next != 'record the same motion for longer' for reason in reasons)
+    for motion in motions_about((0.0, 0.0, -1.0), (0.0, 0.6, -0.8)):
+        assert all(abs(piece.force_s @ piece.rate_s[0]).max() == pytest.approx(0.8 * 9.8 * np.linalg.norm(piece.rate_s[0]))
+                   for piece in motion.make(9.8))
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.effect_states import GroupState
-from imu_calibration.calibration.from_solution import only_axis
+from imu_calibration.calibration.from_solution import possible_motions
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
@@ -142,8 +142,8 @@ def _known_before(model):
 
 
 def _possible_motions(table):
-    about = only_axis(table)
-    return [motion for motion in MOTIONS if motion.seconds < LONGEST and (about is None or motion.possible_about(about))]
+    possible = possible_motions(table)
+    return [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < LONGEST]
 
 
 def _foretold(information, left, added, motions):

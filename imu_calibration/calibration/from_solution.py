@@ -16,6 +16,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.standard_motions import Motion, motions_about
 from imu_calibration.preflight.checks import unusable, warnings
 from imu_calibration.preflight.finding import CheckFinding
 from imu_calibration.reference.table import Table
@@ -25,14 +26,14 @@ from imu_calibration.segmentation.window_cutter import dropped
 def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
     return observability.needed_motions(solution, tolerances, table.gravity_value, prior_sd=make_prior(solution.model).sd,
-                                        only_axis=only_axis(table))
+                                        possible=possible_motions(table))
 
 
-def only_axis(table: Table) -> np.ndarray | None:
-    """Return the axis, in the sensor frame, about which a table with a single joint turns; None for other tables."""
+def possible_motions(table: Table) -> tuple[Motion, ...] | None:
+    """Return the standard motions that a table with a single joint can do; None: any."""
     if len(table.joints) != 1 or not table.joints[0].turns:
         return None
-    return table.mat_sl @ np.asarray(table.joints[0].axis)
+    return motions_about(*(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up)))
 
 
 def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gathered: Gathered, needed: dict[str, tuple[str, float]],
@@ -43,7 +44,8 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
     sd = np.sqrt(np.diag(covariance))
     status = statuses(sd, solution.held, tolerances)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
-    undetermined = tuple({'parameters': weights, 'needs': _need(weights, needed)} for weights in directions)
+    undetermined = tuple({'parameters': weights, 'needs': need} for weights, need in (
+        *((weights, _need(weights, needed)) for weights in directions), *_besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))))
     centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
     if model.joint_names.angle_sd is not None:
@@ -57,6 +59,15 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
 def _need(weights, needed):
     texts = [needed[name][0] for name in sorted(weights, key=lambda n: -abs(weights[n])) if name in needed]
     return texts[0] if texts else 'more of the same motion'
+
+
+def _besides(directions, needed, in_tolerances):
+    """Return (sds in tolerances, motion) of the parameters that none of the worst directions names."""
+    told, others = set().union(*directions), {}
+    for name, (text, _) in needed.items():
+        if name not in told:
+            others.setdefault(text, {})[name] = round(float(in_tolerances[name]), 3)
+    return [(names, text) for text, names in others.items()]
 
 
 def with_gravity_uncertainty(solution: Solution, table: Table) -> np.ndarray:

@@ -127,7 +127,7 @@ def _as_compensated(model, values):
     """Return the values with what compensation does not undo at zero; table, clock and lags stay."""
     values = values.copy()
     for effect in model.effects:
-        if effect.compensation == 'none' and not effect.in_reference and effect.warp is None:
+        if effect.compensation == 'none' and not _of_reference(effect):
             values[model.slices[effect.key]] = effect.prior_values()
     return np.where(np.isfinite(values), values, 0.0)
 

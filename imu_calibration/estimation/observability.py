@@ -86,13 +86,13 @@ def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Seque
 
 
 def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *, prior_sd: np.ndarray,
-                   only_axis: np.ndarray | None = None) -> dict[str, tuple[str, float]]:
+                   possible: Sequence[Motion] | None = None) -> dict[str, tuple[str, float]]:
     """
     Return for each parameter that is not determined the standard motion that would serve it best.
 
     Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
-    tolerances. A table that turns the sensor about one axis only (`only_axis`, unit vector in the sensor frame) can do few of them: where
-    none of these would help, the IMU has to be mounted anew.
+    tolerances. A table that turns the sensor about one axis only can do few of them (`possible`): where none of these would help, the IMU
+    has to be mounted anew.
 
     Returns
     -------
@@ -104,19 +104,21 @@ def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *
     if not len(lacking):
         return {}
     base = solution.information + np.diag(1 / prior_sd**2)
-    predicted = {}
-    for motion in MOTIONS:
+    before, predicted = _sd_of(base), {}
+    for motion in MOTIONS if possible is None else possible:
         total = base + added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)
-        predicted[motion] = np.sqrt(np.clip(np.diag(inverse_normal(total)), 0, None))
-    if only_axis is None:
-        return {solution.param_names[k]: _best(solution, k, predicted) for k in lacking}
-    possible = {motion: sd for motion, sd in predicted.items() if motion.possible_about(only_axis)}
-    return {solution.param_names[k]: _best_on_one_joint(solution, k, possible) for k in lacking}
+        predicted[motion] = _sd_of(total) * np.maximum(solution.sd / before, 1.0)   # what the model leaves out stays
+    best = _best if possible is None else _best_on_one_joint
+    return {solution.param_names[k]: best(solution, k, predicted) for k in lacking}
 
 
-def _best_on_one_joint(solution, index, possible):
-    motion = min(possible, key=lambda m: possible[m][index], default=None)
-    sd = float('nan') if motion is None else float(possible[motion][index])
+def _sd_of(information):
+    return np.sqrt(np.clip(np.diag(inverse_normal(information)), 1e-300, None))
+
+
+def _best_on_one_joint(solution, index, predicted):
+    motion = min(predicted, key=lambda m: predicted[m][index], default=None)
+    sd = float('nan') if motion is None else float(predicted[motion][index])
     return (motion.text, sd) if sd < 0.7 * solution.sd[index] else (OTHER_MOUNT, float('nan'))
 
 

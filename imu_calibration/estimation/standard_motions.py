@@ -35,10 +35,6 @@ class Motion:
         """How long it takes: rests with the way to the next one, and what moves."""
         return sum(REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY for piece in self.make(STANDARD_GRAVITY))
 
-    def possible_about(self, axis_s: np.ndarray) -> bool:
-        """Return whether a table can do it that turns the sensor about one axis only, given as a unit vector in the sensor frame."""
-        return self.axis is not None and abs(float(np.dot(self.axis, axis_s))) > ALONG
-
 
 def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None, branch=None):
     """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
@@ -74,10 +70,11 @@ def _spin(axis, speeds, up=None, arm=None):
     return make
 
 
-def _oscillation(axis, degrees, hertz):
+def _oscillation(axis, degrees, hertz, up=None):
     def make(gravity):
         w, a = 2 * np.pi * hertz, degrees * DEG
-        return [_turn(axis, TIME, a * np.sin(w * TIME), a * w * np.cos(w * TIME), -a * w**2 * np.sin(w * TIME), gravity, (0.3, 0.4, 1.0))]
+        return [_turn(axis, TIME, a * np.sin(w * TIME), a * w * np.cos(w * TIME), -a * w**2 * np.sin(w * TIME), gravity,
+                      (0.3, 0.4, 1.0) if up is None else up)]
     return make
 
 
@@ -120,18 +117,27 @@ def _fine_poses():
 
 SPINS = (-200, -100, 100, 200)
 """Speeds of a spin, deg/s."""
+AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+
+def _spins_about(axis, up=None):
+    name = 'xyz'[axis.index(1)]
+    return Motion(f'spin_{name}', f"spin about the sensor's {name} axis at 100 and 200 deg/s in both senses", _spin(axis, SPINS, up), axis)
+
+
+def _oscillates_about(axis, up=None):
+    name = 'xyz'[axis.index(1)]
+    return Motion(f'oscillate_{name}', f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz", _oscillation(axis, 30, 1.0, up), axis)
+
+
 MOTIONS = (
     Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(EDGES)),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
-    Motion('spin_x', "spin about the sensor's x axis at 100 and 200 deg/s in both senses", _spin((1, 0, 0), SPINS), (1, 0, 0)),
-    Motion('spin_y', "spin about the sensor's y axis at 100 and 200 deg/s in both senses", _spin((0, 1, 0), SPINS), (0, 1, 0)),
-    Motion('spin_z', "spin about the sensor's z axis at 100 and 200 deg/s in both senses", _spin((0, 0, 1), SPINS), (0, 0, 1)),
+    *(_spins_about(axis) for axis in AXES),
     Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
         piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
         for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
-    Motion('oscillate_x', "oscillate about the sensor's x axis, 30 deg at 1 Hz", _oscillation((1, 0, 0), 30, 1.0), (1, 0, 0)),
-    Motion('oscillate_y', "oscillate about the sensor's y axis, 30 deg at 1 Hz", _oscillation((0, 1, 0), 30, 1.0), (0, 1, 0)),
-    Motion('oscillate_z', "oscillate about the sensor's z axis, 30 deg at 1 Hz", _oscillation((0, 0, 1), 30, 1.0), (0, 0, 1)),
+    *(_oscillates_about(axis) for axis in AXES),
     Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
@@ -141,6 +147,26 @@ MOTIONS = (
            _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (20.0, 25.0, 30.0, 25.0, 20.0))),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
+
+
+def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
+    """
+    Return the motions of a table that turns the sensor about one axis only: none where that is no axis of the sensor.
+
+    Gravity stands to the axis as it does on the table: about a vertical one the sensor never sees it turn.
+
+    Parameters
+    ----------
+    axis_s, up_s : array, shape (3,)
+        Unit vectors of the axis and of the vertical, sensor frame, at any angle of the joint.
+
+    """
+    along = [axis for axis in AXES if abs(float(np.dot(axis, axis_s))) > ALONG]
+    if not along:
+        return ()
+    share = float(np.clip(np.dot(axis_s, up_s) * np.sign(np.dot(along[0], axis_s)), -1.0, 1.0))
+    up = share * np.array(along[0], float) + np.sqrt(1.0 - share**2) * np.roll(along[0], 1)
+    return _spins_about(along[0], tuple(up)), _oscillates_about(along[0], tuple(up))
 
 
 TABLE_MOTIONS = {

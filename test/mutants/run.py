@@ -2,7 +2,9 @@
 
 import argparse
 import os
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,8 +18,10 @@ sys.path.insert(0, str(ROOT / 'test'))
 
 from mutants.declared import MUTANTS  # noqa: E402
 
-TIMEOUT = 300.0
-"""s; a test that a fault keeps from ending has noticed it."""
+LONGEST = 120
+"""s of processor time; a test that a fault keeps from ending has noticed it, one that waits for a busy machine has not."""
+PATIENCE = 30
+"""Times that by the clock."""
 NOTICED, SURVIVED, BROKEN = 'noticed', 'SURVIVED', 'BROKEN'
 
 
@@ -31,14 +35,21 @@ def copied(folder):
     return folder
 
 
-def tested(folder, tests, *options, timeout=TIMEOUT):
+def _limited():
+    resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST + 5))
+
+
+def tested(folder, tests, *options):
     """Return pytest's exit code and the last line that it printed."""
     env = os.environ | {'PYTHONPATH': os.pathsep.join([str(folder), os.environ.get('PYTHONPATH', '')]), 'PYTHONDONTWRITEBYTECODE': '1'}
     command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *options, *tests]
     try:
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=PATIENCE * LONGEST, stdin=subprocess.DEVNULL,
+                              preexec_fn=_limited)
     except subprocess.TimeoutExpired:
-        return 1, f'did not end within {timeout:.0f} s'
+        return 1, f'did not end within {PATIENCE * LONGEST} s'
+    if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return 1, f'took more than {LONGEST} s of processor time'
     return done.returncode, next((line for line in reversed(done.stdout.splitlines()) if line.startswith(('FAILED', 'ERROR'))), '')
 
 
@@ -74,7 +85,7 @@ def main():
         for number in range(asked.workers):
             folders.put(copied(Path(place) / str(number)))
         needed = sorted({test for mutant in chosen for test in mutant.tests})
-        code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile', timeout=10 * TIMEOUT)
+        code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile')
         if code:
             sys.exit(f'the tests must pass before anything is broken: {line or code}')
 
