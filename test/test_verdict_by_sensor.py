@@ -10,7 +10,8 @@ from imu_calibration import files
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.nominal import with_nominal
-from imu_calibration.calibration.verdict import HAND_AXES, grave_reasons
+from imu_calibration.calibration.reasons import HAND_AXES
+from imu_calibration.calibration.verdict import grave_reasons
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import DocumentError

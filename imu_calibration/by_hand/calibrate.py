@@ -177,7 +177,8 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: By
     if attitudes < POSES_LEAST:
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
-            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes')
+            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
+            'or describe the table or arm that moved it', key='table')
     turns, dropped = collect_turns(time, imu, poses=poses, settings=settings, temperature_c=temperature_c)
     turns += [known_turn_data(time, imu, turn, poses=poses, settings=settings, temperature_c=temperature_c) for turn in known_turns]
     return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
@@ -275,5 +276,6 @@ def _as_ranges(imu, stills):
     ranges = [(a, b) for a, b in ranges if b - a >= 2]
     if not ranges:
         raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
-                                 'got no interval at rest; hold the IMU still for a second or more in each attitude')
+                                 'got no interval at rest; hold the IMU still for a second or more in each attitude, '
+                                 'or describe the table or arm that moved it', key='table')
     return ranges

@@ -44,8 +44,9 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
     sd = np.sqrt(np.diag(covariance))
     status = statuses(sd, solution.held, tolerances)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
-    undetermined = tuple({'parameters': weights, 'needs': need} for weights, need in (
-        *((weights, _need(weights, needed)) for weights in directions), *_besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))))
+    others = _besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))
+    undetermined = tuple({'parameters': weights, 'needs': need}
+                         for weights, need in (*((each, _need(each, needed)) for each in directions), *others))
     centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
     if model.joint_names.angle_sd is not None:

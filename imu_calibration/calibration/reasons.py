@@ -28,6 +28,8 @@ LOOSE = 2.0
 """From this factor on the misfit is worth a note."""
 SHOWN_NAMES = 6
 """Names listed one by one; of more, the groups are named."""
+HAND_AXES = 'accelerometer_lower_triangular'
+"""The axes of a calibration by hand."""
 
 
 @dataclass(frozen=True)

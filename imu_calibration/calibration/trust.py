@@ -7,10 +7,10 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.proof_words import disproved
-from imu_calibration.calibration.reasons import BAD, GOOD, listed
+from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, listed
 from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import HAND_AXES, grave_reasons
+from imu_calibration.calibration.verdict import grave_reasons
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
 

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
 from imu_calibration.calibration.proof_words import disproved
-from imu_calibration.calibration.reasons import BAD, GOOD, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet
+from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet
 from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.calibration.verdict_notes import notes_on
@@ -17,8 +17,8 @@ from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.errors import with_hint
 
 SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
-HAND_AXES = 'accelerometer_lower_triangular'
-"""The axes of a calibration by hand."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The verdict with its reasons, the gravest first."""

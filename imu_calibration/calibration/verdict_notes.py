@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.proof_words import disproved, proven
-from imu_calibration.calibration.reasons import LOOSE, MISFIT, NOTE, SHOWN_NAMES, Reason, misfit_ratios, quiet
+from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, Reason, misfit_ratios, quiet
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.units import for_people, significant
 
@@ -64,7 +64,7 @@ def _loose(calibration):
 
 def _unstable(calibration, tolerances):
     """Return notes on biases that move from window to window by more than the tolerance on their mean."""
-    reasons = []
+    reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
     for sensor in SENSORS:
         offset = calibration.model.find(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
@@ -73,7 +73,7 @@ def _unstable(calibration, tolerances):
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
                                         f'{significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',
-                                  'let the IMU warm up and the table stand firm, or estimate the bias in use'))
+                                  f'let the IMU warm up{"" if by_hand else " and the table stand firm"}, or estimate the bias in use'))
     return reasons
 
 

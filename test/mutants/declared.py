@@ -128,6 +128,8 @@ TRUST = _of(
      'test_proof.py test_trust.py'),
     ('proof on windows that were fitted', 'calibration/held_out.py', 'for k, part in enumerate(parts) if k != fold)', 'for k, part in enumerate(parts))',
      'test_proof.py'),
+    ('the mount that bends goes from one side of the proof', 'calibration/proof.py', "== 'none' and not _of_reference(effect):", "== 'none' and not effect.in_reference:",
+     'test_proof.py::test_both_sides_are_compared_with_the_same_table'),
     ('misfit is not a reason', 'calibration/reasons.py', 'MISFIT = 10.0', 'MISFIT = 1e9', 'test_verdict.py'),
     ('weak called determined', 'calibration/status.py', 'DETERMINED if s <= t else WEAK', 'DETERMINED if s <= 9 * t else WEAK', 'test_status.py'),
     ('held called determined', 'calibration/status.py', 'HELD if h else DETERMINED', 'DETERMINED if h else DETERMINED', 'test_status.py'),
@@ -184,6 +186,8 @@ BY_SENSOR = _of(
     ('a refused sensor is as certain as a used one', 'calibration/nominal.py', 'np.diag(effect.prior_sds()**2)', 'np.diag(0 * effect.prior_sds()**2)',
      'test_verdict_by_sensor.py'),
     ('a reason concerns both sensors', 'calibration/verdict.py', 'if sensor in reason.sensors]) for sensor', ']) for sensor', 'test_verdict_by_sensor.py'),
+    ('exports hold what compensation refuses', 'exports/export.py', 'else usable(calibration)', 'else Usable(calibration)',
+     'test_verdict_by_sensor.py::test_other_programs_get_numbers_of_a_data_sheet_for_the_sensor_that_is_refused'),
     ('who corrects takes the refused sensor too', 'nodes/adoption.py', 'if settings.anyway else trust.usable(calibration)', 'if True else trust.usable(calibration)',
      'test_adoption.py'),
 )
