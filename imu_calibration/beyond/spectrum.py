@@ -8,6 +8,7 @@ from scipy.signal import detrend
 from scipy.stats import binom
 
 from imu_calibration.beyond.blocks import residuals
+from imu_calibration.beyond.orders import MOST, OUT, orders_of
 from imu_calibration.constants import DEG
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.reference.table import Table
@@ -81,7 +82,7 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     The rest of every stretch of at most ten seconds, or of at most ten turns of a joint that keeps turning, is taken apart into
     frequencies. One counts where its power is four times the median around it; a tone counts in most stretches, which noise does by chance
     (binomial law). Rests and motions both tell of seconds; what stays at a multiple of a speed stands still in turns and wanders in
-    seconds.
+    seconds. Where few stretches turn, whole orders are looked for in all that the joint does (`beyond.orders`).
     """
     attempt = found.attempt
     values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
@@ -91,10 +92,28 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     for sensor in SENSORS:
         parts = np.split(left[sensor], edges)
         asked = [(None, None), *enumerate(table.joint_names)]
-        told = [replace(tone, p_value=tone.p_value * len(AXES) * len(asked)) for joint, name in asked
-                for tone in of_stretches(sensor, _stretches(found.used, parts, joint), name)]
-        tones[sensor] = tuple(sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value))
+        every = (tone for joint, name in asked for tone in (*of_stretches(sensor, _stretches(found.used, parts, joint), name),
+                                                            *_whole(sensor, found.used, parts, joint, name)))
+        told = [replace(tone, p_value=tone.p_value * len(AXES) * len(asked)) for tone in every]
+        first = {}
+        for tone in sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value):
+            first.setdefault((tone.axis, tone.joint), tone)
+        tones[sensor] = tuple(first.values())
     return tones
+
+
+def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:
+    """Yield the Tone of each axis that keeps its phase on a joint and stands out most, where one does."""
+    orders = None if joint is None else orders_of(windows, parts, joint)
+    if orders is None:
+        return
+    for axis in range(3):
+        out = (orders.power[:, axis] > OUT) & (orders.share[:, axis] > MOST)
+        if out.any():
+            best = int(np.argmin(np.where(out, orders.p_value[:, axis], np.inf)))
+            yield Tone(sensor, AXES[axis], name, float(orders.order[best]), float(orders.amplitude[best, axis]),
+                       float(orders.p_value[best, axis] * len(orders.order)), float(orders.share[best, axis]), orders.order,
+                       orders.power[:, axis])
 
 
 def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None) -> Iterator[tuple[np.ndarray, float, float]]:

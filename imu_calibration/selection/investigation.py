@@ -14,7 +14,7 @@ from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
-from imu_calibration.selection.gain import gain_in_turn
+from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.pairs import best_pairs
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
@@ -29,14 +29,10 @@ from imu_calibration.selection.saturation import (
     without_clipped,
 )
 from imu_calibration.selection.search import Named, Search
+from imu_calibration.selection.simpler import simpler
 
 LINEARISATIONS = 5
 """Times that the columns are taken anew, at most."""
-LEAST_REDUCTION = 0.01
-"""
-Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for
-sure.
-"""
 LEFT = 0.1
 """Share of a significant rest that pairs, or effects of implausible size, may leave."""
 LEAST_WINDOWS = 8
@@ -165,7 +161,8 @@ def _settled(attempted, attempt, chosen, progress=None):
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = Explained(attempt.evidence, attempt.search)
-    named, denied = _agreed(attempt, explained, _that_help(attempt, explained, pruned(chosen, explained.share)))
+    first = simpler(attempt, explained, pruned(chosen, explained.share))
+    named, denied = _agreed(attempt, explained, _that_help(attempt, explained, first))
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
