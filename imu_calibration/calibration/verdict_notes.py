@@ -19,6 +19,9 @@ def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
 
 
 def _proven(calibration):
+    if not calibration.proof and calibration.gauge.get('axes') == HAND_AXES:
+        return [Reason(NOTE, 'that it helps is not proven: too few attitudes to leave some out and predict them',
+                       'hold it still in more attitudes')]
     return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
 
 
