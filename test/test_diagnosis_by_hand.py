@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.diagnosis.by_hand import where
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.workflow import diagnosis_lines
@@ -54,6 +56,34 @@ def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     assert name in (first.effect, *first.indistinguishable_from)
     assert first.gain.ci95[0] > 0 and first.gain.windows >= 35
     assert len(found.findings) == 1
+
+
+def test_the_attitudes_at_which_a_rest_appears_are_told():
+    """A gyroscope whose bias is another one while y is level: no effect of the catalogue; beside a bias of every stop no place is told."""
+    def spoil(f, w, t, k):
+        return NOTHING, np.outer(np.abs(f[:, 1]) < 3.0, [0.0, 0.3 * DEG, 0.0])
+    diagnosis = diagnosed(21500, spoil, n_poses=24).diagnosis
+    rest = diagnosis.unexplained['gyroscope']
+    assert not diagnosis.findings and rest.axes == ('y',) and len(rest.regimes) == 1
+    regime = rest.regimes[0]
+    assert regime.axis == 'y' and regime.variable == 'specific force along y' and -4.5 < regime.bounds[0] < -1.5 and 1.5 < regime.bounds[1] < 4.5
+    assert any('where: gyroscope y, while the specific force along y is' in line for line in diagnosis_lines(diagnosis))
+    everywhere = diagnosed(21500, stops, n_poses=24).diagnosis.unexplained['accelerometer']
+    assert everywhere.significant and not everywhere.regimes
+
+
+def test_a_place_among_few_poses_is_paid_for(monkeypatch):
+    """Any range of noise is the likeliest of many: its chance counts them all."""
+    monkeypatch.setattr(where, 'MOST_OF_IT', 0.0)
+    poses = SimpleNamespace(time=10.0 * np.arange(24), temperature_c=None)
+    rng = np.random.default_rng(21501)
+    told = []
+    for _ in range(20):
+        up = rng.normal(size=(24, 3))
+        hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
+        block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
+        told += where.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
+    assert len(told) <= 1
 
 
 def test_sizes_agree_with_what_was_hidden(responding):

@@ -31,7 +31,7 @@ class RestRegime:
     sensor: str
     """'accelerometer' or 'gyroscope'."""
     axis: str
-    """Axis of the sensor."""
+    """Axis of the sensor; 'norm' where only the length of its output is known."""
     variable: str
     """What it goes by: 'angle of NAME', 'rate of NAME', 'time', ..."""
     text: str
@@ -58,7 +58,7 @@ class RestRegime:
 
 
 @dataclass(frozen=True, eq=False)
-class _Variable:
+class Variable:
     """What a regime may go by: a bin for each block, and the words for a range of bins."""
 
     name: str
@@ -68,8 +68,9 @@ class _Variable:
     words: object
 
     @property
-    def count(self):
-        return int(self.bins.max()) + 1
+    def marks(self) -> np.ndarray:
+        """One column for each bin, 1 in the blocks that lie there, shape (b, k)."""
+        return np.eye(int(self.bins.max()) + 1)[self.bins]
 
 
 def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str]) -> list[RestRegime]:
@@ -101,9 +102,9 @@ def _few_false(regimes):
 
 def _of_variable(blocks, axis, rows, prior, variable, white):
     """Return the regimes of one variable, found on every other window and tested on those between: by scatter and by offset."""
-    marks = white(np.eye(variable.count)[variable.bins]) / white.scale[axis]
+    marks = white(variable.marks) / white.scale[axis]
     training = blocks.window % 2 == 0
-    found = _cleanest(rows[training], marks[training], prior, variable.bins[training], variable.cyclic)
+    found = cleanest(rows[training], marks[training], prior, bins=variable.bins[training], cyclic=variable.cyclic)
     return [regime for best, offset in found if (regime := _tested(blocks, axis, rows, marks, prior, variable, best, offset)) is not None]
 
 
@@ -116,7 +117,7 @@ def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
         return None
     if offset:
         mark = marks[:, best].sum(axis=1)
-        share, p_value = _tested_offset(rows[~training], mark[~training], prior, sum(windows))
+        share, p_value = tested_offset(rows[~training], mark[~training], prior, n_windows=sum(windows))
         left = _wider(rows, mark) @ np.append(-_solved(_wider(rows, mark)[training], _for_one_more(prior))[0], 1.0)
         cost = _cost(float((left[~training]**2).sum()), (~training).sum())
     else:
@@ -137,8 +138,22 @@ def _tested_scatter(left, inside, outside, windows):
     return excess[0] / max(sum(excess), 1e-300), float(f_distribution.sf(ratio, *windows))
 
 
-def _tested_offset(rows, mark, prior, n_windows):
-    """Return (share of the rest that an offset inside takes away, p-value of that)."""
+def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows: int) -> tuple[float, float]:
+    """
+    Return (share of the rest that an offset inside takes away, p-value of that).
+
+    Parameters
+    ----------
+    rows : ndarray, shape (b, q + 1)
+        ``[columns of the model | rest]``, independent and of unit variance.
+    mark : ndarray, shape (b,)
+        The offset's column, made independent as the rows were.
+    prior : (ndarray, ndarray)
+        Information and mean that the parameters come with, shape (q,).
+    n_windows : int
+        What counts as degrees of freedom.
+
+    """
     before = _solved(rows, prior)[1]
     after = _solved(_wider(rows, mark), _for_one_more(prior))[1]
     dof = max(n_windows - rows.shape[1], 3)
@@ -161,7 +176,7 @@ def _solved(rows, prior):
     return values, float(((rows[:, -1] - design @ values)**2).sum())
 
 
-def _cleanest(rows, marks, prior, bins, cyclic):
+def cleanest(rows: np.ndarray, marks: np.ndarray, prior: tuple, *, bins: np.ndarray, cyclic: bool) -> list[tuple[list[int], bool]]:
     """
     Return the ranges of bins in order that leave the cleanest rest by likelihood, each with whether it differs by an offset.
 
@@ -217,23 +232,23 @@ def _variables(blocks, joint_names):
     for k, name in enumerate(joint_names):
         if np.ptp(angles[:, k]) > 0.5:
             found.append(_cyclic(f'angle of {name}', angles[:, k] / DEG))
-        found += _ranged(f'rate of {name}', rates[:, k] / DEG, 'deg/s')
+        found += ranged(f'rate of {name}', rates[:, k] / DEG, 'deg/s')
         found += _before_rest(name, rates[:, k])
     speed, force = np.linalg.norm(blocks.means(ref.rate_s), axis=1), np.linalg.norm(blocks.means(ref.force_s), axis=1)
-    found += _ranged('speed', speed / DEG, 'deg/s') + _ranged('specific force', force, 'm/s^2', least=0.5)
+    found += ranged('speed', speed / DEG, 'deg/s') + ranged('specific force', force, 'm/s^2', least=0.5)
     for k, axis in enumerate(AXES):
-        found += _ranged(f'rate about {axis}', blocks.means(ref.rate_s)[:, k] / DEG, 'deg/s')
-        found += _ranged(f'specific force along {axis}', blocks.means(ref.force_s)[:, k], 'm/s^2', least=0.5)
-    found += _ranged('time', blocks.time, 's')
+        found += ranged(f'rate about {axis}', blocks.means(ref.rate_s)[:, k] / DEG, 'deg/s')
+        found += ranged(f'specific force along {axis}', blocks.means(ref.force_s)[:, k], 'm/s^2', least=0.5)
+    found += ranged('time', blocks.time, 's')
     if ref.temperature_c is not None:
         warm = blocks.means(ref.temperature_c)
-        found += _ranged('temperature', warm, 'C', least=0.5)
+        found += ranged('temperature', warm, 'C', least=0.5)
         slope = np.gradient(np.polynomial.Chebyshev.fit(blocks.time, warm, min(12, len(warm) // 10))(blocks.time))
         found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'))
     moving = speed > DEG
     found += _classes('kind', moving, ('at rest', 'while it moves'))
     last = np.maximum.accumulate(np.where(moving, blocks.time, -np.inf))
-    return found + _ranged('time since motion', np.where(np.isfinite(last), np.minimum(blocks.time - last, 1e3), 1e3), 's')
+    return found + ranged('time since motion', np.where(np.isfinite(last), np.minimum(blocks.time - last, 1e3), 1e3), 's')
 
 
 def _before_rest(name, rate):
@@ -252,10 +267,11 @@ def _cyclic(name, degrees):
 
     def words(chosen):
         return f'while the {name} is {edges[chosen[0]]:.0f} to {edges[chosen[-1] + 1]:.0f} deg'
-    return _Variable(name, np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1), edges, True, words)
+    return Variable(name, np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1), edges, True, words)
 
 
-def _ranged(name, values, unit, least=1e-3):
+def ranged(name: str, values: np.ndarray, unit: str, *, least: float = 1e-3) -> list[Variable]:
+    """Return the variable of a value of each block in bins of as many blocks, or none where it hardly changes."""
     edges = np.unique(np.round(np.quantile(values, np.linspace(0.0, 1.0, N_BINS + 1)), 3))
     if len(edges) < 4 or np.ptp(edges) < least:
         return []
@@ -266,10 +282,10 @@ def _ranged(name, values, unit, least=1e-3):
             return f'while the {name} is below {high:.3g} {unit}'
         span = f'{low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'{low:.3g} to {high:.3g} {unit}'
         return f'while the {name} is {span}'
-    return [_Variable(name, np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2), edges, False, words)]
+    return [Variable(name, np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2), edges, False, words)]
 
 
 def _classes(name, mask, words):
     if not FEWEST <= mask.sum() <= len(mask) - FEWEST:
         return []
-    return [_Variable(name, mask.astype(int), None, False, lambda chosen: words[chosen[0]])]
+    return [Variable(name, mask.astype(int), None, False, lambda chosen: words[chosen[0]])]

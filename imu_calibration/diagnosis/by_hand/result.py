@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.beyond.fitting import LEAST_OF_AXIS
 from imu_calibration.beyond.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 from imu_calibration.by_hand.calibrate import HandCalibration
+from imu_calibration.diagnosis.by_hand.where import regimes_by_hand
 from imu_calibration.diagnosis.traces import Traces
+from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.questions import Question
 
@@ -77,7 +80,11 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
     name, share = correlate(_explanations(hand), layers / noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
-    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd, unit)
+    heldout = inquiry.evidence.heldout_residuals(used)[first]
+    excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
+    axes = [AXES[k] for k in np.argsort(-excess) if excess[k] > LEAST_OF_AXIS * excess.max() > 0] if len(excess) == len(AXES) else []
+    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd, unit,
+                       tuple(axes), regimes_by_hand(hand, inquiry.blocks[first], heldout))
 
 
 def _explanations(hand):
