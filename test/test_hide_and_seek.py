@@ -1,9 +1,13 @@
 """How hide and seek counts: who found what, which pairs no search can find, and what detectable means."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from worlds.hide_and_seek_sections import both_found, print_pairs, print_sizes, separable, wrong_names
+from worlds.hide_and_seek_figures import missed
+from worlds.hide_and_seek_sections import both_found, by_grade, print_pairs, print_sizes, separable, wrong_names
+from worlds.hide_and_seek_worlds import GRADES, REALISTIC, _each, effects_of_seed, pairs_of_seed, run, tasks_of
 from worlds.hiding import passing, threshold_noncentrality
 
 
@@ -42,3 +46,37 @@ def test_detectable_is_what_passes_half_of_the_time(n_parameters):
     size = threshold_noncentrality(n_parameters, 50)
     assert 0.45 < passing(size, n_parameters, 50).mean() < 0.55
     assert passing(0.5 * size, n_parameters, 50).mean() < 0.2 and passing(4 * size, n_parameters, 50).mean() > 0.99
+
+
+def asked(**more):
+    return tasks_of(SimpleNamespace(**{'seeds': 1, 'first_seed': 1, 'effects': None, 'parts': ('effects', 'pairs'), 'grades': GRADES, 'noise': None, 'pairs': None} | more))
+
+
+def test_every_effect_is_hidden_once_at_each_grade_in_white_and_in_realistic_noise():
+    singles = [(noise, name) for function, (_, noise, names) in asked() if function is effects_of_seed for name in names]
+    for grade in GRADES:
+        of = {white: [name for noise, name in singles if noise.endswith(grade) and noise.startswith('white') == white] for white in (True, False)}
+        assert sorted(of[True]) == sorted(of[False]) and len(set(of[True])) == len(of[True]) > 30
+    assert {noise.partition('@')[0] for noise, _ in singles} == {'white', *REALISTIC}
+
+
+def test_sessions_have_seeds_of_their_own_and_a_run_cut_short_has_some_of_each_part():
+    tasks = asked(pairs=80)
+    assert len({arguments[0] for _, arguments in tasks}) == len(tasks)
+    assert sum(len(arguments[2]) for function, arguments in tasks if function is pairs_of_seed) == 80
+    assert {function for function, _ in tasks[:6]} == {effects_of_seed, pairs_of_seed}
+
+
+def test_a_world_that_fails_is_a_row_and_costs_no_other():
+    rows = _each([1, 0, 2], lambda case: {'part': 'x', 'value': 2 // case}, 'what')
+    assert [row['part'] for row in rows] == ['x', 'failed', 'x'] and 'ZeroDivisionError' in rows[1]['why']
+    row, = run((lambda seed, noise: 1 / 0, (1, 'white')))
+    assert row['part'] == 'failed'
+
+
+def test_rows_are_told_by_grade_and_what_was_missed_is_listed():
+    rows = [row(['a'], ['a'], noise=noise, unexplained=False, formulas=[]) for noise in ('white@navigation', 'steps@consumer', 'white', 'flicker@consumer')]
+    assert [(grade, noise, len(some)) for grade, noise, some in by_grade(rows)] == [('industrial', 'white', 1), ('navigation', 'white', 1), ('consumer', 'realistic', 2)]
+    wrong = row(['a'], ['b'], [['c']], noise='steps@tactical', unexplained=True, formulas=[])
+    text = missed({'effects': [*rows, wrong], 'pairs': [wrong | {'hidden': ['a', 'd'], 'beside': {'a': 0.5}}]})
+    assert '- a, steps@tactical, seed 1: b or c, rest unexplained' in text and text.count('- none') == 2 and text.endswith('Excepted pairs: a + d.')

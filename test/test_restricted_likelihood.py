@@ -114,10 +114,11 @@ def test_fewer_parameters_are_fewer_columns_of_the_same_normal_matrix(rows):
     assert all_columns.loss(shape) < all_columns.loss(shape, np.array([0, 2])) + 20
 
 
-def test_the_profile_is_what_least_squares_leaves(rows):
+def test_the_profile_is_what_least_squares_leaves_and_what_it_determines(rows):
     values = rows[0][:, 0]
     left = np.linalg.lstsq(values[:, :-1], values[:, -1], rcond=None)[1][0]
-    np.testing.assert_allclose(profile(values.T @ values, restricted=False), left, rtol=1e-9)
+    determined = np.linalg.slogdet(values[:, :-1].T @ values[:, :-1])[1]
+    np.testing.assert_allclose(profile(values.T @ values), left + determined, rtol=1e-9)
 
 
 def test_a_variance_from_few_data_is_taken_larger():

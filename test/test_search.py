@@ -9,6 +9,7 @@ import pytest
 from imu_calibration.beyond import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel
+from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
@@ -200,10 +201,35 @@ def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
         (process,) = plausible_processes(noise, 0.01, sensor='gyroscope')
         assert process.sd == pytest.approx(most) and process.time == 15.0
         assert noise.at_rest_only(process).offset_sd == 0.0
+    for quietest, most in ((0.008, 0.03), (0.02, 0.06), (0.2, 0.12)):   # where all axes do so up to three times the quietest, and twelve times
+        (process,) = plausible_processes(replace(noise, quietest_wander=quietest), 0.01, sensor='gyroscope')
+        assert process.sd == pytest.approx(most)
     measured = replace(noise, known=(BiasProcess(1e-4, 40.0),))
     assert plausible_processes(measured, 0.01, sensor='gyroscope') == measured.known
     quiet = NoiseModel(np.full(3, 4e-8), np.ones(3), bias_processes=(BiasProcess(2e-4, 15.0),))
     assert plausible_processes(quiet, 0.01, sensor='accelerometer')[0].sd == 2e-4
+
+
+@pytest.mark.parametrize('loud', ([1.0, 0.0, 0.0], [1.0, 1.0, 1.0]))
+def test_a_wander_is_as_large_as_on_the_axis_where_it_is_least(loud):
+    """A bias of ten times the noise of window means that moves with 15 s on one axis, or on all."""
+    rng, n, time = np.random.default_rng(3), 100, np.arange(100) * 5.0
+    decay, drive = np.exp(-5.0 / 15.0), rng.normal(0.0, 10.0, (n, 3))
+    wander = drive.copy()
+    for k in range(1, n):
+        wander[k] = decay * wander[k - 1] + np.sqrt(1 - decay**2) * drive[k]
+    rows = np.stack([np.ones((n, 3)), wander * loud + rng.normal(0.0, 1.0, (n, 3))], axis=2)
+    likelihood = NoiseLikelihood(rows, np.ones((n, 3)), time, sessions=[np.arange(n)])
+    search = BiasProcessSearch(likelihood, 1.0)
+    shape = search.best([0])[0]
+    assert shape[1] > 4.0
+    assert search.quietest(shape, [0]) == pytest.approx(10.0 if all(loud) else 0.0, abs=3.0)
+
+
+def test_a_usual_wander_has_no_price():
+    """Accelerometers may wander by so much whatever their white noise."""
+    search = BiasProcessSearch(SimpleNamespace(typical=2.0), 1.0, 20.0)
+    assert search.price(10.0) == 0.0 and search.price(20.0) == pytest.approx((np.log(2.0) / 0.8)**2)
 
 
 def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sensor():
@@ -222,16 +248,16 @@ def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sens
 
 def test_a_wander_far_beyond_the_natural_one_has_its_price():
     """Two units of likelihood less for eight times the natural size are a drift beside a natural wander, not a wander."""
-    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used, restricted: 100.0 - 2.0 * (shape[1] == 8.0 and shape[2] == 100.0))
-    assert BiasProcessSearch(likelihood, 1.0).best([], True) == ((0.0, 1.0, 100.0), 100.0)
-    assert BiasProcessSearch(likelihood, 4.0).best([], True)[0] == (0.0, 8.0, 100.0)
+    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 2.0 * (shape[1] == 8.0 and shape[2] == 100.0))
+    assert BiasProcessSearch(likelihood, 1.0).best([]) == ((0.0, 1.0, 100.0), 100.0)
+    assert BiasProcessSearch(likelihood, 4.0).best([])[0] == (0.0, 8.0, 100.0)
 
 
 def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
-    """Three parameters that win three units of likelihood are chance."""
-    for won, needed in ((3.0, []), (60.0, [7, 8, 9])):
-        search = SimpleNamespace(best=lambda used, restricted, won=won: (None, 100.0 - won * (len(used) > 2)))
-        assert _needed_smooth(search, [0, 1], [[7, 8, 9]]) == needed
+    """Three parameters whose priors are ten wide win three units of likelihood by chance; 14 are what the priors cost, 6 are strong evidence."""
+    for won, needed in ((3.0, []), (17.0, []), (22.0, [7, 8, 9])):
+        search = SimpleNamespace(best=lambda used, won=won: (None, 100.0 - won * (len(used) > 2)))
+        assert _needed_smooth(search, [0, 1], [[7, 8, 9]], prior_sd=np.full(10, 10.0)) == needed
 
 
 @pytest.mark.parametrize(('apart', 'agree'), ((2.0, True), (6.0, False)))

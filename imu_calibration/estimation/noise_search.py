@@ -44,10 +44,11 @@ class NoiseLikelihood:
                  information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = ()):
         self.typical = float(np.sqrt(np.median(white)))
         self.many, self.known = len(rows) >= LEAST_WINDOWS, known
-        self._white, self._likelihood, self._losses = white, RestrictedLikelihood(rows, times, sessions, information=information), {}
+        self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
+        self._likelihood, self._losses = RestrictedLikelihood(rows, times, sessions, information=information), {}
 
-    def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, restricted: bool = True, *, session: float = 0.0) -> float:
-        """Return minus twice the (restricted) log likelihood with the parameters `used`, all where not given."""
+    def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0) -> float:
+        """Return minus twice the restricted log likelihood with the parameters `used`, all where not given."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:
             offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
@@ -57,7 +58,15 @@ class NoiseLikelihood:
         if used is not None:
             at = np.r_[used, len(normal) - 1]
             normal = normal[np.ix_(at, at)]
-        return logs + profile(normal, restricted)
+        return logs + profile(normal)
+
+    def of_axis(self, axis: int, shape: tuple) -> 'NoiseLikelihood':
+        """Return the same of the noise of one axis, that of the others as the shape says; in units of the axis' own typical noise."""
+        offset, bias, time = np.multiply(shape, (self.typical, self.typical, 1.0))
+        others = np.arange(self._white.shape[1]) != axis
+        information = self._likelihood.of_axes(others).whitened(self._white[:, others] + offset**2, self.processes(bias, time))[1]
+        return NoiseLikelihood(self._rows[:, [axis]], self._white[:, [axis]], self._times, sessions=self._sessions, information=information,
+                               known=self.known)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """Return the known processes with one more where its standard deviation is above zero."""

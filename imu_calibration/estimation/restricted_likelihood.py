@@ -31,6 +31,10 @@ class RestrictedLikelihood:
         self._rows, self._times, self._sessions = rows, times, sessions
         self._information = np.zeros((rows.shape[2],) * 2) if information is None else information
 
+    def of_axes(self, axes: np.ndarray) -> 'RestrictedLikelihood':
+        """Return the same of the rows of some axes only."""
+        return RestrictedLikelihood(self._rows[:, axes], self._times, self._sessions, information=self._information)
+
     def __call__(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> float:
         """Return the value for independent variances of the rows, shape (n, n_axes), bias processes and an offset per session."""
         logs, normal = self.whitened(variance, processes, session_variance)
@@ -69,12 +73,12 @@ class RestrictedLikelihood:
         return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
 
 
-def profile(normal: np.ndarray, restricted: bool = True) -> float:
-    """Return ``y'y - b' A^-1 b``, for the restricted likelihood with ``log|A|``, of the normal matrix ``[[A, b], [b', y'y]]``."""
+def profile(normal: np.ndarray) -> float:
+    """Return ``y'y - b' A^-1 b + log|A|`` of the normal matrix ``[[A, b], [b', y'y]]``."""
     scale = np.sqrt(np.maximum(np.diag(normal)[:-1], 1e-300))
     scaled = normal[:-1, :-1] / np.outer(scale, scale)
     scaled.flat[::len(scaled) + 1] += JITTER
     factor = np.linalg.cholesky(scaled)
     solved = lapack.dtrtrs(factor, normal[:-1, -1] / scale, lower=1)[0]
-    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum() if restricted else 0.0
+    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum()
     return logs + normal[-1, -1] - solved @ solved

@@ -12,8 +12,10 @@ NATURAL = 0.5
 """Every bias is taken to move by at least this many times the white noise of one second, with the first of these correlation times."""
 SPREAD = 0.8
 """Standard deviation of the logarithm of how much more than naturally biases move: what is far beyond it is hardly a wander."""
-RATIOS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
-"""Standard deviations that are tried, in units of the typical noise of a window mean."""
+RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
+"""
+Standard deviations that are tried, in units of the typical noise of a window mean; between steps of two the likelihoods of other times lie.
+"""
 
 
 class BiasProcessSearch:
@@ -25,16 +27,18 @@ class BiasProcessSearch:
     likelihood : NoiseLikelihood
     least : float
         Least standard deviation of the bias process.
+    usual : float
+        The one up to which a larger one is as likely; the least one where that is larger.
 
     """
 
-    def __init__(self, likelihood: NoiseLikelihood, least: float = 0.0):
-        self.likelihood, self.least = likelihood, least / likelihood.typical
+    def __init__(self, likelihood: NoiseLikelihood, least: float = 0.0, usual: float = 0.0):
+        self.likelihood, self.least, self.usual = likelihood, least / likelihood.typical, max(least, usual) / likelihood.typical
 
-    def best(self, used: Sequence[int], restricted: bool = True) -> tuple[tuple, float]:
+    def best(self, used: Sequence[int]) -> tuple[tuple, float]:
         """Return (shape, loss) of the best noise beside the parameters `used`, standard deviations in units of the typical noise."""
         def loss(shape):
-            return self.likelihood.loss(shape, used, restricted) + self.price(shape[1])
+            return self.likelihood.loss(shape, used) + self.price(shape[1])
 
         offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
         shapes = [(offset, self.least, TIMES[0])]
@@ -47,8 +51,16 @@ class BiasProcessSearch:
         return shape, loss(shape)
 
     def price(self, bias: float) -> float:
-        """Return minus twice the log of what is believed of a standard deviation, beside that of the natural one."""
-        return (np.log(max(bias / self.least, 1.0)) / SPREAD)**2 if self.least else 0.0
+        """Return minus twice the log of what is believed of a standard deviation, beside that of the usual one."""
+        return (np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0
+
+    def quietest(self, shape: tuple, used: Sequence[int]) -> float:
+        """Return the likeliest sd of the bias process on the axis where it is least, the others moving as the shape says."""
+        def least(own):
+            offset = shape[0] * self.likelihood.typical / own.typical
+            return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), RATIOS)
+
+        return min(least(self.likelihood.of_axis(axis, shape)) for axis in range(3))
 
     def polished(self, shape: tuple, used: Sequence[int]) -> dict:
         """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
@@ -71,7 +83,7 @@ def _descend(loss: Callable, grid):
         losses.append(loss(value))
         if len(losses) > 4 and losses[-1] > losses[-2] > losses[-3]:
             break
-    return grid[losses.index(min(losses))]
+    return float(grid[losses.index(min(losses))])
 
 
 def _polish(loss: Callable, value):

@@ -13,15 +13,20 @@ from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasPr
 from imu_calibration.selection.normal_matrices import normal_matrix, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
-SMOOTH_PENALTY = 10.0
-"""Fall of minus twice the log likelihood per parameter that an effect smooth in time must win over a bias process."""
+STRONG = 6.0
+"""Twice the logarithm of the Bayes factor by which an effect smooth in time must win over a bias process alone (Kass, Raftery 1995)."""
 PLAUSIBLE = 3.0
 """
 A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one.
 """
-STABLE = {'accelerometer': 3e-4, 'gyroscope': 0.0}
+ALIKE, FAR = 3.0, 4.0
 """
-Whatever the white noise, a wander of up to this much passes for noise, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug.
+So does one of up to this many times that of the quietest axis, and of this many times the plausible one at most: the axes of a sensor are
+of one make and their biases wander alike, while a cable pulls along one.
+"""
+STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
+"""
+Whatever the white noise, a wander of this much is nothing strange, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug.
 """
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
@@ -59,11 +64,16 @@ def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ..
 
 
 def plausible_processes(noise: NoiseModel, period: float, *, sensor: str) -> tuple[BiasProcess, ...]:
-    """Return how a bias moves as far as that passes for noise: as found in the recording, naturally at least, at most as such biases do."""
+    """
+    Return how a bias moves as far as that passes for noise.
+
+    As found in the recording, naturally at least, at most as such biases do: further where all axes do so.
+    """
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
         return natural
-    most = max(PLAUSIBLE * natural[0].sd, STABLE[sensor])
+    most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
+    most = float(np.clip(ALIKE * noise.quietest_wander, most, FAR * most))
     return tuple(replace(process, sd=min(process.sd, most)) for process in noise.bias_processes)
 
 
@@ -117,17 +127,24 @@ def _with_bias_process(space, sensor, noise, smooth):
                                  information=_known_otherwise(space, sensor, noise, own),
                                  known=noise[sensor].known)
     least = 0.0 if noise[sensor].known else natural_processes(noise[sensor], recording.period)[0].sd
-    search = BiasProcessSearch(likelihood, least)
+    search = BiasProcessSearch(likelihood, least, STABLE[sensor])
     options = [[place[k] for k in parameters] for parameters in smooth]
     structural = [k for k in range(len(own)) if not any(k in option for option in options)]
-    used = structural + _needed_smooth(search, structural, options)
-    return replace(noise[sensor], **search.polished(search.best(used)[0], used))
+    used = structural + _needed_smooth(search, structural, options, prior_sd=space.prior_sd[own])
+    shape = search.best(used)[0]
+    quietest = search.quietest(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
+    return replace(noise[sensor], quietest_wander=quietest, **search.polished(shape, used))
 
 
-def _needed_smooth(search, structural, options):
-    """Return the parameters of the smooth effect that beats the bias process in likelihood, each with the noise estimated beside it."""
-    losses = [search.best(structural, restricted=False)[1]]
-    losses += [search.best(structural + option, restricted=False)[1] + SMOOTH_PENALTY * len(option) for option in options]
+def _needed_smooth(search, structural, options, *, prior_sd):
+    """
+    Return the parameters of the smooth effect that beats the bias process, each with the noise estimated beside it.
+
+    By restricted likelihood, all parameters integrated out under their priors: at its maximum over as many as there are windows the wander
+    comes out too small, and noise of 15 s looks like a drift.
+    """
+    losses = [search.best(structural)[1]]
+    losses += [search.best(structural + option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options]
     return ([[]] + options)[int(np.argmin(losses))]
 
 

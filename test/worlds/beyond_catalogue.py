@@ -18,15 +18,11 @@ MEASURES = ('flagged', 'axis', 'family', 'lowered', 'place', 'no name')
 """What is drawn of each kind."""
 
 
-def rows_of_seed(seed, noise, kinds, size=1.0):
-    """Hide nothing, then a cause of each kind, in the session of a seed: rows of the record."""
-    empty, known = row_of(seed, NOTHING, noise, None)
-    rows = [empty]
-    for kind in kinds:
-        row, values = row_of(seed, kind, noise, Beyond(kind, seed, size))
-        moved = [(values[name][0] - value) / values[name][1] for name, (value, _) in known.items()]
-        rows.append(row | {'known_bias': float(np.sqrt(np.mean(np.square(moved))))})
-    return rows
+def hidden_row(seed, kind, noise, *, known, size=1.0):
+    """Return the row of the session of a seed with a cause of a kind; `known` are bias and matrix without it."""
+    row, values = row_of(seed, kind, noise, Beyond(kind, seed, size))
+    moved = [(values[name][0] - value) / values[name][1] for name, (value, _) in known.items()]
+    return row | {'known_bias': float(np.sqrt(np.mean(np.square(moved))))}
 
 
 def row_of(seed, kind, noise, cause=None):

@@ -7,8 +7,13 @@ import numpy as np
 
 from worlds import beyond_catalogue
 from worlds.hide_and_seek_report import class_sizes, first_is_right, strictly_first
-from worlds.hide_and_seek_sections import both_found, separable, wrong_names
+from worlds.hide_and_seek_sections import both_found, by_grade, kind_of, separable, wrong_names
 
+BARS = {'white': '97 %', 'realistic': '95 %'}
+"""Share of single effects that is to be named first."""
+
+LEAST = 0.85
+"""Share below which no single effect shall be."""
 MARKS = ('<!-- {}: begin -->', '<!-- {}: end -->')
 
 
@@ -18,6 +23,8 @@ def write_figures(rows, docs):
     for row in rows:
         parts.setdefault(row['part'], []).append(row)
     _replace(docs / 'hide-and-seek.md', _table(rows, parts))
+    if {'effects', 'none', 'pairs'} & set(parts):
+        _replace(docs / 'hide-and-seek.md', missed(parts), 'missed')
     if 'beyond' in parts:
         _replace(docs / 'hide-and-seek.md', beyond_table(parts['beyond']), 'beyond')
     _replace(docs.parent / 'README.md', _sentence(rows, parts))
@@ -45,21 +52,32 @@ def _count(values):
     return f'{sum(values)} of {len(values)}'
 
 
+def _percent(values):
+    values = list(values)
+    return f'{_count(values)} ({100 * np.mean(values):.1f} %)'
+
+
 def _table(rows, parts):
     effects = parts.get('effects', [])
-    lines = [f'{len(rows)} sessions, {date.today().isoformat()}, made and counted by `make hide-and-seek`:', '', '| what | required | measured |', '| --- | --- | --- |']
-    for noise in sorted({row['noise'] for row in effects}, reverse=True):
-        some = [row for row in effects if row['noise'] == noise]
-        lines.append(f'| hidden effect first, or in the class of the first finding, {noise} noise | 97 % | {_count(map(first_is_right, some))} '
+    seeds = [row['seed'] for row in rows if 'seed' in row]
+    lines = [f'{len(seeds)} sessions, seeds {min(seeds, default=0)} to {max(seeds, default=0)}, {date.today().isoformat()}, made and counted by `make hide-and-seek`:', '', '| what | required | measured |', '| --- | --- | --- |']
+    for grade, noise, some in by_grade(effects):
+        lines.append(f'| hidden effect first, or in the class of the first finding, {grade} grade, {noise} noise | {BARS[noise]} | {_percent(map(first_is_right, some))} '
                      f'(strictly first {_count(map(strictly_first, some))}; nothing else named {_count(len(row["found"]) == 1 for row in some)}) |')
+    for noise in BARS:
+        some = [row for _, kind, part in by_grade(effects) for row in part if kind == noise]
+        if some:
+            kinds = sorted(set(map(kind_of, some)))
+            each = '; '.join(f'{kind} {_count(first_is_right(row) for row in some if kind_of(row) == kind)}' for kind in kinds) if len(kinds) > 1 else ''
+            lines.append(f'| the same, all grades, {noise} noise | {BARS[noise]} | {_percent(map(first_is_right, some))}{": " + each if each else ""} |')
     if effects:
         sizes = class_sizes(effects)
         lines.append(f'| of the right ones, told with mates that the recording cannot tell apart |  | {_count(sizes > 1)} |')
         names = sorted({row['hidden'][0] for row in effects})
         shares = {name: np.mean([first_is_right(row) for row in effects if row['hidden'][0] == name]) for name in names}
-        worst = min(names, key=shares.get)
-        lines.append(f'| the same for each of the {len(names)} effects, the worst | 85 % | {100 * shares[worst]:.0f} %'
-                     + (f' ({worst})' if shares[worst] < 1 else '') + ' |')
+        low = [name for name in sorted(names, key=shares.get) if shares[name] < LEAST]
+        lines.append(f'| the same for each of the {len(names)} effects, all grades and noises together, the worst | 85 % | {100 * min(shares.values()):.0f} %'
+                     + (f'; below 85 %: {", ".join(f"{name} {100 * shares[name]:.0f} %" for name in low)}' if low else '') + ' |')
     separating = parts.get('separating', [])
     if separating:
         lines.append(f'| sessions made to separate a class: strictly first | as often | {_count(map(strictly_first, separating))} |')
@@ -70,35 +88,62 @@ def _table(rows, parts):
     levels = [row['level_error'] for row in effects if 'level_error' in row]
     if levels:
         lines.append(f'| saturation level within 1 % | all | {_count(level < 0.01 for level in levels)} |')
-    for noise in sorted({row['noise'] for row in parts.get('none', [])}, reverse=True):
-        lines.append(f'| a finding where nothing is hidden, {noise} noise | at most 2 of 60 | '
-                     f'{_count(bool(row["found"]) for row in parts["none"] if row["noise"] == noise)} |')
+    for what, told in (('a finding', 'found'), ('"unexplained"', 'unexplained'), ('a formula', 'formulas')):
+        each = [(grade, noise, [bool(row[told]) for row in some]) for grade, noise, some in by_grade(parts.get('none', []))]
+        if each:
+            lines.append(f'| nothing hidden: {what} | at most 2 % | {_percent(value for *_, some in each for value in some)} '
+                         f'({"; ".join(f"{grade} {noise} {_count(some)}" for grade, noise, some in each)}) |')
     outside = parts.get('outside', [])
     if outside:
         lines.append(f'| cause outside the catalogue: the rest is significant | 95 % | {_count(row["unexplained"] for row in outside)} |')
         lines.append(f'| cause outside the catalogue: nothing named | 80 % | {_count(not row["found"] for row in outside)} |')
     pairs = [row for row in parts.get('pairs', []) if separable(row)]
     if pairs:
-        lines.append(f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these sessions cannot separate: both named | 90 % | {_count(map(both_found, pairs))} |')
-        lines.append(f'| the same: a wrong name | 2 % | {_count(bool(wrong_names(row)) for row in pairs)} |')
-    for factor in sorted({row['factor'] for row in parts.get('sizes', []) if row['factor'] > 5}):
+        lines.append(f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these sessions cannot separate: both named | 90 % | {_percent(map(both_found, pairs))} |')
+        lines.append(f'| the same: a wrong name | at most 2 % | {_percent(bool(wrong_names(row)) for row in pairs)} |')
+    for factor in sorted({row['factor'] for row in parts.get('sizes', [])}):
         some = [row for row in parts['sizes'] if row['factor'] == factor]
-        lines.append(f'| {factor:g} times the smallest detectable size: first right | 95 % | {_count(map(first_is_right, some))} |')
+        marked = sum(first_is_right(row) and row['implausible'][0] for row in some)
+        lines.append(f'| {factor:g} times the smallest detectable size: first right | {"95 %" if factor > 5 else ""} | {_percent(map(first_is_right, some))}, {marked} of them with the mark |')
     if 'traps' in parts:
         lines.append(f'| traps that give a finding | none | {_count(bool(row["found"]) for row in parts["traps"])} |')
     ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
     if ratios:
         lines.append(f'| held-out rms over that of a fit with the right effect alone, median (1 where nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |')
+    if 'failed' in parts:
+        lines.append(f'| tasks or worlds that failed and are counted nowhere | none | {len(parts["failed"])} |')
     seconds = [row['seconds'] for row in rows if 'seconds' in row] or [np.nan]
-    lines.append(f'| processor time per diagnosis, five minutes at 100 Hz | 5 s | median {np.median(seconds):.1f} s, 95 % below '
+    lines.append(f'| processor time per diagnosis, five minutes at 100 Hz | 5 s, 95 % 10 s | median {np.median(seconds):.1f} s, 95 % below '
                  f'{np.quantile(seconds, 0.95):.1f} s, largest {np.max(seconds):.1f} s |')
     return '\n'.join(lines)
 
 
 def _sentence(rows, parts):
-    effects, outside = parts.get('effects', []), parts.get('outside', [])
-    none = parts.get('none', [])
-    return (f'Measured on {date.today().isoformat()} over {len(rows)} simulated sessions, each cause at five times its smallest detectable size: the hidden effect is named first, or in the '
-            f'class of the first finding, in {_count(map(first_is_right, effects))}; nothing hidden gave a finding in {_count(bool(row["found"]) for row in none)}; a cause '
-            f'that no catalogue holds was reported as unexplained in {_count(row["unexplained"] for row in outside)} and given a name in '
-            f'{_count(bool(row["found"]) for row in outside)}; two effects at once were both found in {_count(map(both_found, parts.get("pairs", [])))}.')
+    effects, none, beyond = (parts.get(name, []) for name in ('effects', 'none', 'beyond'))
+    hidden = [row for row in beyond if row['kind'] != beyond_catalogue.NOTHING]
+    pairs = [row for row in parts.get('pairs', []) if separable(row)]
+    told = [
+        (effects, f'each cause at five times its smallest detectable size and at four grades the hidden effect is named first, or in the class of the first finding, in {_count(map(first_is_right, effects))}'),
+        (none, f'nothing hidden gave a finding in {_count(bool(row["found"]) for row in none)}'),
+        (hidden, f'a cause that no catalogue holds was reported as unexplained in {_count(row["flagged"] for row in hidden)} and given a name in '
+                 f'{_count(bool(row["found"]) for row in hidden)}'),
+        (pairs, f'two effects at once were both found in {_count(map(both_found, pairs))}')]
+    return f'Measured on {date.today().isoformat()} over {len(rows)} simulated sessions: ' + '; '.join(text for some, text in told if some) + '.'
+
+
+def missed(parts):
+    """Return what was not told rightly as a list: single effects, sessions that hide nothing, pairs, and pairs that were excepted."""
+    lines = ['Single effects that were not named first:', '']
+    lines += [f'- {row["hidden"][0]}, {row["noise"]}, seed {row["seed"]}: {_told(row)}' for row in parts.get('effects', []) if not first_is_right(row)] or ['- none']
+    lines += ['', 'Nothing hidden, and not silent:', '']
+    lines += [f'- {row["noise"]}, seed {row["seed"]}: {_told(row)}' for row in parts.get('none', []) if row['found'] or row['unexplained'] or row['formulas']] or ['- none']
+    pairs = parts.get('pairs', [])
+    lines += ['', 'Pairs of which not both were named, or something else too:', '']
+    lines += [f'- {" + ".join(row["hidden"])}, seed {row["seed"]}: {_told(row)}' for row in pairs if separable(row) and (not both_found(row) or wrong_names(row))] or ['- none']
+    excepted = sorted(' + '.join(row['hidden']) for row in pairs if not separable(row))
+    return '\n'.join([*lines, '', f'Excepted pairs: {", ".join(excepted) or "none"}.'])
+
+
+def _told(row):
+    said = [' or '.join([name, *mates]) for name, mates in zip(row['found'], row['classes'])] or ['nothing named']
+    return ', '.join(said) + (', rest unexplained' if row['unexplained'] else '') + (f', formula {" and ".join(row["formulas"])}' if row['formulas'] else '')

@@ -6,7 +6,7 @@ from datetime import date
 import numpy as np
 
 from worlds import beyond_catalogue
-from worlds.hide_and_seek_sections import print_pairs, print_sizes
+from worlds.hide_and_seek_sections import by_grade, kind_of, print_pairs, print_sizes
 
 
 def report(rows, docs):
@@ -25,7 +25,6 @@ def report(rows, docs):
     _traps(parts['traps'])
     _oracle(parts['effects'])
     _classes(parts['effects'])
-    _grades(parts['grades'])
     _beyond(parts['beyond'])
     _seconds(rows)
     for row in parts['failed']:
@@ -57,10 +56,14 @@ def _share(values):
 def _effects(rows, what):
     if not rows:
         return
-    for noise in sorted({row['noise'] for row in rows}):
-        some = [row for row in rows if row['noise'] == noise]
-        print(f'\nfirst finding right or in its class, {what}, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
+    for grade, noise, some in by_grade(rows):
+        print(f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
               f'{_share(map(strictly_first, some))}; nothing else named {_share(len(row["found"]) == 1 for row in some)}')
+    for kind in sorted(set(map(kind_of, rows))):
+        print(f'  {kind}: {_share(first_is_right(row) for row in rows if kind_of(row) == kind)}')
+    for row in rows:
+        if not first_is_right(row):
+            print(f"  {row['hidden'][0]} seed {row['seed']} {row['noise']}: {row['found']} {row['classes']}, rest significant: {row['unexplained']}")
     names = sorted({row['hidden'][0] for row in rows})
     weak = [(name, [first_is_right(row) for row in rows if row['hidden'][0] == name]) for name in names]
     for name, right in weak:
@@ -100,11 +103,12 @@ def _separating(rows):
 
 
 def _nothing(rows, what):
-    for noise in sorted({row['noise'] for row in rows}):
-        some = [row for row in rows if row['noise'] == noise]
-        named = [row['found'] for row in some if row['found']]
-        print(f'\n{what}, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)} {named}; '
-              f'significant rest in {_share(row["unexplained"] for row in some)}')
+    for grade, noise, some in by_grade(rows):
+        print(f'\n{what}, {grade} grade, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)}; '
+              f'significant rest in {_share(row["unexplained"] for row in some)}; a formula in {_share(bool(row["formulas"]) for row in some)}')
+        for row in some:
+            if row['found'] or row['unexplained'] or row['formulas']:
+                print(f"  seed {row['seed']} {row['noise']}: {row['found']}, rest significant: {row['unexplained']}, {row['formulas']}")
 
 
 def _outside(rows):
@@ -135,17 +139,6 @@ def _classes(rows):
     sizes = class_sizes(rows)
     if len(sizes):
         print(f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two: {_share(sizes[sizes > 1] > 2)}')
-
-
-def _grades(rows):
-    for grade in sorted({row['grade'] for row in rows}):
-        some = [row for row in rows if row['grade'] == grade]
-        hidden, empty = [row for row in some if row['hidden']], [row for row in some if not row['hidden']]
-        print(f'\ngrade {grade}: first finding right or in its class {_share(map(first_is_right, hidden))}; nothing hidden: a finding '
-              f'{_share(bool(row["found"]) for row in empty)}, unexplained {_share(row["unexplained"] for row in empty)}')
-        for row in hidden:
-            if not first_is_right(row):
-                print(f'  {row["hidden"][0]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
 
 
 def _beyond(rows):

@@ -1,4 +1,4 @@
-"""Two sections of hide and seek: all pairs of effects at once, and effects from the smallest detectable size to a hundred times it."""
+"""Sections of hide and seek: grades and kinds of noise, all pairs of effects at once, and effects from the smallest detectable size to a hundred times it."""
 
 import numpy as np
 
@@ -7,6 +7,26 @@ def share_of(values):
     """Return how many of some truths hold, as text."""
     values = list(values)
     return f'{sum(values)}/{len(values)} ({100 * np.mean(values):.1f} %)' if values else 'none'
+
+
+def grade_of(row):
+    """Return the grade of the sensors of a row."""
+    return row['noise'].partition('@')[2] or 'industrial'
+
+
+def kind_of(row):
+    """Return the kind of noise of a row, without the grade."""
+    return row['noise'].partition('@')[0]
+
+
+def by_grade(rows):
+    """Yield (grade, 'white' or 'realistic', rows), the largest noise first; every kind but white is realistic."""
+    order = ('consumer', 'industrial', 'tactical', 'navigation')
+    for white in (True, False):
+        for grade in order:
+            some = [row for row in rows if grade_of(row) == grade and (kind_of(row) == 'white') == white]
+            if some:
+                yield grade, 'white' if white else 'realistic', some
 
 
 def both_found(row):

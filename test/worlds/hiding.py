@@ -1,6 +1,7 @@
 """Sessions with something hidden in them, as large as a search could just detect, or any multiple of it; recorded through a bag."""
 
 import tempfile
+import time
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +21,7 @@ from worlds import physics
 from worlds.physics_draw import EFFECTS, POSITIVE, draw_value, generator
 
 NOT_SIZED = {'earth_rate'}
-"""The Earth turns as fast as it does: it is sought with a tactical grade of noise, where it is well above detectability."""
+"""The Earth turns as fast as it does."""
 LEAST_CLIPPED_SHARE = 2e-4
 """Smallest detectable share of clipped samples: about six in five minutes at 100 Hz."""
 
@@ -61,7 +62,7 @@ def record(seed, hidden=None, noise='white', through_bag=True, **options):
 
 def options_of(*effects):
     """Return the options of sessions that hide effects."""
-    return {**({'grade': 'tactical'} if NOT_SIZED & set(effects) else {}), **({'temperature': 'cycle'} if any(name.endswith('_hysteresis') for name in effects) else {})}
+    return {'temperature': 'cycle'} if any(name.endswith('_hysteresis') for name in effects) else {}
 
 
 @lru_cache(maxsize=8)
@@ -71,7 +72,7 @@ def _empty(seed, noise, options):
 
 def sizes_for(seed, noise, effects, options):
     """Return the Sizes in the session of a seed that hides nothing, of the kind that shows the effects."""
-    return _empty(seed, noise, tuple(sorted({**options, **options_of(*(set(effects) - NOT_SIZED))}.items())))
+    return _empty(seed, noise, tuple(sorted({**options, **options_of(*effects)}.items())))
 
 
 def pattern(effect, seed, n_joints=3):
@@ -105,7 +106,9 @@ class Sizes:
     """Smallest detectable sizes: the search finds half of them, the baseline projected out, from the session that hides nothing."""
 
     def __init__(self, recording):
-        self.attempt = investigate(recording.windows, recording.table, recording.model).attempt
+        self.recording, start = recording, time.process_time()
+        self.found = investigate(recording.windows, recording.table, recording.model)
+        self.seconds, self.attempt = time.process_time() - start, self.found.attempt
         evidence, used = self.attempt.evidence, np.array(self.attempt.search.baseline)
         prior = np.diag(1 / self.attempt.space.prior_sd[used]**2)
         normal = evidence.total[:-1, :-1]
