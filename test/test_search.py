@@ -9,7 +9,7 @@ import pytest
 from imu_calibration.beyond import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel
-from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
@@ -198,16 +198,16 @@ def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
     """Natural is 0.01; the found one in its own time, up to three times as much, offsets of windows never."""
     for found, most in ((0.005, 0.01), (0.02, 0.02), (0.5, 0.03)):
         noise = NoiseModel(np.full(3, 0.04), np.ones(3), 0.2, (BiasProcess(max(found, 0.01), 15.0),))
-        (process,) = plausible_processes(noise, 0.01, sensor='gyroscope')
+        (process,) = plausible_processes(noise, 0.01, sensor='gyroscope', duration=1e9)
         assert process.sd == pytest.approx(most) and process.time == 15.0
         assert noise.at_rest_only(process).offset_sd == 0.0
     for quietest, most in ((0.008, 0.03), (0.02, 0.06), (0.2, 0.12)):   # where all axes do so up to three times the quietest, and twelve times
-        (process,) = plausible_processes(replace(noise, quietest_wander=quietest), 0.01, sensor='gyroscope')
+        (process,) = plausible_processes(replace(noise, quietest_wander=quietest), 0.01, sensor='gyroscope', duration=1e9)
         assert process.sd == pytest.approx(most)
     measured = replace(noise, known=(BiasProcess(1e-4, 40.0),))
-    assert plausible_processes(measured, 0.01, sensor='gyroscope') == measured.known
+    assert plausible_processes(measured, 0.01, sensor='gyroscope', duration=1e9) == measured.known
     quiet = NoiseModel(np.full(3, 4e-8), np.ones(3), bias_processes=(BiasProcess(2e-4, 15.0),))
-    assert plausible_processes(quiet, 0.01, sensor='accelerometer')[0].sd == 2e-4
+    assert plausible_processes(quiet, 0.01, sensor='accelerometer', duration=1e9)[0].sd == 2e-4
 
 
 @pytest.mark.parametrize('loud', ([1.0, 0.0, 0.0], [1.0, 1.0, 1.0]))
@@ -226,10 +226,44 @@ def test_a_wander_is_as_large_as_on_the_axis_where_it_is_least(loud):
     assert search.quietest(shape, [0]) == pytest.approx(10.0 if all(loud) else 0.0, abs=3.0)
 
 
+def test_a_session_sees_a_part_of_a_slow_wander():
+    """About the mean of a session of 100 s, a tenth of the correlation time: the variance of sums of the covariance, in steps of 0.1 s."""
+    time = np.arange(0.05, 100.0, 0.1)
+    covariance = 4.0 * np.exp(-np.abs(time[:, None] - time) / 1000.0)
+    assert BiasProcess(2.0, 1000.0).within(100.0) == pytest.approx(np.sqrt(4.0 - covariance.mean()), rel=1e-3)
+    assert BiasProcess(2.0, 15.0).within(1e9) == pytest.approx(2.0)
+    noise = NoiseModel(np.full(3, 0.04), np.ones(3), bias_processes=(BiasProcess(0.08, 1000.0),))
+    assert plausible_processes(noise, 0.01, sensor='gyroscope', duration=100.0) == noise.bias_processes
+
+
+@pytest.mark.parametrize(('won', 'found'), ((5.0, False), (30.0, True)))
+def test_offsets_of_windows_have_their_price(won, found):
+    """Flicker scatters means beyond a wander of 15 s by a little; what moves with the pose does by more."""
+    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - won * (shape[0] > 0))
+    assert (BiasProcessSearch(likelihood, 1.0).best([])[0][0] > 0) == found
+
+
+def test_what_replaces_an_effect_is_significant_itself():
+    """The product predicts held-out windows better than the quadratic, and nobody would have named it."""
+    for p_value, kept in ((1e-12, PRODUCT), (0.5, QUADRATIC)):
+        evidence = Known(lambda used: {frozenset(): 200.0, frozenset([0]): 100.0}.get(used, 40.0), p=p_value)
+        assert Search(evidence, (), [QUADRATIC, PRODUCT]).reconsidered([QUADRATIC]) == [kept]
+
+
+def test_flicker_is_as_much_of_each_time():
+    likelihood = NoiseLikelihood.__new__(NoiseLikelihood)
+    likelihood.known = ()
+    made = likelihood.processes(3.0, FLICKER)
+    assert len(made) > 3 and len({process.sd for process in made}) == 1 and sum(process.sd**2 for process in made) == pytest.approx(9.0)
+    assert likelihood.processes(3.0, 40.0) == (BiasProcess(3.0, 40.0),)
+    likeliest = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 5.0 * (shape[2] == FLICKER))
+    assert BiasProcessSearch(likeliest, 1.0).best([])[0] == (0.0, 1.0, FLICKER)
+
+
 def test_a_usual_wander_has_no_price():
     """Accelerometers may wander by so much whatever their white noise."""
     search = BiasProcessSearch(SimpleNamespace(typical=2.0), 1.0, 20.0)
-    assert search.price(10.0) == 0.0 and search.price(20.0) == pytest.approx((np.log(2.0) / 0.8)**2)
+    assert search.price(0.0, 10.0) == 0.0 and search.price(0.0, 20.0) == pytest.approx((np.log(2.0) / 0.8)**2)
 
 
 def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sensor():

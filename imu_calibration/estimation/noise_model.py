@@ -20,6 +20,15 @@ class BiasProcess:
     time: float
     """Correlation time, s; long against the session it is a random walk, several of them in a row of times make flicker noise."""
 
+    def within(self, duration: float) -> float:
+        """
+        Return the standard deviation about its mean over a time, s: what a session sees of it.
+
+        ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
+        """
+        ratio = self.time / duration
+        return self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1))) if ratio > 1e-6 else self.sd
+
 
 @dataclass(frozen=True, eq=False)
 class MovingFactors:

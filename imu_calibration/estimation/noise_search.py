@@ -19,6 +19,8 @@ TIME_GRID = np.array([40.0, 100.0, 250.0])
 """Offset and bias process in units of the typical noise of a window mean; correlation times in s."""
 SESSION_GRID = 4.0 ** np.arange(-3, 8)
 """Steps from recording to recording in the same units; the best of them is refined by factors of two and of the root of two."""
+FLICKER, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
+"""Correlation time that stands for flicker: as much with each of some times in a row, s, from that of a window to that of a session."""
 LEAST_WINDOWS = 12
 """Fewer windows say nothing of a bias process."""
 
@@ -69,8 +71,9 @@ class NoiseLikelihood:
                                known=self.known)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
-        """Return the known processes with one more where its standard deviation is above zero."""
-        return (*self.known, BiasProcess(sd, time)) if sd > 0 else self.known
+        """Return the known processes with one more, or with those of flicker, where their standard deviation is above zero."""
+        times = FLICKER_TIMES if time == FLICKER else (time,)
+        return (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times)) if sd > 0 else self.known
 
 
 def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray], information: np.ndarray,

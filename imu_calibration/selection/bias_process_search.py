@@ -4,14 +4,16 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
 
-TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0)
-"""Correlation times that are tried, s; that of the natural process first."""
+TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER)
+"""Correlation times that are tried, s, and flicker; that of the natural process first."""
 NATURAL = 0.5
 """Every bias is taken to move by at least this many times the white noise of one second, with the first of these correlation times."""
 SPREAD = 0.8
 """Standard deviation of the logarithm of how much more than naturally biases move: what is far beyond it is hardly a wander."""
+OFFSETS = 10.0
+"""Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows beyond a wander of 15 s as they do."""
 RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
 """
 Standard deviations that are tried, in units of the typical noise of a window mean; between steps of two the likelihoods of other times lie.
@@ -38,7 +40,7 @@ class BiasProcessSearch:
     def best(self, used: Sequence[int]) -> tuple[tuple, float]:
         """Return (shape, loss) of the best noise beside the parameters `used`, standard deviations in units of the typical noise."""
         def loss(shape):
-            return self.likelihood.loss(shape, used) + self.price(shape[1])
+            return self.likelihood.loss(shape, used) + self.price(*shape[:2])
 
         offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
         shapes = [(offset, self.least, TIMES[0])]
@@ -50,9 +52,9 @@ class BiasProcessSearch:
         shape = min(shapes, key=loss)
         return shape, loss(shape)
 
-    def price(self, bias: float) -> float:
-        """Return minus twice the log of what is believed of a standard deviation, beside that of the usual one."""
-        return (np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0
+    def price(self, offset: float, bias: float) -> float:
+        """Return minus twice the log of what is believed of offsets, beside none, and of the sd of a bias, beside the usual one."""
+        return OFFSETS * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0)
 
     def quietest(self, shape: tuple, used: Sequence[int]) -> float:
         """Return the likeliest sd of the bias process on the axis where it is least, the others moving as the shape says."""
@@ -66,7 +68,7 @@ class BiasProcessSearch:
         """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
         offset, bias, time = shape
         offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
-        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used) + self.price(x), bias), self.least)
+        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used) + self.price(offset, x), bias), self.least)
         unit = self.likelihood.typical
         return {'offset_sd': offset * unit, 'bias_processes': self.likelihood.processes(bias * unit, time)}
 

@@ -63,18 +63,20 @@ def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ..
     return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0]),)
 
 
-def plausible_processes(noise: NoiseModel, period: float, *, sensor: str) -> tuple[BiasProcess, ...]:
+def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, duration: float) -> tuple[BiasProcess, ...]:
     """
     Return how a bias moves as far as that passes for noise.
 
-    As found in the recording, naturally at least, at most as such biases do: further where all axes do so.
+    As found in the recording, naturally at least, at most as such biases do within its duration, s: further where all axes do so.
     """
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
         return natural
+    seen = float(np.sqrt(sum(process.within(duration)**2 for process in noise.bias_processes)))
     most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
-    most = float(np.clip(ALIKE * noise.quietest_wander, most, FAR * most))
-    return tuple(replace(process, sd=min(process.sd, most)) for process in noise.bias_processes)
+    alike = ALIKE * noise.quietest_wander * seen / float(np.sqrt(noise.bias_variance))
+    share = min(1.0, float(np.clip(alike, most, FAR * most)) / seen)
+    return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
 
 def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:

@@ -190,7 +190,7 @@ class Search:
                     continue
                 trial = [*chosen[:place], other, *chosen[place + 1:]]
                 value = self.cost(trial)
-                if value < cost and all(self.allowed(trial, each) for each in trial):
+                if value < cost and all(self.allowed(trial, each) for each in trial) and self.score(rest, other).significant:
                     best, cost = trial, value
         return best
 
