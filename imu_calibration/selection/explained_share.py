@@ -39,7 +39,8 @@ class Explained:
     def __init__(self, evidence: WindowEvidence, search: Search):
         self.search, recording = search, evidence.space.recording
         duration = float(np.ptp(recording.time))
-        noise = {s: own.at_rest_only(*plausible_processes(own, recording.period, sensor=s, duration=duration)) for s, own in evidence.noise.items()}
+        noise = {sensor: own.at_rest_only(*plausible_processes(own, recording.period, sensor=sensor, duration=duration))
+                 for sensor, own in evidence.noise.items()}
         noise['gyroscope'] = with_steps_of_encoders(noise['gyroscope'], recording, step=search.encoder_step)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold)
         self.n_means = 3.0 * len(recording.windows)
