@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from imu_calibration.effects.lags import total_lags
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
@@ -72,6 +73,10 @@ def spread(first, second):
         other = theirs.get(name)
         if other and 'held' not in (status, other[2]) and not name.startswith('reference'):
             groups.setdefault(name.rpartition('.')[0], []).append((value - other[0]) / np.hypot(sd, other[1]))
+    lags = [total_lags(each.param_names, each.values, each.covariance) for each in (first, second)]
+    for sensor in set(lags[0]) & set(lags[1]):
+        (value, sd), (other, others) = (each[sensor] for each in lags)
+        groups[f'lag of the {sensor} in all'] = [(value - other) / np.hypot(sd, others)]
     return groups
 
 

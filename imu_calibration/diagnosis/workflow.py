@@ -19,6 +19,7 @@ from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import LEAVES_MOST
 from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.lags import total_lags
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
@@ -51,12 +52,20 @@ class DiagnosisResult:
     @property
     def document(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""
-        return to_mapping(self.diagnosis)
+        lags = {sensor: {'value': value, 'sd': sd, 'unit': 's'} for sensor, (value, sd) in self.lags.items()}
+        return to_mapping(self.diagnosis) | {'lags': lags}
 
     @property
     def lines(self) -> list[str]:
         """What was found, in lines for people."""
-        return diagnosis_lines(self.diagnosis)
+        words = [f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms' for sensor, (value, sd) in self.lags.items()]
+        return diagnosis_lines(self.diagnosis) + [f'lag in all, however it is told: {", ".join(words)}'] * bool(words)
+
+    @property
+    def lags(self) -> dict[str, tuple[float, float]]:
+        """Sensor -> (what its output lags by in all, standard deviation), s: where halves share it out otherwise this repeats."""
+        found = self.calibration
+        return total_lags(found.param_names, found.values, found.covariance)
 
 
 def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,

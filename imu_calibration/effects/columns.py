@@ -14,7 +14,7 @@ from imu_calibration.reference.table import Table
 
 
 def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
-                     values: dict[str, np.ndarray] | None = None) -> Reference:
+                     values: dict[str, np.ndarray] | None = None, roughly: bool = False) -> Reference:
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -22,6 +22,8 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
     ----------
     values : dict, optional
         Effect name -> values that replace the point of those effects.
+    roughly : bool
+        Take a lag for a delay of the same first derivative: a filter, which is a mean over several, costs as many times as much.
 
     """
     branches = [(1.0, table, motion)]
@@ -32,7 +34,8 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         at = model.point_of(effect) if at is None else np.atleast_1d(at)
         if not np.any(at):
             continue
-        branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in effect.warp(a, b, at)]
+        warp = getattr(effect.warp, 'single', effect.warp) if roughly else effect.warp
+        branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in warp(a, b, at)]
     references = [(weight, reference_motion(t, m, temperature_c)) for weight, t, m in branches]
     return mean_reference(references, motion)
 
@@ -59,17 +62,17 @@ class References:
         self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
         self._known: dict[tuple, Reference] = {}
 
-    def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None) -> Reference:
-        """Return the reference of `sensor`, with other values for one effect where given."""
+    def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
+        """Return the reference of `sensor`, with other values for one effect where given; `roughly` as in `warped_reference`."""
         acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
         change, moved = None, ()
         if effect is not None and values is not None:
             change = {effect.name: values}
             moved = (effect.name, *values) if np.any(values != self.model.point_of(effect)) else ()
-        key = (acting, *moved)
+        key = (roughly, acting, *moved)
         if key not in self._known:
             self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
-                                                values=change)
+                                                values=change, roughly=roughly)
         return self._known[key]
 
 
@@ -106,9 +109,11 @@ def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references:
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock   # a lag of zero is a delay to first order
     inputs, levers = [], []
-    # A search, which folds the arms, asks for so many warps that it takes half the references, and errs by the curvature over a step.
-    for above, below, width in _steps(effect, model.point_of(effect), forward=model.folded_arms is not None):
-        ends = [references.at(sensor, effect, at) for at in (above, below)]
+    # A search, which folds the arms, asks for so many warps that it takes half the references, and errs by the curvature over a step; what
+    # it only asks about it asks beside a delay instead of a filter.
+    asking = model.folded_arms is not None
+    for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
+        ends = [references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect))) for at in (above, below)]
         change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
         if sensor == 'accelerometer' and model.arms and (model.folded_arms is None or model.folded_arms.any()):
             turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(ends[1].rate_s, ends[1].alpha_s)

@@ -1,5 +1,7 @@
 """Lags of the sensors: a filter or a delay between what is felt and what is sent."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, SHORT, Effect
@@ -43,6 +45,11 @@ class _Lag:
     def __init__(self, pairs):
         self.pairs = pairs
 
+    @property
+    def single(self) -> '_Lag':
+        """The delay of the same first derivative."""
+        return _Lag(((1.0, 1.0),))
+
     def __call__(self, table: Table, motion: JointMotion, values: np.ndarray) -> list[tuple[float, Table, JointMotion]]:
         """Return (weight, table, motion) of each."""
         return [(weight, table, shifted(motion, values[0] * delay)) for weight, delay in self.pairs]
@@ -51,14 +58,45 @@ class _Lag:
 def _lag_effect(sensor, ending):
     component, pairs, does = _KINDS[ending]
     return Effect(
-        name=f'{SHORT[sensor]}_{ending}', sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
+        name=lag_name(sensor, ending), sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
         explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
         tolerance_reason=('1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer'
                           else '0.1 deg/s while the rate changes by 1000 deg/s^2'),
         motion=('oscillate_fast',), compensation='none', warp=_Lag(pairs), acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
 
 
+def lag_name(sensor: str, ending: str) -> str:
+    """Return the name of the lag of a sensor: of 'bandwidth', 'delay' or 'filter'."""
+    return f'{SHORT[sensor]}_{ending}'
+
+
 LAGS = tuple(_lag_effect(sensor, ending) for ending in _KINDS for sensor in SENSORS)
 """
 First-order filter, pure delay and second-order filter of each sensor; what is alike where it is small is told apart where it is large.
 """
+
+CLOCK = 'time_offset'
+"""What both sensors lag by alike: of the clocks."""
+FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
+"""Effects with one first derivative."""
+
+
+def total_lags(names: Sequence[str], values: np.ndarray, covariance: np.ndarray) -> dict[str, tuple[float, float]]:
+    """
+    Return sensor -> (what its output lags by in all, standard deviation), s, of sensors that lag.
+
+    The first derivative of all descriptions is the same, so this repeats where their names and shares do not.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Parameters, ``sensor.effect.component``.
+    values, covariance : array, shape (n,) and (n, n)
+
+    """
+    found = {}
+    for sensor in SENSORS:
+        own = np.array([part[1] in FAMILY and part[0] in (sensor, 'reference') for part in (name.split('.') for name in names)], float)
+        if own.any():
+            found[sensor] = (float(own @ values), float(np.sqrt(own @ covariance @ own)))
+    return found

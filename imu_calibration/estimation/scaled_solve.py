@@ -37,6 +37,13 @@ def inverse_normal(information: np.ndarray) -> np.ndarray:
     return np.linalg.inv(scaled) * np.outer(scale, scale)
 
 
+def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the solutions of several systems, (k, n, n) and (k, n), each information matrix scaled to a unit diagonal first."""
+    scale = 1 / np.sqrt(np.einsum('kii->ki', information))
+    scaled = information * scale[:, :, None] * scale[:, None, :] + JITTER * np.eye(information.shape[1])
+    return np.linalg.solve(scaled, (scale * right)[:, :, None])[:, :, 0] * scale
+
+
 def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (values, covariance) of the parameters `used` that minimise the quadratic form of a normal matrix plus a prior.

@@ -3,7 +3,7 @@
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Callable, Sequence
+from typing import AbstractSet, Callable, Sequence
 
 import numpy as np
 
@@ -54,12 +54,14 @@ class Attempt:
         Called with the share that is done.
     any_size : bool
         Whether sizes that are known of no instrument are asked about.
+    resolved : set of str
+        Effects that were judged beside one another already, as for `Search`.
 
     """
 
     def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect], locked: np.ndarray,
                  point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None,
-                 any_size: bool = False):
+                 any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
         self.baseline, self.effects, self.locked = baseline, effects, locked
         self.constants = time_constants(max(float(w.time[-1]) for w in windows))
         model, values = point or _start(baseline, effects)
@@ -77,12 +79,13 @@ class Attempt:
         self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
         self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
         step = encoder_step([window for window, kept in zip(windows, locked) if not kept])
-        self.search = Search(self.evidence, used, self.questions, encoder_step=step, any_size=any_size)
+        self.search = Search(self.evidence, used, self.questions, encoder_step=step, any_size=any_size, resolved=resolved)
 
     def asking_any_size(self) -> 'Attempt':
         """Return the same, asking about sizes that are known of no instrument too."""
         other = copy(self)
-        other.search = Search(self.evidence, self.search.baseline, self.questions, encoder_step=self.search.encoder_step, any_size=True)
+        other.search = Search(self.evidence, self.search.baseline, self.questions, encoder_step=self.search.encoder_step, any_size=True,
+                              resolved=self.search.resolved)
         return other
 
     @property

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal
+from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
 from imu_calibration.selection.normal_matrices import mean_matrix, white_means, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
@@ -49,7 +49,10 @@ class Evidence(ABC):
     """
 
     def __init__(self, prior_sd: np.ndarray, prior_mean: np.ndarray):
-        self._prior, self._fits = {'prior_sd': prior_sd, 'prior_mean': prior_mean}, {}
+        self._prior = {'prior_sd': prior_sd, 'prior_mean': prior_mean}
+        self._fits: dict[tuple, tuple] = {}
+        self._losses: dict[tuple, float] = {}
+        self._predictions: dict[tuple, np.ndarray] = {}
 
     @abstractmethod
     def normal(self, number: int | None = None) -> np.ndarray:
@@ -73,10 +76,14 @@ class Evidence(ABC):
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""
-        key = (tuple(used), number)
-        if key not in self._fits:
-            self._fits[key] = solve_normal(self.normal(number), np.asarray(used), **self._prior)
-        return self._fits[key]
+        ordered = tuple(sorted(used))
+        if (ordered, number) not in self._fits:
+            self._fits[ordered, number] = solve_normal(self.normal(number), np.array(ordered), **self._prior)
+        values, covariance = self._fits[ordered, number]
+        if ordered == tuple(used):
+            return values, covariance
+        places = np.searchsorted(ordered, used)
+        return values[places], covariance[np.ix_(places, places)]
 
 
 class WindowEvidence(Evidence):
@@ -100,7 +107,8 @@ class WindowEvidence(Evidence):
         numbers = range(fold.max() + 1)
         self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
         self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
-        self._parts = [np.sum([part[s][number] for part in (self._means, self._within) for s in SENSORS], axis=0) for number in numbers]
+        self._parts = np.array([np.sum([part[s][number] for part in (self._means, self._within) for s in SENSORS], axis=0)
+                                for number in numbers])
         self.total = np.sum(self._parts, axis=0)
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
@@ -120,18 +128,35 @@ class WindowEvidence(Evidence):
 
     def loss(self, used: Sequence[int]) -> float:
         """Return the loss of the best fit on all chosen windows."""
-        return quadratic(self.total, used, self.fit(used)[0])
+        ordered = tuple(sorted(used))
+        if ordered not in self._losses:
+            self._losses[ordered] = quadratic(self.total, ordered, self.fit(ordered)[0])
+        return self._losses[ordered]
 
     def heldout(self, used: Sequence[int]) -> float:
         """Return the loss of each fold under the fit to the other folds, summed."""
-        return self._heldout(self._parts, used)
+        key = ('held out', *sorted(used))
+        if key not in self._losses:
+            self._losses[key] = self._heldout(self._parts, used)
+        return self._losses[key]
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
         """Return the same loss by sensor: (of the windows' means, within the windows)."""
         return {s: (self._heldout(self._means[s], used), self._heldout(self._within[s], used)) for s in SENSORS}
 
     def _heldout(self, parts, used):
-        return sum(quadratic(part, used, self.fit(used, number)[0]) for number, part in enumerate(parts))
+        places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
+        return float(sum(own @ part[np.ix_(places, places)] @ own for own, part in zip(left, parts)))
+
+    def _left_by_others(self, used):
+        """Return for each fold what turns rows of `used`, sorted, into residuals of the fit to all other folds, shape (k, n + 1)."""
+        if used not in self._predictions:
+            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)]**2
+            places = np.append(at, -1)
+            normal = self.total[np.ix_(places, places)] - np.asarray(self._parts)[:, places[:, None], places]
+            values = solve_scaled(normal[:, :-1, :-1] + np.diag(known), normal[:, :-1, -1] + known * self._prior['prior_mean'][at])
+            self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
+        return self._predictions[used]
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""

@@ -7,6 +7,7 @@ from typing import Callable, Sequence
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.lags import FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.table import Table
@@ -15,6 +16,7 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
+from imu_calibration.selection.lag_explanations import lag_explanations
 from imu_calibration.selection.pairs import best_pairs
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
@@ -33,6 +35,8 @@ from imu_calibration.selection.simpler import simpler
 
 LINEARISATIONS = 5
 """Times that the columns are taken anew, at most."""
+EXPLANATIONS = 4
+"""Explanations of the lags that are tried, at most."""
 LEFT = 0.1
 """Share of a significant rest that pairs, or effects of implausible size, may leave."""
 LEAST_WINDOWS = 8
@@ -103,9 +107,14 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.4 * share))
     chosen = attempt.search.run()
-    settled, rivals = settle_rivals(attempt, chosen, attempted)
     report(0.5)
-    outcome = _settled(attempted, settled, chosen if settled is attempt else settled.search.run(), lambda share: report(0.5 + 0.2 * share))
+    explanations = lag_explanations(attempt, chosen, attempted)
+    if explanations is not None:
+        attempted = partial(attempted, resolved=FAMILY)
+        outcome, rivals = _with_lags(explanations, attempted)
+    else:
+        settled, rivals = settle_rivals(attempt, chosen, attempted)
+        outcome = _settled(attempted, settled, chosen if settled is attempt else settled.search.run())
     report(0.75)
     for any_size in (False, True):
         outcome = _looked_again(outcome, partial(attempted, any_size=any_size), any_size)
@@ -132,6 +141,27 @@ class _Outcome:
         return sum(map(self.explained.rest, self.explained.excess(self.named).values()))
 
 
+def _with_lags(explanations, attempted):
+    """
+    Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
+
+    Where one of several effects does not help, a shorter one is tried, where a single one does not, another.
+    """
+    most, refused, tried = None, [], []
+    for _ in range(EXPLANATIONS):
+        told = explanations.told(most, refused)
+        there, chosen, of_lags = explanations.settled(told, attempted)
+        chosen = there.search.run(chosen)
+        settled, rivals = settle_rivals(there, chosen, attempted)
+        outcome = _settled(attempted, settled, chosen if settled is there else _searched(settled, chosen))
+        most, refused = max(len(told.lags) - 1, 1), [*refused, told]
+        kept = [len(told.lags.keys() & {question.name for question in some}) for some in (outcome.named, outcome.chosen)]
+        tried.append((kept, outcome, [*of_lags, *rivals]))
+        if kept[0] == len(told.lags) or not explanations.others(most, refused):
+            return tried[-1][1:]
+    return max(tried, key=lambda entry: entry[0])[1:]
+
+
 def _looked_again(outcome, attempted, any_size):
     """
     Return the _Outcome of what explains a significant rest that stays.
@@ -143,7 +173,8 @@ def _looked_again(outcome, attempted, any_size):
         return outcome
     attempt = outcome.attempt.asking_any_size() if any_size else outcome.attempt
     search, known = attempt.search, {question.label for question in outcome.chosen}
-    found = [search.run(start) for start in ((), *best_pairs(search))]
+    lags = _resolved(attempt, outcome.chosen)
+    found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
     best = min(found, key=search.cost)
     if {question.label for question in best} == known or (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
         return outcome
@@ -157,7 +188,7 @@ def _settled(attempted, attempt, chosen, progress=None):
         if not attempt.needs_another(chosen):
             break
         attempt = attempted(point=attempt.point(chosen), progress=progress)
-        chosen = attempt.search.run()
+        chosen = _searched(attempt, chosen)
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = Explained(attempt.evidence, attempt.search)
@@ -171,6 +202,15 @@ def _settled(attempted, attempt, chosen, progress=None):
         again, denied, chosen = (same_questions(attempt, some) for some in (named, denied, chosen))
         named = _that_help(attempt, explained, pruned(again, explained.share))
     return _Outcome(attempt, explained, chosen, named, denied)
+
+
+def _searched(attempt, chosen):
+    """Return what a search chooses at another linearisation; what was resolved before is where it starts."""
+    return attempt.search.run(_resolved(attempt, chosen))
+
+
+def _resolved(attempt, chosen):
+    return same_questions(attempt, [question for question in chosen if question.name in attempt.search.resolved])
 
 
 def too_few_windows(count: int) -> NotObservableError:

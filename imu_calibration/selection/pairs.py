@@ -28,7 +28,8 @@ def best_pairs(search: Search) -> list[list[Question]]:
     blocks = _Blocks(search)
     shapes = defaultdict(list)
     for one, two in combinations(range(len(search.questions)), 2):
-        if search.questions[one].name != search.questions[two].name:
+        names = {search.questions[one].name, search.questions[two].name}
+        if len(names) == 2 and not names & search.resolved:
             shapes[blocks.size(one), blocks.size(two)].append((one, two))
     scored = [entry for pairs in shapes.values() for entry in blocks.score(pairs)]
     best = []

@@ -130,6 +130,14 @@ def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel
     return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
 
 
+def point_with(model: SensorModel, effects: Sequence[Effect], values: dict[str, float]) -> tuple[SensorModel, np.ndarray]:
+    """Return (the model with all these effects linearised there, its parameters) where some have values, others their prior."""
+    wide = extended_model(model, effects)
+    start = np.array([values.get(name, known) for name, known in zip(wide.param_names, wide.start())])
+    start = np.where(np.isfinite(start), start, 0.0)
+    return wide.at(start), start
+
+
 def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
     """Return the effects that are asked about by columns."""
     return [effect for effect in effects if effect.role is not Role.LIMIT]

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Sequence
+from typing import AbstractSet, Sequence
 
 import numpy as np
 
@@ -69,13 +69,15 @@ class Search:
         Resolution of the encoders, rad.
     any_size : bool
         Whether sizes that are known of no instrument are asked about: for what known ones leave.
+    resolved : set of str
+        Effects that were judged beside one another where each is, which straight lines must not undo: not asked unless chosen.
 
     """
 
     def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], *, encoder_step: float = 0.0,
-                 any_size: bool = False):
+                 any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
         self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
-        self.encoder_step, self.any_size = encoder_step, any_size
+        self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
         self.history = []
 
     def used(self, chosen: Sequence[Question]) -> tuple[int, ...]:
@@ -83,8 +85,8 @@ class Search:
         return self.baseline + tuple(k for q in chosen for k in q.parameters)
 
     def others(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the questions about effects that are not chosen."""
-        names = {q.name for q in chosen}
+        """Return the questions about effects that are not chosen, and not resolved."""
+        names = {q.name for q in chosen}.union(self.resolved)
         return [q for q in self.questions if q.name not in names]
 
     def cost(self, chosen: Sequence[Question]) -> float:

@@ -1,0 +1,278 @@
+"""
+One explanation of the lags: what both sensors lag by, told as simply and as much in common as the recording allows.
+
+A late clock, a delay of one sensor and its filters have the same first derivative, so a search meets them in any order, and halves of one
+recording told one lag under different names. Here every description that a sensor's lag may have is linearised where it is, both sensors'
+costs are added up, and of all explanations that come within the search's price of the best the simplest is told: fewest effects first,
+then a clock that both share before lags of their own, then a delay before a filter. The others are its rivals.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.lags import CLOCK, FAMILY, lag_name
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.evidence import WindowEvidence
+from imu_calibration.selection.questions import Question, point_with
+from imu_calibration.selection.rivals import SHOWN, Rival, same_questions
+from imu_calibration.selection.search import PENALTY, TIE
+
+KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
+"""Descriptions of one sensor's lag, the simplest first."""
+DELAY = KINDS[0]
+FIRST_SHARE = 0.3
+"""Share of a lag that is taken for the low-pass beside a delay at first: at zero it has no derivative of its own."""
+COMMON = 0.01
+"""
+Where nothing rests, share of what lags explain by which a clock that both sensors share may be behind other lags: noise is known from
+the misfit alone there, and the ripple of a motor is told from a filter by evidence that does not repeat from recording to recording.
+"""
+ROUNDS = 3
+"""Times that the columns of a delay beside a low-pass are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """One description of both sensors' lags at once, linearised where it is."""
+
+    kind: tuple[str, ...]
+    attempt: Attempt
+    chosen: list[Question]
+    """The lags of both sensors, then what else was chosen."""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter of the baseline and of the lags -> value."""
+        names = {*self.attempt.baseline.param_names, *(name for q in self.chosen if q.name in FAMILY for name in q.effect.param_names())}
+        return {name: value for name, value in zip(self.attempt.space.names, self.attempt.values(self.chosen)) if name in names}
+
+    def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
+        wanted = [lag_name(sensor, ending) for ending in self.kind]
+        used = self.attempt.search.used(self.chosen)
+        values, covariance = self.attempt.evidence.fit(used)
+        at = [used.index(q.parameters[0]) for name in wanted for q in self.chosen if q.name == name]
+        return values[at], covariance[np.ix_(at, at)]
+
+    def without(self, sensor: str) -> list[Question]:
+        """Return the choice without the lags of one sensor."""
+        return [q for q in self.chosen if q.name not in FAMILY or q.sensor != sensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Which effects make both lags."""
+
+    lags: dict[str, float]
+    """Effect -> value, s."""
+    cost: float
+    """Held-out cost, nats, penalties included."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Parameter of the baseline -> value."""
+
+    @property
+    def rank(self) -> tuple:
+        """What makes an explanation simple."""
+        kinds = [name.rpartition('_')[2] for name in self.lags]
+        return len(self.lags), CLOCK not in self.lags, sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)), self.cost
+
+
+@dataclass(frozen=True, eq=False)
+class LagExplanations:
+    """Every explanation that a recording may tell of its lags."""
+
+    attempt: Attempt
+    """Linearised where no lag acts."""
+    explanations: Sequence[Explanation]
+    rest: Sequence[Question]
+    """What else was chosen."""
+    silent: float | None
+    """Held-out cost without any lag, nats, where nothing rests; None where the noise is known from rests."""
+
+    def others(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> list[Explanation]:
+        """Return the explanations of at most so many effects without some."""
+        return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each not in refused]
+
+    def told(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
+        """Return the simplest explanation of `others`."""
+        return simplest(self.others(most, refused), self.silent)
+
+    def settled(self, told: Explanation, attempted: Callable) -> tuple[Attempt, list[Question], list[Rival]]:
+        """Return (the Attempt at an explanation, the choice with it, what would do nearly as well in the place of its members)."""
+        names = {effect.name: effect.param_names()[0] for effect in self.attempt.effects}
+        values = told.values | {names[name]: value for name, value in told.lags.items()}
+        there = attempted(point=point_with(self.attempt.baseline, self.attempt.effects, values))
+        lags = [next(question for question in there.questions if question.name == name) for name in told.lags]
+        near = [explanation for explanation in self.explanations if explanation.cost < told.cost + TIE]
+        return there, [*lags, *same_questions(there, self.rest)], _rivals(there, told, near)
+
+
+def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> LagExplanations | None:
+    """
+    Return the LagExplanations of a choice; None where no lag is among it, or some of the family cannot be asked about.
+
+    Parameters
+    ----------
+    attempt : Attempt
+        Linearised where no lag acts.
+    chosen : sequence of Question
+    attempted : callable
+        ``attempted(point=..., effects=...)``: the Attempt elsewhere, with some of the effects.
+
+    """
+    rest = [question for question in chosen if question.name not in FAMILY and '@' not in question.label]
+    effects = {effect.name: effect for effect in attempt.effects}
+    if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
+        return None
+    described = _described(attempted, effects, rest)
+    judges = [each.attempt for each in described]
+    explanations = _explanations(described, judges, attempt.baseline.param_names)
+    return LagExplanations(attempt, explanations, rest, _silence(described, judges) if attempt.recording.moving.all() else None)
+
+
+def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
+    """
+    Return the simplest explanation of those that come within the search's price of the best.
+
+    Parameters
+    ----------
+    explanations : sequence of Explanation
+    silent : float, optional
+        Cost without any lag, where nothing rests: an explanation of as many effects with a shared clock then needs to come only so near
+        as the misfit lets anyone tell.
+
+    """
+    best = min(explanation.cost for explanation in explanations)
+    told = min((explanation for explanation in explanations if explanation.cost < best + TIE), key=lambda explanation: explanation.rank)
+    if silent is None or len(told.lags) < 2 or CLOCK in told.lags:
+        return told
+    common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(told.lags)
+              and explanation.cost < best + TIE + COMMON * (silent - best)]
+    return simplest(common) if common else told
+
+
+def _described(attempted, effects, rest):
+    """Return the Told of each kind; of the first alone where no curvature can show."""
+    def at(kind, values=None):
+        asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [question.effect for question in rest]
+        there = attempted(effects=asked, point=None if values is None else point_with(first.attempt.baseline, asked, values))
+        lags = [q for ending in kind for sensor in SENSORS for q in there.questions if q.name == lag_name(sensor, ending)]
+        return Told(kind, there, [*lags, *same_questions(there, rest)])
+
+    first = at(DELAY)
+    shown = max(first.attempt.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY)
+    if shown < SHOWN:
+        return [first]
+    first = at(DELAY, first.values)
+    found, delays = [first], {sensor: first.lags(sensor)[0][0] for sensor in SENSORS}
+    for kind in KINDS[1:]:
+        values = dict(first.values)
+        for sensor, delay in delays.items():
+            own = [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)] if len(kind) == 2 else [delay]
+            values |= {effects[lag_name(sensor, ending)].param_names()[0]: value for ending, value in zip(kind, own)}
+        told = at(kind, values)
+        for _ in range(ROUNDS - 1 if len(kind) > 1 else 0):
+            told = at(kind, told.values)
+        found.append(told)
+    return found
+
+
+def _silence(described, judges):
+    """Return the held-out cost without any lag, nats."""
+    rest = [question for question in described[0].chosen if question.name not in FAMILY]
+    return sum(_cost(described[0], rest, judges, sensor) for sensor in SENSORS)
+
+
+def _explanations(described, judges, names):
+    """Return every Explanation that the descriptions of each sensor make together."""
+    options = {sensor: [_none(described[0], judges, sensor), *(_option(told, judges, sensor) for told in described)] for sensor in SENSORS}
+    if len(described) == 1:   # without curvature the kinds are one column
+        for some in options.values():
+            some += [replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')]
+    found = []
+    for one, two in product(*(options[sensor] for sensor in SENSORS)):
+        if one.kind or two.kind:
+            found += _told_together(one, two, names)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Option:
+    """One sensor with a lag of one kind, or with none."""
+
+    sensor: str
+    kind: tuple[str, ...]
+    cost: float
+    lags: np.ndarray
+    covariance: np.ndarray
+    values: dict[str, float]
+    alike: bool = False
+    """Whether its columns are those of a delay."""
+
+    def own(self, lags):
+        return {lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)}
+
+    def with_delay(self, delay):
+        """Return the lags with the first one given, the others moved along."""
+        return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
+
+
+def _option(told, judges, sensor):
+    return _Option(sensor, told.kind, _cost(told, told.chosen, judges, sensor) + PENALTY * len(told.kind), *told.lags(sensor), told.values)
+
+
+def _none(told, judges, sensor):
+    left = told.without(sensor)
+    values = dict(zip(told.attempt.space.names, told.attempt.values(left)))
+    return _Option(sensor, (), _cost(told, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values)
+
+
+def _cost(told, chosen, judges, sensor):
+    """Return the held-out cost of one sensor's windows, nats, judged with the noise and the band of each attempt in turn."""
+    used, losses = told.attempt.search.used(chosen), []
+    for judge in judges:
+        space = replace(told.attempt.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
+        losses.append(sum(WindowEvidence(space, judge.noise, told.attempt.evidence.fold).heldout_parts(used)[sensor]))
+    return 0.5 * float(np.mean(losses))
+
+
+def _told_together(one, two, names):
+    """Yield the explanations of two sensors' lags: each its own, a clock for both and what each has beside it."""
+    values = {name: (two if name.startswith(two.sensor) else one).values[name] for name in names}
+    cost = one.cost + two.cost
+    own = one.own(one.lags) | two.own(two.lags)
+    if all(value > 0 for value in own.values()):
+        yield Explanation(own, cost, values)
+    if not (one.kind and two.kind):
+        return
+    apart = float(one.lags[0] - two.lags[0])
+    late, clock = (one, two) if apart > 0 else (two, one)
+    if clock.kind == DELAY and (late.kind == DELAY or late.alike):
+        yield Explanation({CLOCK: float(clock.lags[0])} | late.own([abs(apart)]), cost, values)
+    if one.kind[0] == two.kind[0] == 'delay':
+        variances = np.array([each.covariance[0, 0] for each in (one, two)])
+        shared = float(np.average([one.lags[0], two.lags[0]], weights=1 / variances))
+        beside = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
+        beside = {name: value for name, value in beside.items() if not name.endswith('delay')}
+        if all(value > 0 for value in beside.values()):
+            yield Explanation({CLOCK: shared} | beside, cost - PENALTY + 0.5 * apart**2 / float(variances.sum()), values)
+
+
+def _rivals(settled, told, near):
+    """Return what would do nearly as well in the place of a member of an explanation: the members of explanations with no more effects."""
+    asked, found = {question.name: question for question in settled.questions}, {}
+    for other in sorted(near, key=lambda explanation: explanation.cost):
+        gone, come = sorted(set(told.lags) - set(other.lags)), sorted(set(other.lags) - set(told.lags))
+        if len(other.lags) > len(told.lags) or not gone:
+            continue
+        moves = {name: other.values[name] - told.values[name] for name in told.values}
+        for name in come:
+            place = next((each for each in gone if asked[each].sensor == asked[name].sensor), CLOCK if CLOCK in gone else gone[0])
+            if name not in found:
+                first = place not in {rival.question.name for rival in found.values()}
+                found[name] = Rival(asked[place], asked[name], other.cost - told.cost, moves if first else {})
+    return list(found.values())
