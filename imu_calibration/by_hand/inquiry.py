@@ -216,7 +216,9 @@ def _held(hand):
 def _why_not(effect, poses, turns, follows_gravity):
     if effect.role is Role.LIMIT:
         return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
-    if not possible_by_hand(effect) or 'cooling' in effect.needs:
+    if 'cooling' in effect.needs:
+        return 'which way the temperature came is not followed from pose to pose', 'record on a table'
+    if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
     if 'temperature' in effect.needs and poses.temperature_c is None:
         return 'no temperature was recorded', 'record imu/temperature'
