@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
-from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel, dof_factor, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor, white_noise
+from imu_calibration.simulation.sensor_noise import gauss_markov
 
 
 def rest(variance, inflation=1.0, count=1000):
@@ -57,3 +58,25 @@ def test_a_column_of_which_rounding_left_less_than_nothing_says_nothing():
     whole, kept = np.delete(np.delete(products, 3, 0), 3, 1), products[None]
     np.testing.assert_allclose(misfit_along(kept), misfit_along(whole[None]), rtol=1e-12)
     np.testing.assert_allclose(least_misfit(products), least_misfit(whole), rtol=1e-12)
+
+
+def test_a_mean_over_a_window_differs_from_the_bias_in_its_middle_by_what_it_wanders():
+    """Against Gauss-Markov processes drawn step by step: windows of 4 and 16 s of one that forgets in 100 s."""
+    process, rng = BiasProcess(1.0, 100.0), np.random.default_rng(6)
+    bias = gauss_markov(process.sd, process.time, 0.1, shape=(161, 4000), rng=rng)
+    noise = NoiseModel(np.zeros(3), np.ones(3), bias_processes=(process,))
+    for count in (41, 161):
+        drawn = (bias[:count].mean(axis=0) - bias[count // 2]).var()
+        np.testing.assert_allclose(noise.variance_beside_bias(['dynamic'], [count], np.array([0.1 * count])), drawn, rtol=0.1)
+
+
+def test_angles_that_are_read_in_steps_tilt_gravity_at_rest_and_not_in_motion():
+    """Attitudes about axes in all directions, each read to the next step of 1 mrad."""
+    rng = np.random.default_rng(7)
+    axes, gravity = rng.normal(size=(2, 20000, 3))
+    axes, gravity = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (axes, gravity))
+    seen = 9.80665 * np.cross(rng.uniform(-0.5e-3, 0.5e-3, 20000)[:, None] * axes, gravity)
+    still, moving = ReferenceNoise.of_steps(1e-3, 'accelerometer').variance(['static', 'spin'], np.full(2, 5.0))
+    # all directions are alike here; a joint's axis across gravity, as tables have them, turns half as much again into two components
+    assert seen.var() < still < 4 * seen.var() and moving == 0.0
+    assert not ReferenceNoise.of_steps(0.0, 'gyroscope').variance(['static', 'spin'], np.full(2, 5.0)).any()

@@ -8,13 +8,13 @@ import pytest
 
 from imu_calibration.beyond import unexplained as rests
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
-from imu_calibration.selection.explained_share import Explained, pruned, with_steps_of_encoders
+from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, natural_processes, plausible_processes
 from imu_calibration.selection.normal_matrices import white_means
 from imu_calibration.selection.questions import Question
@@ -114,7 +114,7 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
-    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), time=np.arange(4.0), sessions=[np.arange(4)])
+    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), duration=np.ones(4), time=np.arange(4.0), sessions=[np.arange(4)])
     space = SimpleNamespace(recording=recording, mean={'gyroscope': [np.ones((4, 2))] * 3})
     for offset, weight in ((0.0, 10.0), (3.0, 1 / np.sqrt(9.01))):
         white = white_means(space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope')
@@ -272,10 +272,8 @@ def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sens
     turned = rng.uniform(0.0, 1.0, (20000, 2))
     read = np.round(turned / 1e-3) * 1e-3
     scatter = np.var(np.diff(read - turned, axis=1) / 5.0) + 1e-8 / 500
-    recording = SimpleNamespace(kind=np.array(['spin', 'static']), count=np.full(2, 500.0), period=0.01, windows=[SimpleNamespace(duration=5.0)] * 2)
-    ones = np.ones(3)
-    noise = with_steps_of_encoders(NoiseModel(1e-8 * ones, ones, moving={'spin': MovingFactors(ones, ones)}), recording, step=1e-3)
-    moving, still = noise.mean_variance(recording.kind, recording.count)
+    noise = NoiseModel(np.full(3, 1e-8), np.ones(3), reference=ReferenceNoise.of_steps(1e-3, 'gyroscope'))
+    moving, still = noise.mean_variance(['spin', 'static'], np.full(2, 500.0), np.full(2, 5.0))
     np.testing.assert_allclose(moving, scatter, rtol=0.05)
     np.testing.assert_allclose(still, 1e-8 / 500)
 
@@ -325,7 +323,8 @@ def test_what_the_halves_disagree_on_is_denied(monkeypatch):
 def rest_of(sigma, residual):
     """Return the Unexplained of a residual whose windows exceed noise by so many standard deviations."""
     count = len(residual)
-    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), time=np.arange(float(count)),
+    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), duration=np.ones(count),
+                                time=np.arange(float(count)),
                                 describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
                                           'specific force': np.full(count, 9.8)})
     space = SimpleNamespace(mean={'accelerometer': [column[:, None] for column in residual.T]}, recording=recording, places=lambda sensor, axis: np.array([0]))

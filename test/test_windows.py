@@ -1,7 +1,5 @@
 """Windows found in simulated sessions, whatever the rates, the faults and the way the streams arrive."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,6 @@ from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, Tempe
 from imu_calibration.segmentation.spike_filter import REACH
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
 from imu_calibration.segmentation.wander_limit import SHORTEST, WanderLimit
-from imu_calibration.segmentation.window import Window, WindowKind
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -482,19 +479,26 @@ def test_stream_statistics_are_at_hand():
 
 
 def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
-    """A bias that wanders by 10 ug shows within 20 s beside 1 ug/sqrt(Hz), and not beside 120."""
-    rng, time = np.random.default_rng(4), np.arange(1000) * 0.01
-    limits = {}
-    for density in (1e-5, 1e-4, 1.2e-3):
+    """A bias that wanders by 10 ug shows within 20 s beside 1 ug/sqrt(Hz), and not beside 120, nor where late stamps turn gravity by more."""
+    rng, time = np.random.default_rng(4), np.arange(2000) * 0.01
+    cuts = {}
+    for density, jitter in ((1e-5, 0.0), (1e-4, 0.0), (1.2e-3, 0.0), (1e-5, 5e-5)):
         limit = WanderLimit()
-        assert limit.longest(20.0) == 20.0
-        force_s = rng.normal(0.0, 10.0 * density, (1000, 3))
-        window = Window(WindowKind.STATIC, (time * 1e9).astype(np.int64), time, force_s, force_s, None)
-        limit.take(replace(window, kind=WindowKind.DYNAMIC))
-        assert limit.longest(20.0) == 20.0
-        limit.take(window)
-        limits[density] = limit.longest(20.0)
-    assert limits[1e-5] == SHORTEST and limits[1e-4] == pytest.approx(7.1, rel=0.4) and limits[1.2e-3] == 20.0
+        samples = SimpleSamples(time + rng.normal(0.0, jitter, 2000), rng.normal(0.0, 10.0 * density, (2000, 3)), np.ones((2000, 3)))
+        assert limit.pieces(samples) == 1
+        limit.rested(samples)
+        cuts[density, jitter] = limit.pieces(samples)
+    assert list(cuts.values()) == [np.ceil(time[-1] / SHORTEST), 3, 1, 1]
+
+
+class SimpleSamples:
+    """Time, force and rate of samples."""
+
+    def __init__(self, time, force_s, rate_s):
+        self.time, self.force_s, self.rate_s = time, force_s, rate_s
+
+    def __len__(self):
+        return len(self.time)
 
 
 def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():

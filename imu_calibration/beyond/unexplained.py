@@ -65,7 +65,7 @@ def _rest(attempt, explained, sensor, excess, values):
     space, recording = attempt.space, attempt.recording
     residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
-    white = floor.mean_variance(recording.kind, recording.count)
+    white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma = sigma_means = excess[0] / np.sqrt(2 * explained.n_means)
     if excess[1] > WITHIN_SHARE * explained.n_within:

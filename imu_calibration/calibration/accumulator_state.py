@@ -49,7 +49,7 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
               'blocks': [_outline(block) for block in accumulator.blocks],
               **{name: getattr(gathered, name) for name in _PLAIN}}
     arrays: dict[str, Any] = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
-                              'rows': np.array([(row.time, row.duration) for row in rows], float).reshape(-1, 2),
+                              'rows': np.array([(row.time, row.duration, row.encoder_step) for row in rows], float).reshape(-1, 3),
                               'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
                               'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
                               'poses': np.array([position for _, _, position in gathered.poses], float)}
@@ -136,7 +136,8 @@ def _gathered(header, arrays):
     for k, kind in enumerate(header['kinds']):
         statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
                       for sensor, (mean, variance, inflation) in columns.items()}
-        rows.append(WindowStatistics(kind, float(numbers[k, 0]), float(numbers[k, 1]), int(whole[k, 0]), statistics, int(whole[k, 1])))
+        time, duration, *step = map(float, numbers[k])   # files of earlier versions know no steps
+        rows.append(WindowStatistics(kind, time, duration, int(whole[k, 0]), statistics, int(whole[k, 1]), *step))
     within, slow = ({tuple(key): arrays[f'{name}.{number}'] for number, key in enumerate(header[name])} for name in ('within', 'slow'))
     poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
     plain = {name: header[name] for name in _PLAIN}

@@ -203,14 +203,15 @@ def _joined(first, second):
         means = [share[0] * x + share[1] * y for x, y in pairs]
         sensors[sensor] = SensorStatistics(means[0], a.within[:0], means[1], means[2])
     time = share[0] * first.time + share[1] * second.time
-    return WindowStatistics(first.kind, float(time), first.duration + second.duration, total, sensors, first.session)
+    return WindowStatistics(first.kind, float(time), first.duration + second.duration, total, sensors, first.session,
+                            max(first.encoder_step, second.encoder_step))
 
 
 def _without_within(window):
     if not window.pieces and all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
         return window
     sensors = {name: SensorStatistics(s.mean, s.within[:0].copy(), s.noise_variance, s.inflation) for name, s in window.sensors.items()}
-    return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session)
+    return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session, window.encoder_step)
 
 
 def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:

@@ -5,6 +5,8 @@ from typing import Sequence
 
 import numpy as np
 
+from imu_calibration.constants import STANDARD_GRAVITY
+
 HOUR = 3600.0
 """s; sessions are hardly longer, and what a bias does over days does not move within one."""
 DOF_FACTOR_MOST = 3.0
@@ -30,6 +32,31 @@ class BiasProcess:
         return self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1))) if ratio > 1e-6 else self.sd
 
 
+@dataclass(frozen=True)
+class ReferenceNoise:
+    """What the reference itself adds to means of windows: joints that are read in steps."""
+
+    turn: float = 0.0
+    """Standard deviation of the turn between two readings, rad; over the length of a window it is one of the mean rate."""
+    level: float = 0.0
+    """Standard deviation of gravity's components at rest, m/s^2."""
+
+    @classmethod
+    def of_steps(cls, step: float, sensor: str) -> 'ReferenceNoise':
+        """
+        Return that of a sensor beside encoders with a step, rad.
+
+        A reading errs by ``step / sqrt(12)``, a turn by ``step / sqrt(6)``. An attitude that errs about one axis shows in two components
+        of gravity's three.
+        """
+        return cls(turn=step / np.sqrt(6)) if sensor == 'gyroscope' else cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
+
+    def variance(self, kinds: Sequence[str] | np.ndarray, durations: np.ndarray) -> np.ndarray:
+        """Return the variance of the means of windows of these kinds and lengths, s, shape (k,)."""
+        still = np.array([kind == 'static' for kind in kinds])
+        return np.where(still, self.level**2, (self.turn / np.maximum(durations, 1e-3))**2)
+
+
 @dataclass(frozen=True, eq=False)
 class MovingFactors:
     """What moving windows of one kind scatter beyond the noise at rest, as factors on ``white_variance * inflation``, each shape (3,)."""
@@ -50,7 +77,8 @@ class NoiseModel:
     Noise of one sensor.
 
     The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the same recording,
-    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes.
+    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes, seen at the middles of the windows;
+    beside these middles means scatter by what biases wander within (`means_beside_middles`).
     """
 
     white_variance: np.ndarray
@@ -71,6 +99,8 @@ class NoiseModel:
     """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
     session_variance: float = 0.0
     """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
+    reference: ReferenceNoise = ReferenceNoise()
+    """What the reference adds to the means of windows."""
     left_out: frozenset[tuple[int, float]] = frozenset()
     """(recording, middle in s) of windows that the others contradict: their means count for nothing."""
 
@@ -94,10 +124,15 @@ class NoiseModel:
         """Correlation time of the largest bias process, s; None when there is none."""
         return max(self.bias_processes, key=lambda process: process.sd).time if self.bias_processes else None
 
-    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """Return the variance of means of windows of these kinds and lengths by the noise within, shape (k, 3)."""
+    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray | None = None) -> np.ndarray:
+        """Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3)."""
         factors = {kind: moving.means for kind, moving in self.moving.items()}
-        return self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
+        white = self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
+        return white if durations is None else white + self.reference.variance(kinds, durations)[:, None]
+
+    def variance_beside_bias(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray) -> np.ndarray:
+        """Return the same beside the bias as it is in the middle of each window: with what it wanders within, shape (k, 3)."""
+        return self.mean_variance(kinds, counts, durations) + means_beside_middles(self.bias_processes, durations)[:, None]
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
         """Return the covariance of the bias at instants about the middle of a window, s, beside its value there, shape (n, n)."""
@@ -138,6 +173,20 @@ class NoiseModel:
             if any(np.any(np.abs(unit * a / b - 1) > change) for a, b in ((mine.every, its.every), (mine.slow, its.slow))):
                 return False
         return True
+
+
+def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray | float) -> np.ndarray:
+    """
+    Return the variance of the mean of a wandering bias over windows of these lengths (s) beside its value in their middles.
+
+    Of a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It fades in windows longer than a bias remembers,
+    whose means its value in the middle overstates already.
+    """
+    total = np.zeros(np.shape(durations))
+    for process in processes:
+        step = np.asarray(durations, float) / (6 * process.time)
+        total = total + process.sd**2 * step / (1 + (3 * step)**2)
+    return total
 
 
 def dof_factor(dof: np.ndarray | float) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.estimation.noise_model import BiasProcess, dof_factor
+from imu_calibration.estimation.noise_model import BiasProcess, dof_factor, means_beside_middles
 from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood, profile
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
@@ -39,11 +39,14 @@ class NoiseLikelihood:
         Variance of the means by the noise within windows.
     known : tuple of BiasProcess
         Processes that are there in any case.
+    durations : ndarray, shape (n,), optional
+        Lengths of the windows, s.
 
     """
 
     def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
-                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = ()):
+                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0):
+        self._durations = np.broadcast_to(durations, len(rows))
         self.typical = float(np.sqrt(np.median(white)))
         self.many, self.known = len(rows) >= LEAST_WINDOWS, known
         self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
@@ -55,7 +58,8 @@ class NoiseLikelihood:
         if key not in self._losses:
             offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
             processes = self.processes(bias, time)
-            self._losses[key] = self._likelihood.whitened(self._white + offset**2, processes, step**2)
+            within = means_beside_middles(processes, self._durations)[:, None]
+            self._losses[key] = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
         logs, normal = self._losses[key]
         if used is not None:
             at = np.r_[used, len(normal) - 1]
@@ -66,9 +70,11 @@ class NoiseLikelihood:
         """Return the same of the noise of one axis, that of the others as the shape says; in units of the axis' own typical noise."""
         offset, bias, time = np.multiply(shape, (self.typical, self.typical, 1.0))
         others = np.arange(self._white.shape[1]) != axis
-        information = self._likelihood.of_axes(others).whitened(self._white[:, others] + offset**2, self.processes(bias, time))[1]
+        processes = self.processes(bias, time)
+        variance = self._white[:, others] + means_beside_middles(processes, self._durations)[:, None] + offset**2
+        information = self._likelihood.of_axes(others).whitened(variance, processes)[1]
         return NoiseLikelihood(self._rows[:, [axis]], self._white[:, [axis]], self._times, sessions=self._sessions, information=information,
-                               known=self.known)
+                               known=self.known, durations=self._durations)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """Return the known processes with one more, or with those of flicker, where their standard deviation is above zero."""
@@ -77,7 +83,7 @@ class NoiseLikelihood:
 
 
 def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray], information: np.ndarray,
-                     known: tuple[BiasProcess, ...] = ()) -> dict:
+                     known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0) -> dict:
     """
     Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
 
@@ -88,11 +94,12 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, 
 
     Parameters
     ----------
-    rows, white, times, sessions, information, known
+    rows, white, times, sessions, information, known, durations
         As in `NoiseLikelihood`.
 
     """
-    search = _Search(NoiseLikelihood(rows, white, times, sessions=sessions, information=information, known=known))
+    search = _Search(NoiseLikelihood(rows, white, times, sessions=sessions, information=information, known=known,
+                                     durations=durations))
     trials, costs = search.grid(0.0)
     session = search.best_session(trials[np.argmin(costs)]) if len(sessions) > 1 else 0.0
     if session > 0:

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.band_misfit import BandMisfit, band_misfit, misfit_along, own_misfit
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise, white_noise
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -26,14 +26,15 @@ def updated_noise(system: WeightedSystem, values: np.ndarray, noises: dict[str, 
 
 def _at_rest(system, sensor, values):
     white = white_noise(system.accumulator.rows, sensor)
+    reference = ReferenceNoise.of_steps(max(row.encoder_step for row in system.accumulator.rows), sensor)
     if white is not None:
-        return NoiseModel(*white)
+        return NoiseModel(*white, reference=reference)
     variance = np.full(3, 1e-30)
     for kind in system.within[sensor]:
         variance = np.maximum(variance, _misfit_of(system, sensor, kind, values).noise)
     if not system.within[sensor]:
         variance = np.full(3, system.means[sensor][:, -3:].var() + 1e-12)
-    return NoiseModel(variance, np.ones(3))
+    return NoiseModel(variance, np.ones(3), reference=reference)
 
 
 def _with_bands(system, sensor, noise):
@@ -47,8 +48,9 @@ def _updated(system, sensor, values, noise):
         noise = replace(_at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out)
     noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})
     rows, information = system.linearised(sensor, values, noise)
-    return replace(noise, **estimate_offsets(rows, system.mean_variance(noise), system.times, sessions=system.sessions,
-                                             information=information, known=noise.known))
+    white = system.mean_variance(noise, beside_bias=False)
+    return replace(noise, **estimate_offsets(rows, white, system.times, sessions=system.sessions, information=information,
+                                             known=noise.known, durations=system.durations))
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:

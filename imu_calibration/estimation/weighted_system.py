@@ -50,6 +50,11 @@ class WeightedSystem:
         return np.array([row.count for row in self.accumulator.rows], float)
 
     @cached_property
+    def durations(self) -> np.ndarray:
+        """Length of each window, s."""
+        return np.array([row.duration for row in self.accumulator.rows])
+
+    @cached_property
     def kinds(self) -> list[str]:
         """Kind of each window."""
         return [row.kind for row in self.accumulator.rows]
@@ -68,9 +73,13 @@ class WeightedSystem:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
         return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
 
-    def mean_variance(self, noise: NoiseModel) -> np.ndarray:
-        """Return the variance of the window means by the noise within, of those left out beyond all others', shape (n_windows, 3)."""
-        variance = noise.mean_variance(self.kinds, self.counts)
+    def mean_variance(self, noise: NoiseModel, beside_bias: bool = True) -> np.ndarray:
+        """
+        Return the variance of the window means, of those left out beyond all others', shape (n_windows, 3).
+
+        Beside the bias in the middle of each window, or by the noise within and the reference alone.
+        """
+        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(self.kinds, self.counts, self.durations)
         if noise.left_out:
             out = np.array([key in noise.left_out for key in self.keys])
             variance[out] = LOOSE**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)

@@ -59,6 +59,8 @@ class WindowStatistics:
     """Sensor name -> SensorStatistics."""
     session: int = 0
     """Recording that the window comes from."""
+    encoder_step: float = 0.0
+    """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
     pieces: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     """Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a proof is wanted (see `pieces`)."""
 
@@ -120,7 +122,8 @@ def _reduced(window, designs, session, inputs):
         rate_s = designs['gyroscope'][:, inputs['gyroscope']]
         pieces = {s: moving_pieces(np.concatenate([designs[s], outputs[s]], axis=1), window.time, designs[s][:, inputs[s]],
                                    rate_s=rate_s) for s in SENSORS}
-    return WindowStatistics(window.kind, float(window.time.mean()), duration, len(window.time), sensors, session, pieces)
+    step = 0.0 if window.joint_step is None else float(np.max(window.joint_step, initial=0.0))
+    return WindowStatistics(window.kind, float(window.time.mean()), duration, len(window.time), sensors, session, step, pieces)
 
 
 def _reduce_static(design, output):

@@ -23,7 +23,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.goals import WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
@@ -190,7 +190,7 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     ----------
     table : Table
     noise : mapping
-        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`.
+        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`; steps of the encoders are those of the table.
     tolerances : mapping, optional
         {section: {effect: tolerance}}, SI.
     rate : float
@@ -206,7 +206,9 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     model = choose_model(options, table)
     values = None if calibration is None else model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
-    planner = Planner(Situation(Repertoire(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate))
+    step = table.joint_noise_rad or 0.0
+    beside = {sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor)) for sensor, own in noise.items()}
+    planner = Planner(Situation(Repertoire(table, limits or limits_of(table)), coordinates, beside, rate=rate))
     if calibration is not None:
         planner.take(calibration)
     return planner

@@ -79,8 +79,8 @@ class WindowPredictor:
                         for cut, a, b in zip(flat, edges, edges[1:], strict=False)])
         return [[next(windows) for _ in one] for one in cuts]
 
-    def _cut(self, segments) -> Iterator[tuple[JointMotion, float, float, float]]:
-        """Yield (motion at some instants, middle, length with what settles, seconds of data) of each window."""
+    def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
+        """Yield (motion at some instants, kind, middle, length with what settles, seconds of data) of each window."""
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')
@@ -89,11 +89,11 @@ class WindowPredictor:
             if seconds >= getattr(self.settings, f'{kind}_minimum'):
                 count = LEAST_INSTANTS if kind == 'static' else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
                 time = lost + (np.arange(count) + 0.5) / count * seconds
-                yield Profile('', (segment,)).at(time), begin + lost + seconds / 2, segment.duration, seconds
+                yield Profile('', (segment,)).at(time), kind, begin + lost + seconds / 2, segment.duration, seconds
             begin += segment.duration
 
     def _window(self, cut, designs):
-        motion, middle, length, seconds = cut
+        motion, kind, middle, length, seconds = cut
         samples, count = seconds * self.rate, len(motion)
         offsets = ((np.arange(count) + 0.5) / count - 0.5) * seconds
         means, variance, within = {}, {}, {}
@@ -101,6 +101,7 @@ class WindowPredictor:
             slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
             means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
             within[sensor] = np.zeros((slope.shape[2],) * 2)
+            reference = noise.reference.variance([kind], np.array([seconds]))[0]
             wander, turned = np.linalg.eigh(noise.wander_within(offsets))
             rows, ones = turned.T @ design, turned.sum(axis=0)
             for axis in range(3):
@@ -108,6 +109,7 @@ class WindowPredictor:
                 variance[sensor][axis] = 1 / (weight @ ones**2)
                 mean = variance[sensor][axis] * ((weight * ones) @ rows)
                 centred = (rows - np.outer(ones, mean)) @ slope[:, axis]
+                variance[sensor][axis] += reference
                 means[sensor][axis] = mean @ slope[:, axis]
                 within[sensor] += centred.T @ (centred * weight[:, None])
         return PlannedWindow(middle, length, samples, means, variance, within)

@@ -1,17 +1,19 @@
 """How long a moving window may be, so that the bias of a quiet accelerometer does not wander within it by more than noise hides."""
 
 from collections import deque
+from math import ceil
 
 import numpy as np
 
-from imu_calibration.segmentation.window import Window, WindowKind
+from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.segmentation.window import PhasedSamples
 
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
 """m/s^2 and s: the best accelerometers hold their bias to 10 ug over minutes (a Gauss-Markov process; field figures in `sensor_noise`)."""
 PIECE = 0.25
 """Means over this time tell the noise at low frequency, s: longer than sensor filters."""
 LEAST_PIECES = 4
-SHORTEST = 2.5
+SHORTEST = 5.0
 """Moving windows are not cut shorter, s."""
 
 
@@ -21,22 +23,33 @@ class WanderLimit:
 
     Over T the mean of white noise of density d scatters by ``d / sqrt(T)``, a bias by about ``sd sqrt(2 T / time)``. They meet at
     ``T = d sqrt(time / 2) / sd``; a longer window holds a drift that least squares takes for scale factors and arms. That
-    is 80 s at 120 ug/sqrt(Hz), and less than a second at 1 ug/sqrt(Hz).
+    is 80 s at 120 ug/sqrt(Hz), and less than a second at 1 ug/sqrt(Hz). Where gravity turns by more than the noise while stamps
+    are late by their jitter, the reference is what limits, and means over short windows would show its errors instead.
     """
 
     def __init__(self) -> None:
         self._densities: deque[float] = deque(maxlen=9)
 
-    def take(self, window: Window) -> None:
+    def rested(self, samples: PhasedSamples) -> None:
         """Learn from a window at rest."""
-        length = int(round(PIECE / window.period)) if window.kind == WindowKind.STATIC and window.period > 0 else 0
-        pieces = len(window) // length if length else 0
+        period = _period(samples)
+        length = int(round(PIECE / period)) if period > 0 else 0
+        pieces = len(samples) // length if length else 0
         if pieces >= LEAST_PIECES:
-            means = window.force_s[:pieces * length].reshape(pieces, length, 3).mean(axis=1)
-            self._densities.append(float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * window.period)))
+            means = samples.force_s[:pieces * length].reshape(pieces, length, 3).mean(axis=1)
+            self._densities.append(float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period)))
 
-    def longest(self, most: float) -> float:
-        """Return the longest moving window, s, at most that which the settings allow; that one where no rest was seen yet."""
-        if not self._densities:
-            return most
-        return min(most, max(SHORTEST, float(np.median(self._densities)) * np.sqrt(BEST_TIME / 2) / BEST_BIAS))
+    def pieces(self, samples: PhasedSamples) -> int:
+        """Return into how many windows motion is to be cut; one where no rest was seen yet."""
+        if not self._densities or len(samples) < 3:
+            return 1
+        density = float(np.median(self._densities))
+        jitter = np.diff(samples.time, 2).std() / np.sqrt(6)
+        if STANDARD_GRAVITY * np.sqrt((samples.rate_s**2).sum(axis=1).mean()) * jitter * np.sqrt(_period(samples)) > density:
+            return 1
+        longest = max(SHORTEST, density * np.sqrt(BEST_TIME / 2) / BEST_BIAS)
+        return ceil((samples.time[-1] - samples.time[0]) / longest)
+
+
+def _period(samples):
+    return (samples.time[-1] - samples.time[0]) / max(len(samples) - 1, 1)

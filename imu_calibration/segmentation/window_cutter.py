@@ -148,8 +148,7 @@ class WindowCutter:
 
     def _longest(self, kind):
         # halves of a window that is a little too long must still be long enough
-        most = self._settings.window_maximum
-        return max(self._wander.longest(most) if kind == DYNAMIC else most, 2 * self._least(kind))
+        return max(self._settings.window_maximum, 2 * self._least(kind))
 
     def _finished(self, samples, kind, reason):
         n = len(samples)
@@ -160,9 +159,12 @@ class WindowCutter:
         self.counts[key] = self.counts.get(key, 0) + n
         if kind == UNUSED and not self._keep_unused:
             return []
-        window = make_window(samples, _KINDS[kind], _REASONS[reason])
-        self._wander.take(window)
-        return [window]
+        if kind == STATIC:
+            self._wander.rested(samples)
+        pieces = self._wander.pieces(samples) if kind == DYNAMIC else 1
+        bounds = np.linspace(0, n, pieces + 1).astype(int)
+        return [make_window(samples.select(slice(start, stop)), _KINDS[kind], _REASONS[reason])
+                for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 def _runs(value, broken):

@@ -78,8 +78,8 @@ class Attempt:
         self.questions = questions(judged, effects)
         self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
         self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
-        step = encoder_step([window for window, kept in zip(windows, locked) if not kept])
-        self.search = Search(self.evidence, used, self.questions, encoder_step=step, any_size=any_size, resolved=resolved)
+        self.search = Search(self.evidence, used, self.questions, encoder_step=judged.recording.encoder_step, any_size=any_size,
+                             resolved=resolved)
 
     def asking_any_size(self) -> 'Attempt':
         """Return the same, asking about sizes that are known of no instrument too."""
@@ -189,11 +189,6 @@ class Attempt:
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
-
-
-def encoder_step(windows: Sequence[Window]) -> float:
-    """Return the largest step of the encoders that shows in the readings, rad; 0 where none does."""
-    return max((float(np.max(w.joint_step)) for w in windows if w.joint_step is not None), default=0.0)
 
 
 def baseline_parameters(baseline: SensorModel, model: SensorModel) -> tuple[int, ...]:

@@ -1,16 +1,13 @@
 """Which share of what noise leaves unexplained the chosen effects remove, so that none is named beside a cause that nobody asked about."""
 
-from dataclasses import replace
 from typing import Callable, Sequence
 
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.noise_beside_effects import plausible_processes
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.reduced_recording import ReducedRecording
 from imu_calibration.selection.search import Search
 
 LEAST_SHARE = 0.7
@@ -41,7 +38,6 @@ class Explained:
         duration = float(np.ptp(recording.time))
         noise = {sensor: own.at_rest_only(*plausible_processes(own, recording.period, sensor=sensor, duration=duration))
                  for sensor, own in evidence.noise.items()}
-        noise['gyroscope'] = with_steps_of_encoders(noise['gyroscope'], recording, step=search.encoder_step)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold)
         self.n_means = 3.0 * len(recording.windows)
         self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
@@ -82,21 +78,6 @@ class Explained:
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
         shown = {s: removed[s] >= SHOWS * removed[s].max() for s in sensors}
         return [(float(removed[s][shown[s]].sum()), float(self._rest(with_it[s])[shown[s]].sum())) for s in sensors]
-
-
-def with_steps_of_encoders(noise: NoiseModel, recording: ReducedRecording, *, step: float) -> NoiseModel:
-    """
-    Return the noise of a gyroscope with the reference's own in the means of moving windows: a turn read at both ends in steps.
-
-    The mean rate over T then errs by ``step / sqrt(6) / T``; samples within, whose errors average out, do not show it.
-    """
-    moving = {}
-    for kind, factors in noise.moving.items():
-        rows = recording.kind == kind
-        duration = np.array([window.duration for window in recording.windows])[rows]
-        variance = np.median(step**2 / 6.0 / np.maximum(duration, recording.period)**2 * recording.count[rows])
-        moving[kind] = replace(factors, means=factors.means + variance / noise.low_variance)
-    return replace(noise, moving=moving)
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:

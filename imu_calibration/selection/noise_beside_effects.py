@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, white_noise
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasProcessSearch
@@ -83,8 +83,8 @@ def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
     found = {}
     for sensor in SENSORS:
-        white = white_noise(space.recording.windows, sensor)
-        found[sensor] = NoiseModel(*(white or (_white_without_rest(space, sensor), np.ones(3))))
+        white, inflation = white_noise(space.recording.windows, sensor) or (_white_without_rest(space, sensor), np.ones(3))
+        found[sensor] = NoiseModel(white, inflation, reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor))
     return found
 
 
@@ -124,10 +124,10 @@ def _with_bias_process(space, sensor, noise, smooth):
     rows = np.zeros((len(recording.windows), 3, len(own) + 1))
     for axis in range(3):
         rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
-    white = noise[sensor].mean_variance(recording.kind, recording.count)
+    white = noise[sensor].mean_variance(recording.kind, recording.count, recording.duration)
     likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
                                  information=_known_otherwise(space, sensor, noise, own),
-                                 known=noise[sensor].known)
+                                 known=noise[sensor].known, durations=recording.duration)
     least = 0.0 if noise[sensor].known else natural_processes(noise[sensor], recording.period)[0].sd
     search = BiasProcessSearch(likelihood, least, STABLE[sensor])
     options = [[place[k] for k in parameters] for parameters in smooth]

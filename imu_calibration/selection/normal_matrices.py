@@ -43,6 +43,6 @@ def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], selec
 def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str) -> list[np.ndarray]:
     """Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1)."""
     recording, own = space.recording, noise[sensor]
-    variance = own.mean_variance(recording.kind, recording.count) + own.offset_sd**2
+    variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration) + own.offset_sd**2
     return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, processes=own.bias_processes)(rows[:, None])[:, 0]
             for axis, rows in enumerate(space.mean[sensor])]

@@ -57,6 +57,16 @@ class ReducedRecording:
         return np.array([window.count for window in self.windows], float)
 
     @cached_property
+    def duration(self) -> np.ndarray:
+        """Length of each window, s, shape (k,)."""
+        return np.array([window.duration for window in self.windows])
+
+    @property
+    def encoder_step(self) -> float:
+        """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
+        return max((window.encoder_step for window in self.windows), default=0.0)
+
+    @cached_property
     def slow_rows(self) -> np.ndarray:
         """Short pieces of each window, shape (k,)."""
         return np.array([window.sensors['accelerometer'].slow_rows for window in self.windows])
