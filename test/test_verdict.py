@@ -65,6 +65,20 @@ def test_residuals_in_motion_against_the_noise_at_rest(factor, word, reason):
     assert found.word == word and words == ([reason] if reason else [])
 
 
+@pytest.mark.parametrize(('interval', 'regime', 'word'), [((0.1, 0.2), (0.3, 0.4), WEAK), ((0.1, 0.2), (0.9, 1.01), BAD), ((0.9, 1.01), (0.3, 0.4), BAD)])
+def test_residuals_far_above_the_noise_are_weak_beside_a_proof_of_help_in_every_motion(interval, regime, word):
+    base = with_statistics('gyroscope', chi2_per_dof={'spin': 20.0})
+    entry = {'before': 2.0, 'after': 1.0, 'unit': 'rad/s', 'windows': 9, 'ci95': interval}
+    proof = {'gyroscope': entry | {'regimes': {'turns': {'before': 2.0, 'after': 1.0, 'ci95': regime}}}}
+    found = judge(replace(base, proof=proof), TOLERANCES)
+    if interval[1] < 1:
+        assert found.word == word and 'residuals of spin windows are 4.5 times' in found.lines()[0]
+        assert ('in every motion all the same' in found.lines()[0]) == (word == WEAK)
+    assert judge(base, TOLERANCES).word == BAD and (found.word == BAD) == (word == BAD)
+    restless = replace(base, proof=proof, statistics=base.statistics | {'windows': {'spin': 3}})
+    assert judge(restless, TOLERANCES).word == BAD   # late by a period of the motion
+
+
 def test_without_rest_residuals_are_compared_with_their_slow_part():
     base = with_statistics('gyroscope', chi2_per_dof={'spin': 20.0})
     text = judge(replace(base, statistics=base.statistics | {'windows': {'spin': 3}}), TOLERANCES).lines()[0]

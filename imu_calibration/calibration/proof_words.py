@@ -37,6 +37,13 @@ def harmed(found: Mapping) -> dict[str, Any]:
             and part['ci95'][0] > 1.0}
 
 
+def helps_everywhere(found: Mapping | None) -> bool:
+    """Return whether an entry of a proof is sure that the error shrinks, on the whole and in every motion with windows enough to tell."""
+    if not found or not found['windows'] or not found['ci95'][1] < 1.0:
+        return False
+    return not any(part['after'] >= part['before'] or part['ci95'][1] >= 1.0 for part in (found.get('regimes') or {}).values())
+
+
 def proven(proof: Mapping) -> list[str]:
     """Return what a proof shows, a line for each sensor."""
     return [f'{sensor} error on data that took no part ({found["windows"]} windows): {found["before"]:.3g} {found["unit"]} without, '

@@ -60,8 +60,13 @@ def quiet(calibration: Calibration) -> str:
 
     Without a rest only their own slow part is there, and lags show in the fast one.
     """
+    return 'the noise at rest' if rested(calibration) else 'their slow part (a lag or a late clock leaves that)'
+
+
+def rested(calibration: Calibration) -> bool:
+    """Return whether a recording on a table has rests, from which the noise is known."""
     windows = calibration.statistics.get('windows')
-    return 'the noise at rest' if windows is None or windows.get('static') else 'their slow part (a lag or a late clock leaves that)'
+    return windows is None or bool(windows.get('static'))
 
 
 def listed(names: Sequence[str]) -> str:

@@ -6,8 +6,8 @@ import numpy as np
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
-from imu_calibration.calibration.proof_words import disproved
-from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet
+from imu_calibration.calibration.proof_words import disproved, helps_everywhere
+from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet, rested
 from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.calibration.verdict_notes import notes_on
@@ -48,10 +48,10 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     Return the Verdict on a calibration.
 
-    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument, residuals in motion far
-    above the noise at rest, or a sensor of which nothing was determined and the whole matrix is held (after a rest in one attitude). Weak:
-    a requested parameter is not determined to its tolerance, or what explains the rest has a size that is known of no instrument. Good:
-    neither.
+    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument; residuals in motion far
+    above the noise at rest, where nothing proves that the calibration helps in every motion all the same; or a sensor of which nothing was
+    determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not determined to its tolerance,
+    what explains the rest has a size that is known of no instrument, or such residuals beside that proof. Good: neither.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         Largest standard deviation of a determined parameter.
 
     """
-    against = grave_reasons(calibration) + _strange_causes(calibration) + _undetermined(calibration)
+    against = grave_reasons(calibration) + _misfits(calibration, WEAK) + _strange_causes(calibration) + _undetermined(calibration)
     words = {sensor: _worst([reason for reason in against if sensor in reason.sensors]) for sensor in SENSORS}
     favour = [] if against else [_all_well(calibration, tolerances)]
     order = (BAD, WEAK)
@@ -74,7 +74,7 @@ def _worst(against):
 
 def grave_reasons(calibration: Calibration) -> list[Reason]:
     """Return what makes a verdict bad; it follows from what a document says."""
-    return _disproved(calibration) + _implausible(calibration) + _misfits(calibration) + _blind(calibration)
+    return _disproved(calibration) + _implausible(calibration) + _misfits(calibration, BAD) + _blind(calibration)
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
@@ -112,11 +112,18 @@ def _strange_causes(calibration):
             for name, share in found.items()]
 
 
-def _misfits(calibration):
-    return [Reason(BAD, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
-                   'the model leaves something out',
+def _misfits(calibration, word):
+    """
+    Return the residuals in motion that are too large, of the sensors for which that weighs as much as the word says.
+
+    A table that shakes while it turns, a cable, a mount that gives way: a calibration is better than none. Without rests no proof counts:
+    stamps that are late by a period of the motion predict the next period as well as this one.
+    """
+    return [Reason(word, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
+                   f'the model leaves something out{", and it helps in every motion all the same" if word == WEAK else ""}',
                    "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
-            for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
+            for sensor in SENSORS if (word == WEAK) == (rested(calibration) and helps_everywhere(calibration.proof.get(sensor)))
+            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
 
 
 def _blind(calibration):
