@@ -155,6 +155,19 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
     assert len(speeds) != 1
 
 
+def test_no_time_is_spent_on_causes_that_no_motion_tells_apart(table):
+    """A delay and a filter of 0.1 ms are one column: the plan says so at once instead of driving for three minutes."""
+    causes = [('gyroscope', name) for name in ('gyro_delay', 'gyro_filter')]
+    model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names).with_effect(*causes[0])
+    values = model.start()
+    values[model.slices[causes[0]]] = 1e-4
+    calibration = Calibration(model, values, np.diag(model.prior()[1]**2), ('weak',) * len(values))
+    separator = make_separator(table, calibration, causes, noise=NOISE, sizes={'gyroscope.gyro_filter.delay': 1e-4})
+    plan = separator.plan(longest=180.0)
+    assert plan.missing == ('gyro_delay and gyro_filter',) and plan.seconds == 0
+    assert separator.next_motion(plan.start).motion is None
+
+
 def test_a_class_is_taken_from_a_diagnosis_or_refused():
     findings = [{'effect': 'a', 'indistinguishable_from': []},
                 {'effect': 'b', 'indistinguishable_from': ['c', 'd'], 'sizes_of_mates': {'c': {'c.x': {'value': 2.0, 'unit': '1'}}}}]

@@ -16,6 +16,9 @@ from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.separation import make_separator
 from imu_calibration.reference.table import Table
 
+LONGEST = 180.0
+"""What no plan of this length tells apart is one cause for this table, s."""
+
 
 def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,
                  options: CalibrationOptions = CalibrationOptions()) -> Planner:
@@ -46,8 +49,10 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
         if name not in sensors:
             raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has")
     causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
-    return make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
-                          sizes=suspect.sizes)
+    planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
+                             sizes=suspect.sizes)
+    planner.within(LONGEST)
+    return planner
 
 
 def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]) -> Calibration:

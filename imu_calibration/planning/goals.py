@@ -86,6 +86,8 @@ class ToldApart:
         self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
         self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
+        self.reachable = np.ones(len(self.pairs), bool)
+        """Pairs that some motion can tell apart: no time is spent on the others, which stay missing."""
 
     def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
         """Return lambda of each pair in units of what is enough, shape (k, n_pairs)."""
@@ -103,9 +105,15 @@ class ToldApart:
         return np.maximum(found, 1e-12)
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return half the sum of logarithms of what is lacking, the worst pair three times."""
-        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance) / margin**2), 0.0)
-        return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1)
+        """Return half the sum of logarithms of what pairs that can be told apart lack, the worst of them three times."""
+        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0)
+        return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
+
+    def leave_out_of_reach(self, covariance: np.ndarray) -> None:
+        """Spend no time on pairs, in either order, that even this covariance, (n, n), better than any plan's, does not tell apart."""
+        enough_left = self.noncentrality(covariance[None])[0] >= 1.0
+        apart = {(a.key, b.key) for (a, b), reached in zip(self.pairs, enough_left, strict=True) if reached}
+        self.reachable = np.array([(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs])
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the pairs that would not be told apart."""

@@ -25,7 +25,7 @@ from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.goals import WithinTolerances
+from imu_calibration.planning.goals import ToldApart, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.search import Offers, exchanged, greedy
@@ -137,8 +137,8 @@ class Planner:
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
         missing = self.situation.goal.missing(self._belief.known)
-        if not missing:
-            return NextMotion(None, DONE)
+        if not self.situation.goal.left(self._belief.known[None])[0] > 0:
+            return NextMotion(None, STUCK if missing else DONE, missing=missing)
         place = self.situation.place_near(position)
         choice = Offers(self.situation, self._belief, place)
         number = choice.best if self._visited or self.known is not None else self.situation.first_rest(place)
@@ -155,11 +155,17 @@ class Planner:
         start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
         place = situation.place_near(start)
         first = () if self.known is not None else (situation.first_rest(place),)
+        self.within(longest)
         sequence = greedy(situation, place, known=self.known, first=first, progress=progress, longest=longest)
         sequence = exchanged(situation, sequence, place, known=self.known, fixed=len(first))
         with_bound = with_bound and isinstance(situation.goal, WithinTolerances)
         bound = situation.lower_bound(self.known) if with_bound else float('nan')
         return self._plan_of(sequence, start, place, bound)
+
+    def within(self, seconds: float) -> None:
+        """Spend no time on causes that no plan of so many seconds tells apart."""
+        if isinstance(self.situation.goal, ToldApart) and np.isfinite(seconds):
+            self.situation.goal.leave_out_of_reach(self.situation.best_covariance(seconds, self.known))
 
     def _plan_of(self, sequence, start, place, bound):
         situation, coordinates = self.situation, self.situation.coordinates

@@ -202,6 +202,20 @@ class Situation:
             total = total + exact_information(windows, times, self.noise)
         return np.linalg.inv(total), seconds
 
+    def best_covariance(self, seconds: float, known: np.ndarray | None = None) -> np.ndarray:
+        """
+        Return a covariance of z below that of any plan of these motions and the moves between them that takes so long.
+
+        Every motion fills all of the time at once, with every window seen beside biases that forget what was before it.
+        """
+        moves = [(windows, float(self.way_seconds[key])) for key, windows in self.way_windows.items() if windows]
+        everything = [*zip(self.windows, self.seconds.tolist(), strict=True), *moves]
+        total = self.coordinates.prior_information + (0.0 if known is None else known)
+        for windows, length in everything:
+            if windows:
+                total = total + sum(additive_bound(window, self.noise) for window in windows) * max(seconds / length, 1.0)
+        return np.linalg.inv(total)
+
     def excess(self, covariance: np.ndarray) -> np.ndarray:
         """Return the standard deviations of the parameters asked for, in tolerances, shape (p,)."""
         asked = self.coordinates.asked
