@@ -73,7 +73,7 @@ def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, se
 def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):
     def enough(windows, *arguments, **options):
         raise ImuCalibrationError(f'{len(windows)} windows')
-    monkeypatch.setattr('imu_calibration.calibration.by_evidence.investigate', enough)
+    monkeypatch.setattr('imu_calibration.calibration.by_evidence.inquire', enough)
     with pytest.raises(ImuCalibrationError, match=r'^\d\d+ windows'):
         diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
