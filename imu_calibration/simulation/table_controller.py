@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -127,8 +127,8 @@ class TableController:
         if self._stalled is None:
             self._stalled = braking_from(self._commanded(np.array([self.settings.stall_time])), self.limits)
         column, stuck = self.joint_names.index(self.settings.stall_joint), self._stalled.at(time[late])
-        for field in fields(JointMotion)[1:]:
-            getattr(motion, field.name)[late, column] = getattr(stuck, field.name)[:, column]
+        for name in ('position', 'rate', 'acceleration', 'jerk'):
+            getattr(motion, name)[late, column] = getattr(stuck, name)[:, column]
         return motion
 
     def _commanded(self, time):
