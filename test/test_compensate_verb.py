@@ -13,6 +13,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
+from imu_calibration.reference.thermal_branch import ThermalBranch
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS, parse_imu
@@ -39,7 +40,8 @@ def write_case(folder, effects):
     """Write a bag of what a sensor with these effects reads, and its calibration; return the calibration."""
     calibration = random_calibration(7, *EFFECTS[effects], sd=1e-5)
     stamps, force, rate, alpha, temperature = true_motion()
-    ref = Reference(np.zeros(N), np.broadcast_to(np.eye(3), (N, 3, 3)), force, rate, alpha, 9.8, temperature)
+    branch = np.interp(stamps - stamps[0], stamps[::100] - stamps[0], ThermalBranch().of(temperature[::100]))
+    ref = Reference(np.zeros(N), np.broadcast_to(np.eye(3), (N, 3, 3)), force, rate, alpha, 9.8, temperature, branch)
     readings = [sensor_output(calibration.model, sensor, calibration.values, ref=ref) for sensor in ('accelerometer', 'gyroscope')]
     thermometer = TemperatureSamples(stamps[::100], temperature[::100])
     write_session(folder / 'bag', ImuSamples(stamps, *readings, 'imu_link'), temperature=thermometer)
