@@ -84,7 +84,7 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 test-oldest:
 	$(MAKE) test VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
 
-# Each declared line of the guards broken, one at a time (test/mutants/declared.py): which faults does no test notice? Half an hour.
+# Each declared line of the guards broken, one at a time (test/mutants/declared.py): which faults does no test notice?
 mutants: $(STAMP)
 	@$(PY) test/mutants/run.py
 

@@ -127,7 +127,7 @@ HAND = _of(
     ('what comes after a turn is on the old branch', 'compensation/sample_compensation.py', 'self.branch.push(temperature_c)', 'pass',
      'test_thermal_branch.py::test_compensation_live_and_of_a_recording_take_the_branch_out'),
     ('what does not belong to the others stays', 'by_hand/outliers.py', 'if p * max(len(own), 1) < P_VALUE]', 'if p < 0]', 'test_hand_faults.py::test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out'),
-    ('missed turns stay', 'by_hand/outliers.py', 'CONTRADICTED = 0.35', 'CONTRADICTED = 9.0', 'test_hand_faults.py::test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out'),
+    ('missed turns stay', 'by_hand/outliers.py', 'CONTRADICTED = 0.35', 'CONTRADICTED = 9.0', 'test_hand_faults.py::test_what_was_left_out_does_not_come_back_in_the_proof'),
     ('slow turns are poses', 'segmentation/static_detector.py', 'keep[1:-1] &= np.all(', 'keep[1:-1] |= np.all(', 'test_hand_faults.py::test_a_slow_turn_about_the_vertical_is_no_pose'),
     ('spikes stay', 'segmentation/spike_filter.py', 'LARGE = 8.0', 'LARGE = 8e9', 'test_spike_filter.py'),
     ('fast motion passes for spikes', 'segmentation/spike_filter.py', 'np.maximum(1.4 * limit, ROUGH * rough)', '1.4 * limit', 'test_spike_filter.py'),
