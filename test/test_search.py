@@ -133,9 +133,11 @@ class Squares:
 
     @staticmethod
     def of(space, values, _sensor):
-        count, within, means = space
+        count, within, means, *rests = space
         within, means = (np.where(values[:, 0] > 0, left, 1.0) * size * np.ones(count) for left, size in ((within, 97.0), (means, 0.15)))
-        return dict(zip(gain.MEASURES, ((within + 100.0 / 3.0 * means, np.full(count, 100.0)), (means, np.full(count, 3.0)), (within, np.full(count, 97.0)))))
+        still = np.where(values[:, 0] > 0, rests[0] if rests else 0.15, 0.15) * np.ones(count)
+        return dict(zip(gain.MEASURES, ((within + 100.0 / 3.0 * means, np.full(count, 100.0)), (means, np.full(count, 3.0)),
+                                        (within, np.full(count, 97.0)), (still, np.full(count, 3.0)))))
 
 
 def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeypatch):
@@ -153,6 +155,16 @@ def test_a_large_fall_of_a_few_means_may_be_chance(monkeypatch, risen, measure):
     monkeypatch.setattr(gain, '_squares', Squares.of)
     means = np.where(np.arange(30) % 3, 0.001, risen)
     assert gain.gain_in_turn(Squares(0.99, means), [], [QUADRATIC], sensors=['accelerometer']).measure == measure
+
+
+def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
+    """Moving windows of a quiet sensor show the encoder."""
+    monkeypatch.setattr(gain, '_squares', Squares.of)
+    unsure = np.where(np.arange(30) % 3, 0.001, 3.0)
+    for within, measure in ((1.0, gain.AT_REST), (0.99, 'samples about the mean of their window')):
+        some = Squares(within, unsure)
+        some.all_samples = (*some.all_samples, 0.02 if within == 1.0 else 0.001)
+        assert gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
 
 
 def test_an_interval_of_95_percent_holds_95_percent():

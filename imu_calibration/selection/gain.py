@@ -10,7 +10,8 @@ from imu_calibration.selection.questions import Question
 
 RESAMPLES = 1000
 """Of whole windows, for an interval."""
-MEASURES = ('samples', 'window means', 'samples about the mean of their window')
+AT_REST = 'means of windows at rest'
+MEASURES = ('samples', 'window means', 'samples about the mean of their window', AT_REST)
 """Residuals that a gain is told of."""
 LEAST_REDUCTION = 0.01
 """
@@ -67,7 +68,7 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
     Return the same Gain on the windows that choose, each fold under the fit to the others.
 
     Told is the measure that falls most, or where that is not sure, the one that falls most surely: a small lag takes a tenth off the window
-    means by chance, and half a percent off the samples for sure.
+    means by chance, and half a percent off the samples for sure. Of a quiet sensor moving windows show the encoder, and rests the sensor.
     """
     found, fold = [], attempt.evidence.fold
     for sensor in sensors:
@@ -77,7 +78,7 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
             pair.append(_squares(attempt.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
         found += [(_gain(sensor, measure, each), each) for measure, each in of.items()]
-    most = max(found, key=lambda entry: np.nan_to_num(entry[0].ci95[0], nan=-np.inf))
+    most = max((entry for entry in found if entry[0].measure != AT_REST), key=lambda entry: np.nan_to_num(entry[0].ci95[0], nan=-np.inf))
     return (most if most[0].ci95[0] > 0 else max(found, key=lambda entry: _certainty(entry[1])))[0]
 
 
@@ -98,7 +99,7 @@ def _squares(space, values, sensor):
     within[rest] = at_rest[rest] * (recording.count[rest] - 1)
     three = np.full(len(means), 3.0)
     every = (within + recording.count * means, 3 * recording.count)
-    return dict(zip(MEASURES, (every, (means, three), (within, 3 * (recording.count - 1)))))
+    return dict(zip(MEASURES, (every, (means, three), (within, 3 * (recording.count - 1)), (means[rest], three[rest]))))
 
 
 def _certainty(pair):
