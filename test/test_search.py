@@ -167,6 +167,13 @@ def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
         assert gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
 
 
+def test_a_recording_without_rests_says_nothing_of_them(monkeypatch):
+    """All measures rise; that of no windows at all does not, and must not stand for a fall."""
+    monkeypatch.setattr(gain, '_squares', lambda *args: Squares.of(*args) | {gain.AT_REST: (np.zeros(0), np.zeros(0))})
+    found = gain.gain_in_turn(Squares(1.2, 1.2), [], [QUADRATIC], sensors=['accelerometer'])
+    assert found.measure != gain.AT_REST and found.ci95[0] < 0
+
+
 def test_an_interval_of_95_percent_holds_95_percent():
     """Of the reductions that windows drawn anew give."""
     rng = np.random.default_rng(8)

@@ -79,7 +79,8 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
         found += [(_gain(sensor, measure, each), each) for measure, each in of.items()]
     most = max((entry for entry in found if entry[0].measure != AT_REST), key=lambda entry: np.nan_to_num(entry[0].ci95[0], nan=-np.inf))
-    return (most if most[0].ci95[0] > 0 else max(found, key=lambda entry: _certainty(entry[1])))[0]
+    known = [entry for entry in found if not np.isnan(entry[0].ci95[0])] or [most]   # a recording without rests says nothing of them
+    return (most if most[0].ci95[0] > 0 else max(known, key=lambda entry: _certainty(entry[1])))[0]
 
 
 def _gain(sensor, measure, pair):

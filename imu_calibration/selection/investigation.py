@@ -237,10 +237,10 @@ def _that_help(attempt, explained, named):
     kept = [question for question in named if attempt.search.allowed(named, question)]
     while kept:
         least = [_sure_reduction(attempt, kept, each) for each in kept]
-        short = [paid <= _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]
+        short = [not paid > _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]   # nan is not sure
         if not any(short):
             break
-        del kept[int(np.argmin(np.where(short, least, np.inf)))]
+        del kept[int(np.argmin(np.where(short, np.nan_to_num(least, nan=-np.inf), np.inf)))]
     return kept
 
 
