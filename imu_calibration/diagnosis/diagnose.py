@@ -10,7 +10,7 @@ from imu_calibration.beyond.unexplained import unexplained
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import candidates_of, sentence
-from imu_calibration.diagnosis.separating_motion import separating_motion
+from imu_calibration.diagnosis.separating_motion import motions_of_one_joint, separating_motion
 from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
@@ -94,6 +94,8 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
         return MATE * own <= other
 
     def motion_of(question, mate):
+        if len(table.joint_names) == 1:
+            return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
     told_by = calibrated or solution

@@ -8,7 +8,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.estimation.standard_motions import MOTIONS, ONE_JOINT, OTHER_MOUNT, TABLE_MOTIONS
 from imu_calibration.selection.questions import Question
 
 ENOUGH = 9.0
@@ -42,6 +42,13 @@ def motions_of(question: Question, mate: Question) -> str:
     own = [name for name in question.effect.motion + mate.effect.motion]
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
     return '; '.join(dict.fromkeys(texts[name] for name in own if name in texts))
+
+
+def motions_of_one_joint(question: Question, mate: Question) -> str:
+    """Return the same of a table that turns about one axis only, which cannot do most of them."""
+    own = dict.fromkeys(question.effect.motion + mate.effect.motion)
+    found = [ONE_JOINT[name] for name in own if name in ONE_JOINT]
+    return '; '.join(found + [OTHER_MOUNT] * (len(found) < len(own)))
 
 
 def _best_motion(solution, question, mate, gravity):

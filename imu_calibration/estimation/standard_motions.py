@@ -176,3 +176,11 @@ TABLE_MOTIONS = {
     'fast_spin': 'spin slowly up to the fastest rate in both senses',
 }
 """Motions that concern the table or the clock; their gain depends on the table and is not predicted."""
+ONE_JOINT = {
+    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz',
+    'fast_spin': TABLE_MOTIONS['fast_spin'],
+    'slow_turn': 'turn the joint slowly through full circles',
+    'warm_up': 'rest in several places, cold and warm',
+    'warm_and_cool': 'rest in several places while it warms up by ten kelvins, and again while it cools',
+}
+"""What a table of one joint can do of them; for the others the sensor is mounted anew."""
