@@ -10,7 +10,7 @@ from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
-from imu_calibration.selection import investigation
+from imu_calibration.selection import clipping, investigation
 from imu_calibration.selection.saturation import find_saturation, may_be_clipped, without_clipped
 from imu_calibration.use_cases.diagnose import diagnose
 
@@ -79,8 +79,8 @@ def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
 def test_locked_windows_show_no_limit(monkeypatch):
     windows = [SimpleNamespace(kind='static', number=number) for number in range(12)]
     seen = []
-    monkeypatch.setattr(investigation, '_limits', lambda some, table, model: (seen.extend(window.number for window in some), ([], {}, None))[1])
-    _, locked, _ = investigation._without_clipping(windows, None, None)
+    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(window.number for window in some), ([], {}, None))[1])
+    _, locked, _ = clipping.without_clipping(windows, None, None)
     assert locked.sum() == 3 and seen == [number for number in range(12) if not locked[number]]
 
 
@@ -89,7 +89,7 @@ def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
     table = Table.from_mapping(pair.table)
     gatherer = MotionGatherer(table)
     windows = gatherer.push(pair.first.block) + gatherer.finish()
-    monkeypatch.setattr(investigation, 'may_be_clipped', lambda windows, sensor: True)
-    monkeypatch.setattr(investigation, 'without_clipped', lambda *given, **known: [])
+    monkeypatch.setattr(clipping, 'may_be_clipped', lambda windows, sensor: True)
+    monkeypatch.setattr(clipping, 'without_clipped', lambda *given, **known: [])
     found = investigation.investigate(windows, table, SensorModel(joint_names=table.joint_names))
     assert found.used == [window for window in windows if window.kind != 'unused'] and not found.limits

@@ -173,7 +173,9 @@ def test_blocks_without_noise_are_the_offline_simulation():
         joined = type(parts[0]).concatenate(parts)
         assert len(joined) == np.count_nonzero(whole.stamp_ns < expected[0].stamp_ns[0] + int(60e9))
         for field in fields(joined):
-            if field.name not in ('frame_id', 'names'):
+            if getattr(whole, field.name) is None:
+                assert getattr(joined, field.name) is None
+            elif field.name not in ('frame_id', 'names'):
                 np.testing.assert_allclose(getattr(joined, field.name), getattr(whole, field.name)[:len(joined)], rtol=0, atol=1e-12)
 
 

@@ -28,8 +28,9 @@ from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.extended_model import extended_solution
-from imu_calibration.selection.investigation import LEAST_WINDOWS, Investigation
+from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE
 

@@ -13,7 +13,8 @@ from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.workflow import diagnosis_lines, in_words, nothing_named
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.selection.investigation import LEAST_WINDOWS, too_few_windows
+from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.investigation import too_few_windows
 
 
 class Outcome(StrEnum):

@@ -12,6 +12,8 @@ from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, s
 from imu_calibration.selection.normal_matrices import mean_matrix, white_means, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
+LEAST_WINDOWS = 8
+"""Fewer windows leave none to hold out."""
 FOLDS = 6
 """Parts that are held out in turn."""
 LOCKED_EVERY = 4

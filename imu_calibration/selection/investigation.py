@@ -6,30 +6,21 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.lags import FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.evidence import locked_windows
+from imu_calibration.selection.clipping import windows_at, without_clipping
+from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
 from imu_calibration.selection.pairs import best_pairs
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
-from imu_calibration.selection.saturation import (
-    Saturation,
-    find_saturation,
-    may_be_clipped,
-    measured,
-    noise_at_rest,
-    predictions,
-    simple_fit,
-    without_clipped,
-)
+from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import Named, Search
 from imu_calibration.selection.simpler import simpler
 
@@ -39,8 +30,6 @@ EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
 LEFT = 0.1
 """Share of a significant rest that pairs, or effects of implausible size, may leave."""
-LEAST_WINDOWS = 8
-"""Fewer windows leave none to hold out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +90,8 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
         raise too_few_windows(len(used))
     report = progress or (lambda share: None)
     model = with_joints_of(model, table)
-    used, locked, limits = _without_clipping(used, table, model)
-    effects, not_testable = testable_effects(model, table, _of(used, ~locked))
+    used, locked, limits = without_clipping(used, table, model)
+    effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     asked = without_saturation(effects)
     attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.4 * share))
@@ -262,42 +251,3 @@ def _sure_reduction(attempt, chosen, question):
 def with_joints_of(model: SensorModel, table: Table) -> SensorModel:
     """Return the model with the joints of the table."""
     return model if model.joint_names == table.joint_names else replace(model, joint_names=table.joint_names)
-
-
-def _of(windows, rows):
-    return [window for window, taken in zip(windows, rows) if taken]
-
-
-def _without_clipping(windows, table, model):
-    """Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show)."""
-    locked = locked_windows(np.array([window.kind for window in windows]))
-    limits, noise_sd, values = _limits(_of(windows, ~locked), table, model)
-    if not limits:
-        return windows, locked, []
-    levels, kept = {limit.sensor: limit.level for limit in limits}, []
-    for rows in (~locked, locked):
-        part = _of(windows, rows)
-        kept.append(without_clipped(part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd))
-    entries = [(window.time[0], number, window) for number, part in enumerate(kept) for window in part]
-    in_order = sorted(entries, key=lambda entry: entry[:2])
-    return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
-
-
-def _limits(windows, table, model):
-    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without what the limits spoil)."""
-    nothing = [], {}, None
-    suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
-    if not suspects:
-        return nothing
-    limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
-    noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
-    kept = windows
-    for _ in range(2):
-        predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
-        kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
-        if len(kept) < LEAST_WINDOWS:
-            return nothing   # what is always at its limit, or always near it, shows no limit
-    values = simple_fit(kept, table, model)
-    predicted = predictions(windows, table, model, values=values)
-    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]
-    return found, noise_sd, values

@@ -1,0 +1,61 @@
+"""Windows without what a limit of the output spoils, before anything is asked of them; the locked ones show no limit."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.evidence import LEAST_WINDOWS, locked_windows
+from imu_calibration.selection.saturation import (
+    Saturation,
+    find_saturation,
+    may_be_clipped,
+    measured,
+    noise_at_rest,
+    predictions,
+    simple_fit,
+    without_clipped,
+)
+
+
+def windows_at(windows: Sequence[Window], rows: np.ndarray) -> list[Window]:
+    """Return the windows of the rows that are true."""
+    return [window for window, taken in zip(windows, rows) if taken]
+
+
+def without_clipping(windows: list[Window], table: Table, model: SensorModel) -> tuple[list[Window], np.ndarray, list[Saturation]]:
+    """Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show)."""
+    locked = locked_windows(np.array([window.kind for window in windows]))
+    limits, noise_sd, values = _limits(windows_at(windows, ~locked), table, model)
+    if not limits:
+        return windows, locked, []
+    levels, kept = {limit.sensor: limit.level for limit in limits}, []
+    for rows in (~locked, locked):
+        part = windows_at(windows, rows)
+        kept.append(without_clipped(part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd))
+    entries = [(window.time[0], number, window) for number, part in enumerate(kept) for window in part]
+    in_order = sorted(entries, key=lambda entry: entry[:2])
+    return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
+
+
+def _limits(windows, table, model):
+    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without what the limits spoil)."""
+    nothing = [], {}, None
+    suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
+    if not suspects:
+        return nothing
+    limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
+    noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
+    kept = windows
+    for _ in range(2):
+        predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
+        kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
+        if len(kept) < LEAST_WINDOWS:
+            return nothing   # what is always at its limit, or always near it, shows no limit
+    values = simple_fit(kept, table, model)
+    predicted = predictions(windows, table, model, values=values)
+    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]
+    return found, noise_sd, values
