@@ -120,7 +120,7 @@ def _misfits(calibration, word):
     stamps that are late by a period of the motion predict the next period as well as this one.
     """
     return [Reason(word, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
-                   f'the model leaves something out{", and it helps in every motion all the same" if word == WEAK else ""}',
+                   f'the model leaves something out{", though the calibration helps in every motion" if word == WEAK else ""}',
                    "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
             for sensor in SENSORS if (word == WEAK) == (rested(calibration) and helps_everywhere(calibration.proof.get(sensor)))
             for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
