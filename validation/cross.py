@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from imu_calibration.effects.lags import total_lags
+from imu_calibration.effects.lags import FAMILY, total_lags
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
@@ -66,13 +66,19 @@ def outcome(found, checked):
 
 
 def spread(first, second):
-    """Return the differences over combined standard deviations by group of parameters, of what both know."""
+    """
+    Return the differences over combined standard deviations by group of parameters, of what both know.
+
+    Delays and filters of a sensor are one group: one cause, told by one explanation or another, whose size in all is a group of its own.
+    """
     groups = {}
     theirs = dict(zip(second.param_names, zip(second.values, second.sd, second.status)))
     for name, value, sd, status in zip(first.param_names, first.values, first.sd, first.status):
         other = theirs.get(name)
         if other and 'held' not in (status, other[2]) and not name.startswith('reference'):
-            groups.setdefault(name.rpartition('.')[0], []).append((value - other[0]) / np.hypot(sd, other[1]))
+            group = name.rpartition('.')[0]
+            of_lags = group.rpartition('.')[2] in FAMILY
+            groups.setdefault(f'{group.partition(".")[0]}.lags' if of_lags else group, []).append((value - other[0]) / np.hypot(sd, other[1]))
     lags = [total_lags(each.param_names, each.values, each.covariance) for each in (first, second)]
     for sensor in set(lags[0]) & set(lags[1]):
         (value, sd), (other, others) = (each[sensor] for each in lags)
