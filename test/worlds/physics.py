@@ -146,7 +146,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     truth = {'accelerometer': triads[0], 'gyroscope': triads[1], 'values': values, 'earth_n': world.earth_n, 'gravity': gravity,
              'temperature_c': climate.at(sampling.time), 'profile': moves, 'noise': model, 'start_ns': start_ns, **events}
     claims = _claims(model, imu_rate) if wrong_covariance else None
-    session = Session(imu, joints, published, _told(mapping, gravity, hidden), claims, truth)
+    session = Session(imu, joints, published, _told(mapping, hidden), claims, truth)
     session = _drop(session, dropped, start_ns, events['gap'])
     return _at_rest(session, start_ns, moves.find('rest')) if only_at_rest else session
 
@@ -265,11 +265,11 @@ def encoder_reading(angle, harmonics):
     return reading, slope
 
 
-def _told(mapping, gravity, hidden):
-    """Return the description that the searcher gets: nominal, and without latitude when Earth rate is hidden."""
+def _told(mapping, hidden):
+    """Return the description that the searcher gets: nominal, and without its azimuth when the Earth's rate is hidden."""
     told = copy.deepcopy(mapping)
     if 'earth_rate' in hidden:
-        told.update(gravity=float(gravity), latitude=None, height=None, azimuth_deg=None)
+        told.update(azimuth_deg=None)
     return told
 
 
