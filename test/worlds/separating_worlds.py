@@ -3,8 +3,9 @@ Does the motion that is planned to tell causes apart leave the right name? ``pyt
 
 A physical cause is hidden in a unit on a table, and a short round is driven by habit: the faces, one spin about each axis, a swing. Where the diagnosis
 of that names a class of effects that it cannot tell apart, the planner makes at most three minutes of motion for the same unit, and the diagnosis is asked
-again about both together. It is right when it then names what was hidden, with nothing that would do as well. Effects that the plan says beforehand to be alike whatever
-that table does in three minutes, lags of one sensor by a tenth of a millisecond above all, are one cause for it: a class of these with what was hidden is counted apart.
+again about all of it together; where a class is left still the planner makes another motion in what is left of the three minutes. It is right when it then
+names what was hidden, with nothing that would do as well. Effects that the plan says beforehand to be alike whatever that table does in three minutes, lags
+of one sensor by a tenth of a millisecond above all, are one cause for it: a class of these with what was hidden is counted apart.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
 from imu_calibration.use_cases.diagnose import Diagnosed, diagnose
-from imu_calibration.use_cases.plan import plan
+from imu_calibration.use_cases.plan import LONGEST_SEPARATION, plan
 
 from worlds.hiding import Recording, Sizes
 from worlds.physics import Session, make_session
@@ -36,7 +37,9 @@ HIDDEN = ('accel_quadratic', 'gyro_bandwidth', 'accel_scale_asymmetry', 'gyro_qu
 FACTORS = (2.5, 4.0)
 """Sizes, as multiples of what is just detectable in the first round; the larger, the more seldom a class is left."""
 PAUSE = 30.0
-"""Seconds between the first recording and the second."""
+"""Seconds between one recording and the next."""
+SEPARATIONS = 2
+"""Motions that are asked for in the three minutes, as `planner_node` asks (its parameter `separations`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,28 +97,42 @@ def run(world: World) -> dict:
     first = world.session(0, world.round(), hidden)
     table = Table.from_mapping(first.table)
     row = {'seed': world.seed, 'hidden': world.effect, 'factor': world.factor}
-    before = diagnose(first.block, table)
-    row['before'] = names(before)
-    if not any(mates for _, mates in row['before']):
+    found = diagnose(first.block, table)
+    row['before'] = names(found)
+    if not is_class(row['before']):
         return row
-    try:
-        made = plan(table, calibration=before.calibration, diagnosis=before.document, with_bound=False).plan
-    except ImuCalibrationError as error:
-        return row | {'refused': str(error), 'right': False}
-    if not made.motions:
-        return row | judged(row['before'], world.effect, made) | {'processor': time.process_time() - start}
-    motion = Profile('separating', tuple(segment for one in made.segments for segment in one), first.truth['profile'].joint_names)
-    second = world.session(1, motion, hidden)
-    row['after'] = names(diagnose(appended(first.block, second.block), table))
-    return row | judged(row['after'], world.effect, made) | {'processor': time.process_time() - start}
+    block, done = first.block, []
+    while len(done) < SEPARATIONS:
+        left = LONGEST_SEPARATION - sum(made.seconds for made in done)
+        try:
+            made = plan(table, calibration=found.calibration, diagnosis=found.document, longest=left, with_bound=False).plan
+        except ImuCalibrationError as error:
+            if not done:
+                return row | {'refused': str(error), 'right': False}
+            break
+        done.append(made)
+        if made.motions:
+            motion = Profile('separating', tuple(segment for one in made.segments for segment in one), first.truth['profile'].joint_names)
+            block = appended(block, world.session(len(done), motion, hidden).block)
+            found = diagnose(block, table)
+        row |= judged(names(found), world.effect, done)
+        if not made.motions or row['right'] or row['one_cause'] or not is_class(names(found)):
+            break
+    return row | {'processor': time.process_time() - start}
 
 
-def judged(found: list, hidden: str, made: Plan) -> dict:
-    """Return what a plan promised and whether a single, right name is left, or a class that the plan called one cause."""
-    alike = {hidden, *(name for pair in made.missing for name in pair.split(' and ') if hidden in pair.split(' and '))}
+def is_class(found: list) -> bool:
+    """Return whether a finding has others that would do as well."""
+    return any(mates for _, mates in found)
+
+
+def judged(found: list, hidden: str, done: Sequence[Plan]) -> dict:
+    """Return what plans promised and whether a single, right name is left, or a class that the first plan called one cause."""
+    missing = done[0].missing   # of all three minutes
+    alike = {hidden, *(name for pair in missing for name in pair.split(' and ') if hidden in pair.split(' and '))}
     named = {name for effect, mates in found for name in (effect, *mates)}
-    return {'after': found, 'seconds': made.seconds, 'motions': len(made.motions), 'missing': made.missing, 'right': found == [(hidden, ())],
-            'one_cause': len(found) == 1 and hidden in named and named <= alike}
+    return {'after': found, 'seconds': sum(made.seconds for made in done), 'motions': sum(len(made.motions) for made in done), 'rounds': len(done),
+            'missing': missing, 'right': found == [(hidden, ())], 'one_cause': len(found) == 1 and hidden in named and named <= alike}
 
 
 def names(diagnosed: Diagnosed) -> list:
