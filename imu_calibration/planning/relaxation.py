@@ -23,6 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.estimation.scaled_solve import inverse_normal
+
 ROUNDS = 600
 """Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
 CLOSE = 1.01
@@ -71,7 +73,7 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf)
     for number in range(rounds):
         total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
-        covariance = np.linalg.inv(total)
+        covariance = inverse_normal(total)   # what nobody can reach is all but singular
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T
