@@ -38,6 +38,11 @@ class Gain:
     """Windows that were held out."""
 
     @property
+    def least(self) -> float:
+        """Lower end of the interval, minus infinity where too few windows tell it: a recording without rests says nothing of them."""
+        return -np.inf if np.isnan(self.ci95[0]) else self.ci95[0]
+
+    @property
     def reduction(self) -> float:
         """1 - after / before."""
         return 1.0 - self.heldout_rms_after / self.heldout_rms_before if self.heldout_rms_before > 0 else 0.0
@@ -77,10 +82,11 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
             values = np.array([attempt.space.reduced(used, attempt.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
             pair.append(_squares(attempt.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
-        found += [(_gain(sensor, measure, each), each) for measure, each in of.items()]
-    most = max((entry for entry in found if entry[0].measure != AT_REST), key=lambda entry: np.nan_to_num(entry[0].ci95[0], nan=-np.inf))
-    known = [entry for entry in found if not np.isnan(entry[0].ci95[0])] or [most]   # a recording without rests says nothing of them
-    return (most if most[0].ci95[0] > 0 else max(known, key=lambda entry: _certainty(entry[1])))[0]
+        found += [(_gain(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
+    most = max((told for told, _ in found if told.measure != AT_REST), key=lambda told: told.least)
+    if most.least > 0:
+        return most
+    return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
 
 
 def _gain(sensor, measure, pair):
