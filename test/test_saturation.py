@@ -77,11 +77,22 @@ def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
 
 
 def test_locked_windows_show_no_limit(monkeypatch):
-    windows = [SimpleNamespace(kind='static', number=number) for number in range(12)]
-    seen = []
-    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(window.number for window in some), ([], {}, None))[1])
+    windows, seen = windows_of(np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), 12), []
+    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1])
     _, locked, _ = clipping.without_clipping(windows, None, None)
-    assert locked.sum() == 3 and seen == [number for number in range(12) if not locked[number]]
+    assert locked.sum() == 3 and seen == [id(window) for window, out in zip(windows, locked) if not out]
+
+
+def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
+    """The eleventh window of twelve would be locked."""
+    force, seen = np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), []
+    force[1020:1040, 2] = 9.0
+    windows, limit = windows_of(force, 12), SimpleNamespace(sensor='accelerometer', level=9.0)
+    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1])
+    monkeypatch.setattr(clipping, 'predictions', lambda *given, **named: None)
+    monkeypatch.setattr(clipping, 'without_clipped', lambda some, *given, **named: some)
+    _, locked, _ = clipping.without_clipping(windows, None, None)
+    assert id(windows[10]) in seen and locked.sum() == 2
 
 
 def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):

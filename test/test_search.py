@@ -269,6 +269,13 @@ def test_what_replaces_an_effect_is_significant_itself():
         assert Search(evidence, (), [QUADRATIC, PRODUCT]).reconsidered([QUADRATIC]) == [kept]
 
 
+def test_what_was_resolved_is_not_replaced():
+    """The drift outweighs the lag, which could not come back beside it."""
+    lag, drift = asked('gyroscope', 'gyro_delay', 0), replace(DRIFT, parameters=(1,))
+    losses = {frozenset(): 2000.0, frozenset([0]): 1600.0, frozenset([1]): 400.0, frozenset([0, 1]): 0.0}
+    assert Search(Known(losses.get), (), [lag, drift], resolved={lag.name}).run([lag]) == [lag, drift]
+
+
 def test_flicker_is_as_much_of_each_time():
     likelihood = NoiseLikelihood.__new__(NoiseLikelihood)
     likelihood.known = ()

@@ -27,11 +27,16 @@ def windows_at(windows: Sequence[Window], rows: np.ndarray) -> list[Window]:
 
 
 def without_clipping(windows: list[Window], table: Table, model: SensorModel) -> tuple[list[Window], np.ndarray, list[Saturation]]:
-    """Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show)."""
-    locked = locked_windows(np.array([window.kind for window in windows]))
-    limits, noise_sd, values = _limits(windows_at(windows, ~locked), table, model)
+    """
+    Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show).
+
+    One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked, where they do so at a limit.
+    """
+    locked, piled = locked_windows(np.array([window.kind for window in windows])), _piled(windows)
+    limits, noise_sd, values = _limits(windows_at(windows, piled | ~locked), table, model)
     if not limits:
         return windows, locked, []
+    locked &= ~piled
     levels, kept = {limit.sensor: limit.level for limit in limits}, []
     for rows in (~locked, locked):
         part = windows_at(windows, rows)
@@ -39,6 +44,16 @@ def without_clipping(windows: list[Window], table: Table, model: SensorModel) ->
     entries = [(window.time[0], number, window) for number, part in enumerate(kept) for window in part]
     in_order = sorted(entries, key=lambda entry: entry[:2])
     return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
+
+
+def _piled(windows):
+    """Return which windows hold the largest output of a sensor, where several samples share it."""
+    found = np.zeros(len(windows), bool)
+    for sensor in SENSORS:
+        if may_be_clipped(windows, sensor):
+            largest = np.array([np.abs(measured(window, sensor)).max() for window in windows])
+            found |= largest >= largest.max() * (1 - 1e-12)
+    return found
 
 
 def _limits(windows, table, model):

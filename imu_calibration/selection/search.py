@@ -186,6 +186,8 @@ class Search:
     def _replaced(self, chosen):
         best, cost = None, self.cost(chosen) - BETTER
         for place, question in enumerate(chosen):
+            if question.name in self.resolved:   # it could not come back, and what outweighs it may be there beside it
+                continue
             rest = chosen[:place] + chosen[place + 1:]
             for other in self.others(rest):
                 if other is question:
