@@ -91,8 +91,8 @@ class NoiseModel:
     """How the bias moves from window to window."""
     known: tuple[BiasProcess, ...] = ()
     """Those of them that were measured apart, on a recording at rest."""
-    quietest_wander: float = 0.0
-    """Standard deviation of the bias process on the axis where it is least, where it is so large that this was asked."""
+    middle_wander: float = 0.0
+    """Standard deviation of the bias process on the middle one of the axes, where it is so large that this was asked."""
     moving: dict[str, MovingFactors] = field(default_factory=dict)
     """Kind of window -> what it scatters beyond the noise at rest."""
     session_sd: float = 0.0

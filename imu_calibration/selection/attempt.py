@@ -19,7 +19,7 @@ from imu_calibration.selection.normal_matrices import normal_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace, counted_from_values, parameter_space, questions, smooth_parameters
 from imu_calibration.selection.questions import Question, extended_model, time_constants
 from imu_calibration.selection.reduced_recording import ReducedRecording, mean_arms, reduce_recording
-from imu_calibration.selection.search import Search
+from imu_calibration.selection.search import FAMILY_WISE, Search
 from imu_calibration.selection.time_constant_bank import make_bank
 from imu_calibration.selection.trusted_band import in_trusted_band
 
@@ -129,6 +129,11 @@ class Attempt:
         at = [used.index(k) for k in question.parameters]
         fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean) for normal in self._halves]
         return agree(fits, self.evidence.fit(used), at)
+
+    def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
+        """Return whether an effect stands out of what the windows disagree on it too (`WindowEvidence.p_value_by_scatter`)."""
+        p_value = self.evidence.p_value_by_scatter(self.search.used(chosen), question.parameters)
+        return p_value * len(self.questions) < FAMILY_WISE
 
     @cached_property
     def _halves(self):

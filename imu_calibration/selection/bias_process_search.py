@@ -56,13 +56,13 @@ class BiasProcessSearch:
         """Return minus twice the log of what is believed of offsets, beside none, and of the sd of a bias, beside the usual one."""
         return OFFSETS * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0)
 
-    def quietest(self, shape: tuple, used: Sequence[int]) -> float:
-        """Return the likeliest sd of the bias process on the axis where it is least, the others moving as the shape says."""
-        def least(own):
+    def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
+        """Return the median over the axes of the likeliest sd of the bias process of each, the others moving as the shape says."""
+        def likeliest(own):
             offset = shape[0] * self.likelihood.typical / own.typical
             return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), RATIOS)
 
-        return min(least(self.likelihood.of_axis(axis, shape)) for axis in range(3))
+        return float(np.median([likeliest(self.likelihood.of_axis(axis, shape)) for axis in range(3)]))
 
     def polished(self, shape: tuple, used: Sequence[int]) -> dict:
         """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""

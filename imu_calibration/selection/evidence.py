@@ -5,6 +5,7 @@ from typing import Sequence
 
 import numpy as np
 from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
@@ -16,6 +17,8 @@ LEAST_WINDOWS = 8
 """Fewer windows leave none to hold out."""
 FOLDS = 6
 """Parts that are held out in turn."""
+LEAST_SCATTER = 20
+"""Windows more than parameters from which on their scatter says something of its own."""
 LOCKED_EVERY = 4
 """Every so many windows of each kind are locked away: nothing is estimated, chosen or refused on them."""
 
@@ -99,13 +102,16 @@ class WindowEvidence(Evidence):
         Sensor -> NoiseModel.
     fold : array, shape (k,)
         Fold of each window.
+    scatter : dict, optional
+        Sensor -> by how many times each window scatters more within than others of its kind, at least 1, shape (k, 3); its mean does too.
 
     """
 
-    def __init__(self, space: ParameterSpace, noise: dict[str, NoiseModel], fold: np.ndarray):
+    def __init__(self, space: ParameterSpace, noise: dict[str, NoiseModel], fold: np.ndarray, *,
+                 scatter: dict[str, np.ndarray] | None = None):
         super().__init__(space.prior_sd, space.prior_mean)
         self.space, self.noise, self.fold = space, noise, fold
-        white = {sensor: white_means(space, noise, sensor) for sensor in SENSORS}
+        white = self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
         numbers = range(fold.max() + 1)
         self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
         self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
@@ -146,6 +152,23 @@ class WindowEvidence(Evidence):
         """Return the same loss by sensor: (of the windows' means, within the windows)."""
         return {s: (self._heldout(self._means[s], used), self._heldout(self._within[s], used)) for s in SENSORS}
 
+    def unpredicted(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
+        """
+        Return the same, the means' in units of what each fold under the fit to the others may miss it by: as much as there are means.
+
+        Of a bias that wanders slowly the first window says how large it is and all others how it goes on: without this the first is missed
+        by what the others do not know.
+        """
+        places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
+        known, found = np.diag(1 / self._prior['prior_sd'][places[:-1]]**2), {}
+        for sensor, parts in self._means.items():
+            squares = 0.0
+            for own, part, every in zip(left, (part[np.ix_(places, places)] for part in parts), self._parts):
+                slopes, others = (part @ own)[:-1], (self.total - every)[np.ix_(places[:-1], places[:-1])] + known
+                squares += own @ part @ own - slopes @ solve_scaled((others + part[:-1, :-1])[None], slopes[None])[0]
+            found[sensor] = (float(squares), self._heldout(self._within[sensor], used))
+        return found
+
     def _heldout(self, parts, used):
         places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
         return float(sum(own @ part[np.ix_(places, places)] @ own for own, part in zip(left, parts)))
@@ -164,3 +187,28 @@ class WindowEvidence(Evidence):
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
         fall = self.loss(smaller) - self.loss(larger)
         return float(chi2.sf(max(fall, 0.0), len(larger) - len(smaller)))
+
+    def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
+        """
+        Return the p-value of some of the parameters `used`, by how far the windows agree on them (Hotelling's T^2); 0 where these are few.
+
+        With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows beside the fit and its covariance C, the estimates scatter with
+        ``C sum(g_k g_k') C`` whatever the noise is like: within windows it is taken to be white and the same in all of a kind, while a bias
+        that wanders within them, and encoders where two joints turn fast, make it neither (White 1980, Econometrica 48).
+        """
+        values, covariance = self.fit(used)
+        reduced, slopes = self.space.reduced(used, values), np.zeros((len(self.fold), self.space.size + 1))
+        kind = self.space.recording.kind
+        for sensor in SENSORS:
+            variance = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
+            for axis, means in enumerate(self._white[sensor]):
+                at = self.space.places(sensor, axis)
+                within = self.space.slopes_within(sensor, axis, reduced[at]) / np.array([variance[name][axis] for name in kind])[:, None]
+                slopes[:, at] += means * (means @ reduced[at])[:, None] + within
+        places = [list(used).index(k) for k in parameters]
+        moved = slopes[:, list(used)] @ covariance[:, places]
+        n_windows, n_own = moved.shape
+        if n_windows - n_own < LEAST_SCATTER:
+            return 0.0
+        t_squared = values[places] @ np.linalg.solve(moved.T @ moved, values[places])
+        return float(fisher.sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))

@@ -96,6 +96,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.4 * share))
     chosen = attempt.search.run()
+    chosen = [question for question in chosen if question.name not in FAMILY or attempt.windows_agree(chosen, question)]
     report(0.5)
     explanations = lag_explanations(attempt, chosen, attempted)
     if explanations is not None:
@@ -223,7 +224,7 @@ def _that_help(attempt, explained, named):
     evidence of anything that goes with it. So the plain residual, in the unit of the sensor, must fall too. The locked windows are not
     asked: what they show afterwards could not be told as a gain.
     """
-    kept = [question for question in named if attempt.search.allowed(named, question)]
+    kept = [question for question in named if attempt.search.allowed(named, question) and attempt.windows_agree(named, question)]
     while kept:
         least = [_sure_reduction(attempt, kept, each) for each in kept]
         short = [not paid > _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]   # nan is not sure

@@ -13,20 +13,28 @@ from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasPr
 from imu_calibration.selection.normal_matrices import normal_matrix, within_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace
 
-STRONG = 6.0
-"""Twice the logarithm of the Bayes factor by which an effect smooth in time must win over a bias process alone (Kass, Raftery 1995)."""
+STRONG = 10.0
+"""
+Twice the logarithm of the Bayes factor by which an effect smooth in time must win over a bias process alone: very strong (Kass, Raftery
+1995), since some fifteen of them are asked.
+"""
 PLAUSIBLE = 3.0
 """
 A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one.
 """
 ALIKE, FAR = 3.0, 4.0
 """
-So does one of up to this many times that of the quietest axis, and of this many times the plausible one at most: the axes of a sensor are
-of one make and their biases wander alike, while a cable pulls along one.
+So does one of up to this many times that of the middle axis, and of this many times the plausible one at most: the axes of a sensor are
+of one make and their biases wander alike, while a cable pulls along one. Not of the quietest: a bias that steps may rest on one axis.
 """
 STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 """
 Whatever the white noise, a wander of this much is nothing strange, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug.
+"""
+WIDEST = 100.0
+"""
+What drifts does so by this many times the usual wander at most: as far as the priors of the effects, those of consumer instruments, go
+beyond theirs.
 """
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
@@ -74,7 +82,7 @@ def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, durati
         return natural
     seen = float(np.sqrt(sum(process.within(duration)**2 for process in noise.bias_processes)))
     most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
-    alike = ALIKE * noise.quietest_wander * seen / float(np.sqrt(noise.bias_variance))
+    alike = ALIKE * noise.middle_wander * seen / float(np.sqrt(noise.bias_variance))
     share = min(1.0, float(np.clip(alike, most, FAR * most)) / seen)
     return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
@@ -128,14 +136,35 @@ def _with_bias_process(space, sensor, noise, smooth):
     likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
                                  information=_known_otherwise(space, sensor, noise, own),
                                  known=noise[sensor].known, durations=recording.duration)
-    least = 0.0 if noise[sensor].known else natural_processes(noise[sensor], recording.period)[0].sd
-    search = BiasProcessSearch(likelihood, least, STABLE[sensor])
+    natural = float(np.sqrt(sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))))
+    search = BiasProcessSearch(likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor])
     options = [[place[k] for k in parameters] for parameters in smooth]
     structural = [k for k in range(len(own)) if not any(k in option for option in options)]
-    used = structural + _needed_smooth(search, structural, options, prior_sd=space.prior_sd[own])
+    prior_sd = drift_prior(rows[:, :, :-1], space.prior_sd[own], max(natural, STABLE[sensor]))
+    used = structural + _needed_smooth(search, structural, options, prior_sd=prior_sd)
     shape = search.best(used)[0]
-    quietest = search.quietest(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
-    return replace(noise[sensor], quietest_wander=quietest, **search.polished(shape, used))
+    middle = search.of_middle_axis(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
+    return replace(noise[sensor], middle_wander=middle, **search.polished(shape, used))
+
+
+def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.ndarray:
+    """
+    Return the prior sd of parameters as drifts of a sensor, shape (q,).
+
+    By that of the catalogue, made for consumer instruments, a navigation gyroscope would drift by 15 000 times its wander, and whatever it
+    does drift by were unlikely.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n, 3, q)
+        Of the means of windows.
+    prior_sd : ndarray, shape (q,)
+    usual : float
+        Standard deviation of the usual wander of the bias.
+
+    """
+    spread = np.sqrt(columns.var(axis=0).max(axis=0))
+    return np.minimum(prior_sd, WIDEST * usual / np.maximum(spread, 1e-300))
 
 
 def _needed_smooth(search, structural, options, *, prior_sd):

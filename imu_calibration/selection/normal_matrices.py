@@ -40,9 +40,26 @@ def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], selec
     return total
 
 
-def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str) -> list[np.ndarray]:
-    """Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1)."""
+def scatter_of_each(space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return sensor -> by how many times each window scatters more within, beside parameters (q,), than others of its kind, (k, 3)."""
+    recording, found, reduced = space.recording, {}, space.reduced(range(space.size), values)
+    for sensor in SENSORS:
+        usual = np.array([noise[sensor].row_variance(name) for name in recording.kind]) * np.maximum(recording.count - 1, 1)[:, None]
+        at = [space.places(sensor, axis) for axis in range(3)]
+        own = [space.slopes_within(sensor, axis, reduced[at[axis]]) @ reduced[at[axis]] for axis in range(3)]
+        found[sensor] = np.maximum(np.stack(own, axis=1) / usual, 1.0)
+    return found
+
+
+def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str, *, scatter: np.ndarray | None = None) -> list[np.ndarray]:
+    """
+    Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1).
+
+    `scatter` says by how many times each window scatters more within than others of its kind, shape (k, 3).
+    """
     recording, own = space.recording, noise[sensor]
     variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration) + own.offset_sd**2
+    if scatter is not None:
+        variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
     return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, processes=own.bias_processes)(rows[:, None])[:, 0]
             for axis, rows in enumerate(space.mean[sensor])]

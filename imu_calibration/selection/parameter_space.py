@@ -36,6 +36,11 @@ class ParameterSpace:
     """
     Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design | residual]``, shape (p + 3, q_a + 1).
     """
+    join_within: dict[str, list[np.ndarray]]
+    """
+    The same for what is within windows: of effects that are smooth in time nothing, since the bias wanders there too and the noise within
+    is taken to be white.
+    """
     slow_only: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS})
     """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
     slow_variance: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS})
@@ -73,6 +78,11 @@ class ParameterSpace:
         """Return the sum of `within_each`, shape (q_a + 1, q_a + 1)."""
         return self._joined(sensor, axis, part, lambda products: products[rows].sum(axis=0, keepdims=True), rows)[0]
 
+    def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
+        """Return the products of the centred rows of each window with themselves times `weights` (q_a + 1,), shape (k, q_a + 1)."""
+        join = self.join_within[sensor][axis]
+        return self.recording.products[sensor, 'slow' if self.slow_only[sensor][axis] else 'within'] @ (join @ weights) @ join
+
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """Return the sum of squares of the centred rows of each window times its `weights` (k, q_a + 1), shape (k,)."""
         columns = weights @ self.join[sensor][axis].T
@@ -80,7 +90,7 @@ class ParameterSpace:
 
     def _joined(self, sensor, axis, part, pick, rows):
         slow_only = part is None and self.slow_only[sensor][axis]
-        join = self.join[sensor][axis]
+        join = self.join_within[sensor][axis]
         found = join.T @ (pick(self.recording.products[sensor, 'slow' if slow_only else part or 'within']) @ join)
         if slow_only:
             missing = np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
@@ -111,12 +121,14 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
     shift = np.where(in_baseline, prior - recording.values, prior)
     removed = np.where(in_baseline, 0.0, recording.values)
     names = [*model.param_names, *(name for entry in bank for name in entry.param_names)]
-    index, join = {}, {}
+    smooth = np.concatenate([*(np.full(e.size, e.smooth) for e in model.effects),
+                             *(np.full(len(entry.param_names), entry.effect.smooth) for entry in bank)])
+    index, join, join_within = {}, {}, {}
     for sensor in SENSORS:
-        parts = [_join(model, sensor, axis, recording, removed, len(names)) for axis in range(3)]
-        index[sensor], join[sensor] = map(list, zip(*parts))
+        parts = [_join(model, sensor, axis, recording, removed, smooth) for axis in range(3)]
+        index[sensor], join[sensor], join_within[sensor] = map(list, zip(*parts))
     sd = np.concatenate([sd, *(entry.prior_sd for entry in bank)])
-    return ParameterSpace(recording, tuple(names), sd, np.pad(shift, (0, len(names) - len(shift))), index, join)
+    return ParameterSpace(recording, tuple(names), sd, np.pad(shift, (0, len(names) - len(shift))), index, join, join_within)
 
 
 def bank_places(recording: ReducedRecording) -> dict[str, slice]:
@@ -126,20 +138,22 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
 
 
-def _join(model, sensor, axis, recording, removed, size):
-    """Return (parameters that act on an axis, matrix that joins columns to them)."""
+def _join(model, sensor, axis, recording, removed, smooth):
+    """Return (parameters that act on an axis, matrix that joins columns to them, that of what is within windows)."""
     bank, places = recording.bank[sensor], bank_places(recording)
     jacobian = coefficient_jacobian(model, sensor, recording.values)[:, axis]
     p, n_model = jacobian.shape
     ends = np.cumsum([p, *(len(entry.slopes) for entry in bank)])
-    full = np.zeros((ends[-1] + 3, size + 1))
+    full = np.zeros((ends[-1] + 3, len(smooth) + 1))
     full[:p, :n_model] = jacobian
     for entry, a, b in zip(bank, ends, ends[1:]):
         full[a:b, places[entry.label]] = entry.slopes[:, axis]
     full[:p, -1] = jacobian @ removed
     full[ends[-1] + axis, -1] = 1.0
     used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
-    return used, full[:, np.append(used, -1)]
+    within = np.where(np.append(smooth, False), 0.0, full)
+    within[:p, -1] = jacobian @ np.where(smooth[:n_model], 0.0, removed)
+    return used, full[:, np.append(used, -1)], within[:, np.append(used, -1)]
 
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:

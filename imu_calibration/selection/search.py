@@ -7,11 +7,11 @@ from typing import AbstractSet, Sequence
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 
-FAMILY_WISE = 0.01
+FAMILY_WISE = 0.001
 """Chance of a finding in a recording whose model is right."""
 LEAST_GAIN = 4.0
 """Least gain of held-out log likelihood, nats."""
@@ -111,10 +111,7 @@ class Search:
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
             return False
-        # Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
-        angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
-        turns = angles.get(question.effect.unit)
-        if turns is not None and np.all(np.abs(value) * turns < 0.5 * self.encoder_step):
+        if np.max(np.abs(value)) < least_angle(question.effect, self.encoder_step):
             return False
         if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
             return False
@@ -175,8 +172,6 @@ class Search:
         return chosen
 
     def _dropped(self, chosen):
-        if len(chosen) < 2:
-            return None
         for question in sorted(chosen, key=lambda q: -q.penalty):
             rest = [q for q in chosen if q is not question]
             if not self.score(rest, question).significant:
@@ -212,6 +207,16 @@ class Search:
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
         return sorted(found.values(), key=lambda pair: pair[1])[:most]
+
+
+def least_angle(effect: Effect, encoder_step: float) -> float:
+    """
+    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad); 0 for what is no angle.
+
+    Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
+    """
+    angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
+    return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
 
 
 class Named(ABC):

@@ -15,7 +15,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.selection.evidence import FOLDS
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.search import FAMILY_WISE, LEAST_GAIN, PENALTY
+from imu_calibration.selection.search import FAMILY_WISE, LEAST_GAIN, PENALTY, least_angle
 
 from worlds import physics
 from worlds.physics_draw import EFFECTS, POSITIVE, draw_value, generator
@@ -123,7 +123,9 @@ class Sizes:
         value = pattern(effect, seed)
         direction, n_parameters = self._direction(effect, value)
         strength = direction @ self.information @ direction
-        size = factor * np.sqrt(threshold_noncentrality(n_parameters, len(self.attempt.questions)) / strength)
+        seen = np.sqrt(threshold_noncentrality(n_parameters, len(self.attempt.questions)) / strength)
+        read = least_angle(self._question(effect, value)[0].effect, self.attempt.search.encoder_step) / np.max(np.abs(value))
+        size = factor * max(seen, read)
         if effect.endswith('_bias_drift'):
             return np.append(size * value[:3], value[3])
         if effect.endswith(POSITIVE):
