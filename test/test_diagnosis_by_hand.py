@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 
 from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
+from imu_calibration.by_hand.inquiry import Inquiry, investigate_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.diagnosis.by_hand import where
 from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.workflow import diagnosis_lines
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
+from imu_calibration.reference.table import Table
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import random_values, simulate as simulate_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -70,6 +75,17 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     assert any('where: gyroscope y, while the specific force along y is' in line for line in diagnosis_lines(diagnosis))
     everywhere = diagnosed(21500, stops, n_poses=24).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes
+
+
+def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
+    """Turns about (1, 1, 1) alone: a scale error along it lies in elements that are all held, and products of rates look like it."""
+    profile = make_profile('avrutov_111')
+    table = Table.from_mapping(profile.table)
+    model = SensorModel(joint_names=table.joint_names)
+    imu = simulate_session(model, random_values(model), table, profile=profile)[0]
+    monkeypatch.setattr(Inquiry, 'named', lambda self: [])   # what is asked about is known before the search
+    found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
+    assert {'gyro_rate_product', 'gyro_quadratic'} <= {entry['effect'] for entry in found.not_testable}
 
 
 def test_a_place_among_few_poses_is_paid_for(monkeypatch):

@@ -11,7 +11,6 @@ from imu_calibration.by_hand.evidence import HandEvidence
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import NotObservableError
@@ -177,7 +176,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
-    base = tuple(np.flatnonzero(~_held(baseline)).tolist())
+    base = tuple(range(baseline.model.size))   # held ones too: what they may be is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()
@@ -206,11 +205,6 @@ def _that_predict(inquiry, held_out, named):
             break
         named.remove(poor[-1])
     return named
-
-
-def _held(hand):
-    known = dict(zip(hand.param_names, hand.statuses))
-    return np.array([known.get(name) == HELD for name in hand.model.param_names])
 
 
 def _why_not(effect, poses, turns, follows_gravity):
