@@ -16,9 +16,11 @@ from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.workflow import diagnosis_lines
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
+from imu_calibration.reference.earth import EARTH_RATE
 from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import random_values, simulate as simulate_session
+from imu_calibration.simulation.session import random_values
+from imu_calibration.simulation.session import simulate as simulate_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -75,6 +77,12 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     assert any('where: gyroscope y, while the specific force along y is' in line for line in diagnosis_lines(diagnosis))
     everywhere = diagnosed(21500, stops, n_poses=24).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes
+
+
+def test_the_earth_turns_about_the_vertical_and_is_no_finding():
+    """Quiet gyroscopes see 80 % of its rate follow gravity."""
+    diagnosis = diagnosed(52, lambda f, w, t, k: (NOTHING, 0.8 * EARTH_RATE / GRAVITY * f), n_poses=20, rate_sd=2e-4).diagnosis
+    assert not diagnosis.findings and not diagnosis.unexplained['gyroscope'].significant
 
 
 def test_what_held_parameters_may_be_is_no_finding(monkeypatch):

@@ -16,6 +16,7 @@ from imu_calibration.by_hand.turns import at_range_end, rising
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.preflight.checks import Preflight
+from imu_calibration.reference.earth import EARTH_RATE
 from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.segmentation.static_detector import find_still
 
@@ -134,6 +135,24 @@ def test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_
     tipped = GRAVITY * np.column_stack([np.sin(1.5 * share), 0.1 * np.sin(9 * share), np.cos(1.5 * share)])
     drift = 1e-2 * np.column_stack([share**2, share, -share]) + np.random.default_rng(4).normal(0, 1e-4, (len(share), 3))
     assert not shown(g_sensitivity_evidence(replace(poses, force=tipped, rate=drift, time=100 * share)))
+
+
+def test_the_earth_is_not_sold_as_g_sensitivity():
+    """Its rate about the vertical follows gravity, alike in every axis; what is larger, or another axis, is none of it."""
+    imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
+    poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
+    noise = np.random.default_rng(5).normal(0, 1e-5, poses.rate.shape)
+    for size, axis, wanted in ((0.9, slice(None), False), (-0.7, slice(None), False), (3.0, slice(None), True), (0.9, 2, True)):
+        response = np.zeros((3, 3))
+        response[axis, axis] = np.eye(3)[axis, axis] * size * EARTH_RATE / GRAVITY
+        assert shown(g_sensitivity_evidence(replace(poses, rate=poses.force @ response.T + noise))) == wanted
+
+
+def test_the_latitude_that_nobody_said_is_in_the_sd_of_a_g_sensitivity(session):
+    imu, ranges, _ = session
+    hand = calibrate_by_hand(imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), ranges)
+    diagonal = [hand.param_names.index(f'gyroscope.gyro_g_sensitivity.{name}') for name in ('xx', 'yy', 'zz')]
+    assert min(hand.sd[diagonal]) >= EARTH_RATE / np.sqrt(3) / GRAVITY
 
 
 def test_g_sensitivity_is_seen_beside_a_warm_up():

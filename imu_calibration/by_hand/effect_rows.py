@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.by_hand.equations import TurnData, between_middles, tangent
+from imu_calibration.by_hand.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.effects.base import SENSORS, Effect
@@ -44,7 +45,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class HandSpace:
-    """Parameters of a diagnosis by hand: those of the baseline, then one run per column set."""
+    """Parameters of a diagnosis by hand: those of the baseline, the Earth's rate about the vertical, then one run per column set."""
 
     names: tuple
     """Label of each run of columns: effect name, for a warm-up with the number of its time constant."""
@@ -77,9 +78,10 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
     sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
     base = hand.model.size
     sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
-    ends = np.cumsum([base] + sizes)
-    space = HandSpace(tuple(label for _, label, _ in sets), {s[1]: slice(a, b) for s, a, b in zip(sets, ends, ends[1:])},
-                      np.concatenate([1e3 * hand.model.priors, *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))]), int(ends[-1]))
+    ends = np.cumsum([base + 1] + sizes)
+    widths = np.concatenate([1e3 * hand.model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
+    parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
+    space = HandSpace(tuple(parts), parts, widths, int(ends[-1]))
     at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
                                hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label,
                tau in sets}
@@ -123,13 +125,14 @@ def _norm_block(hand, space, at_rest, sensor_of):
 
 
 def _rest_block(hand, space, at_rest, sensor_of):
-    """Three rows per pose: the rate at rest."""
+    """Three rows per pose: the rate at rest, with what the Earth turns about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
     more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
                                       temperature_c=poses.temperature_c)
     rows = np.zeros((count, 3, space.size + 1))
     rows[:, :, 9:12] = np.eye(3)
+    rows[:, :, hand.model.size] = hand.state.up
     rows[:, :, hand.model.extra_index('gyroscope')] = slopes
     rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
     for label, columns in at_rest.items():

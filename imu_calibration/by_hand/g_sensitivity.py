@@ -5,6 +5,7 @@ import scipy.linalg
 from scipy.special import fdtrc
 
 from imu_calibration.by_hand.equations import Poses
+from imu_calibration.reference.earth import EARTH_RATE
 
 SPARE = 8
 """With fewer poses beyond the columns the choice of the wander alone explains too much."""
@@ -17,13 +18,19 @@ TIMES = (0.1, 0.3, 1.0, 3.0)
 SILENT = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
 P_VALUE = 1e-3
 """The response of the gyroscope to gravity enters the model when chance would show it less often."""
+EARTH_UPWARDS_SD = EARTH_RATE / np.sqrt(3)
+"""
+The Earth turns about the vertical by its rate times the sine of the latitude, which follows gravity as the same response of every axis
+does. Where nobody says the latitude it is anything up to the whole rate, rad/s.
+"""
 
 
 def g_sensitivity_evidence(poses: Poses) -> dict:
     """
     Test whether the gyroscope's readings at rest follow the direction of gravity, beyond what time and temperature explain.
 
-    ``rate = bias(time, temperature) + sensitivity @ force + error``: the bias is a parabola in time, with a term in temperature where that
+    ``rate = bias(time, temperature) + sensitivity @ force + earth * up + error``: the Earth's rate about the vertical comes off first, as
+    far as the readings show it and it may go; the bias is a parabola in time, with a term in temperature where that
     was recorded, and the error wanders, by a share and with a correlation time that restricted likelihood chooses beside all columns.
 
     Returns
@@ -41,8 +48,11 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
     if count < full.shape[1] + SPARE:
         return dict(SILENT)
-    covariance = min(_covariances(time), key=lambda candidate: _loss(candidate, full, poses.rate))
-    (least, kept_out), (rest, rest_out) = (_left(covariance, design, poses.rate) for design in (full, course))
+    up, first = full[:, course.shape[1]:], course.shape[1]
+    upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
+    rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
+    covariance = min(_covariances(time), key=lambda candidate: _loss(candidate, full, rate))
+    (least, kept_out), (rest, rest_out) = (_left(covariance, design, rate) for design in (full, course))
     dof = count - full.shape[1] - CHOSEN
     scale = least / dof + 1e-300
     ratio = float(np.mean((rest - least) / 3 / scale))

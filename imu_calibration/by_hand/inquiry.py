@@ -176,7 +176,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
-    base = tuple(range(baseline.model.size))   # held ones too: what they may be is no finding
+    base = tuple(range(baseline.model.size + 1))   # held ones too, and the Earth: what they may be is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.by_hand.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, HandModel, unpack
 from imu_calibration.by_hand.model_error import hand_model_error
 from imu_calibration.estimation.model_error import ModelError
@@ -68,7 +69,8 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
     error = hand_model_error(model, state, poses, turns=turns, scatter=scatter, free=~held)
-    cov = error.added(covariance_with_held(factor, ~held, held, prior_sd=priors)) + _of_gravity(state.values, gravity_sd / model.gravity)
+    known = _of_gravity(state.values, gravity_sd / model.gravity) + _of_earth(model, state, poses, ~held)
+    cov = error.added(covariance_with_held(factor, ~held, held, prior_sd=priors)) + known
     return HandSolution(state, cov, held, scatter, factor, steps + more, error)
 
 
@@ -154,3 +156,14 @@ def _of_gravity(values, relative_sd):
     common = np.zeros(len(values))
     common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]
     return relative_sd**2 * np.outer(common, common)
+
+
+def _of_earth(model, state, poses, free):
+    """Return what the Earth's rate about the vertical adds to the covariance: what the biases and the answers to gravity take of it."""
+    slopes = model.further('gyroscope', state.values, model.gravity * state.up, rate=np.zeros_like(state.up), time=poses.time,
+                           temperature_c=poses.temperature_c)[1]
+    own = np.concatenate([np.arange(GYRO_BIAS.start, GYRO_BIAS.stop), model.extra_index('gyroscope')]).astype(int)
+    columns = np.concatenate([np.broadcast_to(np.eye(3), (len(slopes), 3, 3)), slopes], axis=2).reshape(-1, len(own))
+    taken, kept = np.zeros(model.size), own[free[own]]
+    taken[kept] = np.linalg.lstsq(columns[:, free[own]], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None)[0]
+    return np.outer(taken, taken)
