@@ -1,12 +1,14 @@
 """The guards of the search, each in a case in which it alone stands between the tool and a false claim."""
 
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from imu_calibration.beyond import unexplained as rests
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
@@ -18,7 +20,7 @@ from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_o
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
 from imu_calibration.selection.normal_matrices import scatter_of_each, white_means
-from imu_calibration.selection.parameter_space import parameter_space
+from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import LEAST_GAIN, Search
 
@@ -348,9 +350,22 @@ def test_what_only_one_window_tells_is_not_held_against_it():
     evidence = WindowEvidence.__new__(WindowEvidence)
     Evidence.__init__(evidence, np.full(1, 1e3), np.zeros(1))
     evidence._parts = np.array([rows[k::6].T @ rows[k::6] for k in range(6)])
-    evidence._means, evidence._within, evidence.total = {'gyroscope': evidence._parts}, {'gyroscope': 0 * evidence._parts}, evidence._parts.sum(axis=0)
+    evidence._means, evidence._within_whole, evidence.total = {'gyroscope': evidence._parts}, {'gyroscope': 0 * evidence._parts}, evidence._parts.sum(axis=0)
     assert evidence.heldout([0]) > 500.0
     assert evidence.unpredicted([0])['gyroscope'][0] < 30.0
+
+
+def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it():
+    """Means say 3; within windows of 100 samples of unit noise the slope of the residual is 3 times that of the column too, or -7 times by a wander."""
+    for slope, left in ((3.0, 0.0), (-7.0, 100.0)):
+        count, each = 12, np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]])
+        recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 101.0), duration=np.ones(count), time=np.arange(float(count)), moving=np.ones(count, bool),
+                                    sessions=[np.arange(count)], mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)), products=dict.fromkeys(product(SENSORS, ['within']), np.tile(each, (count, 1, 1))))
+        index, join, within = ({sensor: [some] * 3 for sensor in SENSORS} for some in (np.array([0]), np.eye(2), np.diag([0.0, 1.0])))
+        space = ParameterSpace(recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within)
+        evidence = WindowEvidence(space, dict.fromkeys(SENSORS, NoiseModel(np.ones(3), np.ones(3))), np.arange(count) % 6)
+        assert evidence.fit([0])[0] == pytest.approx(3.0, rel=1e-6)
+        assert evidence.unpredicted([0])['gyroscope'][1] == pytest.approx(3 * count * 100.0 * (1.0 + left), rel=1e-6)
 
 
 def test_flicker_is_as_much_of_each_time():

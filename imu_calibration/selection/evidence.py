@@ -1,6 +1,8 @@
 """How well a choice of parameters predicts windows that it was not fitted to: small problems on normal matrices."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
+from functools import cached_property
 from typing import Sequence
 
 import numpy as np
@@ -157,7 +159,7 @@ class WindowEvidence(Evidence):
         Return the same, the means' in units of what each fold under the fit to the others may miss it by: as much as there are means.
 
         Of a bias that wanders slowly the first window says how large it is and all others how it goes on: without this the first is missed
-        by what the others do not know.
+        by what the others do not know. What a drift does within windows, which tells nothing of it, is predicted too.
         """
         places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
         known, found = np.diag(1 / self._prior['prior_sd'][places[:-1]]**2), {}
@@ -166,8 +168,14 @@ class WindowEvidence(Evidence):
             for own, part, every in zip(left, (part[np.ix_(places, places)] for part in parts), self._parts):
                 slopes, others = (part @ own)[:-1], (self.total - every)[np.ix_(places[:-1], places[:-1])] + known
                 squares += own @ part @ own - slopes @ solve_scaled((others + part[:-1, :-1])[None], slopes[None])[0]
-            found[sensor] = (float(squares), self._heldout(self._within[sensor], used))
+            found[sensor] = (float(squares), self._heldout(self._within_whole[sensor], used))
         return found
+
+    @cached_property
+    def _within_whole(self):
+        """Sensor -> what is within the windows of each fold, with that of effects that are smooth in time."""
+        whole, numbers = replace(self.space, join_within=self.space.join), range(self.fold.max() + 1)
+        return {s: [within_matrix(whole, self.noise, self.fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
 
     def _heldout(self, parts, used):
         places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))

@@ -94,6 +94,8 @@ SEARCH = _of(
     ('what a search starts from may be chance', 'search.py', 'def _dropped(self, chosen):', 'def _dropped(self, chosen):\n        if len(chosen) < 2:\n            return None',
      'test_search.py::test_what_a_search_starts_from_is_significant_by_itself_too'),
     ('a bias that wanders within windows is a drift', 'parameter_space.py', 'np.where(np.append(smooth, False), 0.0, full)', 'full.copy()', 'test_search.py::test_within_windows_nothing_is_told_of_what_is_smooth_in_time'),
+    ('what a drift does within windows is left unexplained', 'evidence.py', 'join_within=self.space.join)', 'join_within=self.space.join_within)',
+     'test_search.py::test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it'),
     ('how far windows agree is not asked', 'investigation.py', 'and attempt.windows_agree(named, question)]', ']', 'test_search.py::test_what_the_windows_disagree_on_is_not_named'),
     ('windows agree whatever they scatter', 'evidence.py', 'np.linalg.solve(moved.T @ moved, values[places])', 'np.linalg.solve(covariance[np.ix_(places, places)], values[places])',
      'test_search.py::test_windows_agree_on_a_finding'),
