@@ -198,8 +198,8 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
     """It takes all there is off the accelerometer, and leaves twice as much on the gyroscope as it takes."""
     explained = Explained.__new__(Explained)
     explained.n_means, explained.n_within = 100.0, 1000.0
-    explained.excess = lambda chosen: {'accelerometer': (0.0, 0.0), 'gyroscope': (2000.0, 0.0)} if chosen else {
-        'accelerometer': (1000.0, 0.0), 'gyroscope': (3000.0, 0.0)}
+    explained.excess = lambda chosen: {'accelerometer': alike(0.0, 0.0), 'gyroscope': alike(2000.0, 0.0)} if chosen else {
+        'accelerometer': alike(1000.0, 0.0), 'gyroscope': alike(3000.0, 0.0)}
     assert explained.share([OFFSET], OFFSET) == pytest.approx(1 / 3)
 
 
@@ -208,8 +208,24 @@ def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(with
     """It explains the means; within windows, where it shows or does not, as much stays as it removes in all."""
     explained = Explained.__new__(Explained)
     explained.n_means, explained.n_within = 100.0, 1000.0
-    explained.excess = lambda chosen: {'accelerometer': (0.0, 1000.0 + within) if chosen else (1000.0, 1000.0 + 2 * within)}
+    explained.excess = lambda chosen: {'accelerometer': alike(0.0, 1000.0 + within) if chosen else alike(1000.0, 1000.0 + 2 * within)}
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
+
+
+def alike(means, within):
+    """Return an excess of the means and within windows of which each axis has a third."""
+    return np.outer([means, within], np.full(3, 1 / 3))
+
+
+def test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others():
+    """All together are below five standard deviations, one alone is above six; three that share the same are not."""
+    explained = Explained.__new__(Explained)
+    explained.n_means, explained.n_within = 300.0, 3000.0
+    alone = np.array([[-20.0, 100.0, -20.0], [0.0, 0.0, 0.0]])
+    assert explained.sigma(alone)[0] > 5.0 and explained.rest(alone) == 100.0
+    assert explained.rest(alike(60.0, 0.0)) == explained.rest(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]])) == 0.0
+    explained.excess = lambda chosen: {'accelerometer': alone if chosen else alone + np.array([[0.0, 300.0, 0.0], [0.0, 0.0, 0.0]])}
+    assert explained.share([DRIFT], DRIFT) == pytest.approx(0.75), 'too little for an effect that is smooth in time'
 
 
 def test_every_bias_moves_by_half_the_white_noise_of_a_second():
@@ -451,8 +467,10 @@ def rest_of(sigma, residual):
                                 describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
                                           'specific force': np.full(count, 9.8)})
     space = SimpleNamespace(mean={'accelerometer': [column[:, None] for column in residual.T]}, recording=recording, places=lambda sensor, axis: np.array([0]))
-    explained = SimpleNamespace(floor=SimpleNamespace(noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))}), n_means=3.0 * count, n_within=0.0)
-    return rests._rest(SimpleNamespace(space=space, recording=recording), explained, 'accelerometer', (sigma * np.sqrt(6.0 * count), 0.0), np.ones(1))
+    explained = Explained.__new__(Explained)
+    explained.floor = SimpleNamespace(noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))})
+    explained.n_means, explained.n_within = 3.0 * count, 0.0
+    return rests._rest(SimpleNamespace(space=space, recording=recording), explained, 'accelerometer', alike(sigma * np.sqrt(6.0 * count), 0.0), np.ones(1))
 
 
 def test_a_rest_of_some_standard_deviations_is_unexplained():

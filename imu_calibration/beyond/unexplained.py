@@ -67,18 +67,19 @@ def _rest(attempt, explained, sensor, excess, values):
     floor = explained.floor.noise[sensor]
     white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration)
     noise_sd = np.sqrt(white + floor.bias_variance)
-    sigma = sigma_means = excess[0] / np.sqrt(2 * explained.n_means)
-    if excess[1] > WITHIN_SHARE * explained.n_within:
-        sigma = max(sigma, excess[1] / np.sqrt(2 * explained.n_within))
+    sigma_means, sigma_within = explained.sigma(excess)
+    # Quiet axes hide what one alone has.
+    means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
+    sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT and explained.n_means >= 3 * LEAST_WINDOWS)
     if not significant:
         return Unexplained(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
     if sigma_means <= SIGNIFICANT:
         inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
-        return Unexplained(True, float(np.sqrt(inside * excess[1] / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
+        return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
     if rms == 0:   # less than biases may wander, and more than neighbours may differ
-        rms = float(np.sqrt(np.mean(white) * excess[0] / explained.n_means))
+        rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
     name, share = correlate(_explanations(recording), residual / noise_sd)
     return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
 

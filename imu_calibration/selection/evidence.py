@@ -12,7 +12,7 @@ from scipy.stats import f as fisher
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
-from imu_calibration.selection.normal_matrices import mean_matrix, white_means, within_matrix
+from imu_calibration.selection.normal_matrices import white_means, within_of_axis
 from imu_calibration.selection.parameter_space import ParameterSpace
 
 LEAST_WINDOWS = 8
@@ -77,8 +77,8 @@ class Evidence(ABC):
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of the choice `larger` against `smaller`."""
 
-    def heldout_parts(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
-        """Return the loss on held-out data by sensor, where an effect acts on both: (of the windows' means, within the windows)."""
+    def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return the loss on held-out data by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
         raise NotImplementedError(f'{type(self).__name__} knows of no effect that acts on both sensors')
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -113,18 +113,26 @@ class WindowEvidence(Evidence):
                  scatter: dict[str, np.ndarray] | None = None):
         super().__init__(space.prior_sd, space.prior_mean)
         self.space, self.noise, self.fold = space, noise, fold
-        white = self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
-        numbers = range(fold.max() + 1)
-        self._means = {s: [mean_matrix(space, {s: white[s]}, fold == number) for number in numbers] for s in SENSORS}
-        self._within = {s: [within_matrix(space, noise, fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
-        self._parts = np.array([np.sum([part[s][number] for part in (self._means, self._within) for s in SENSORS], axis=0)
-                                for number in numbers])
+        self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
+        folds = [fold == number for number in range(fold.max() + 1)]
+        self._of_axis = {sensor: [np.array([[rows[own].T @ rows[own] for own in folds],
+                                            [within_of_axis(space, noise[sensor], sensor, axis, select=own) for own in folds]])
+                                  for axis, rows in enumerate(self._white[sensor])] for sensor in SENSORS}
+        self._parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
         self.total = np.sum(self._parts, axis=0)
+
+    def _of_sensor(self, sensor):
+        """Return the normal matrices of one sensor, of each fold."""
+        found = np.zeros((self.fold.max() + 1, self.space.size + 1, self.space.size + 1))
+        for axis, parts in enumerate(self._of_axis[sensor]):
+            at = self.space.places(sensor, axis)
+            found[:, at[:, None], at] += parts.sum(axis=0)
+        return found
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
         """Return the covariance that one sensor alone, and what is known before, leave the parameters `used`."""
         at = np.ix_(used, used)
-        information = np.sum([*self._means[sensor], *self._within[sensor]], axis=0)[at]
+        information = self._of_sensor(sensor).sum(axis=0)[at]
         return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)]**2))
 
     def normal(self, number: int | None = None) -> np.ndarray:
@@ -147,39 +155,48 @@ class WindowEvidence(Evidence):
         """Return the loss of each fold under the fit to the other folds, summed."""
         key = ('held out', *sorted(used))
         if key not in self._losses:
-            self._losses[key] = self._heldout(self._parts, used)
+            places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
+            self._losses[key] = float(sum(own @ part[np.ix_(places, places)] @ own for own, part in zip(left, self._parts)))
         return self._losses[key]
 
-    def heldout_parts(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
-        """Return the same loss by sensor: (of the windows' means, within the windows)."""
-        return {s: (self._heldout(self._means[s], used), self._heldout(self._within[s], used)) for s in SENSORS}
+    def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return the same loss by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
+        left = self._left_of_all(used)
+        return {sensor: np.stack([_squares(parts, left[:, self.space.places(sensor, axis)]) for axis, parts in enumerate(axes)], axis=1)
+                for sensor, axes in self._of_axis.items()}
 
-    def unpredicted(self, used: Sequence[int]) -> dict[str, tuple[float, float]]:
+    def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
         Return the same, the means' in units of what each fold under the fit to the others may miss it by: as much as there are means.
 
         Of a bias that wanders slowly the first window says how large it is and all others how it goes on: without this the first is missed
         by what the others do not know. What a drift does within windows, which tells nothing of it, is predicted too.
         """
-        places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
-        known, found = np.diag(1 / self._prior['prior_sd'][places[:-1]]**2), {}
-        for sensor, parts in self._means.items():
-            squares = 0.0
-            for own, part, every in zip(left, (part[np.ix_(places, places)] for part in parts), self._parts):
-                slopes, others = (part @ own)[:-1], (self.total - every)[np.ix_(places[:-1], places[:-1])] + known
-                squares += own @ part @ own - slopes @ solve_scaled((others + part[:-1, :-1])[None], slopes[None])[0]
-            found[sensor] = (float(squares), self._heldout(self._within_whole[sensor], used))
+        left, own, found = self._left_of_all(used), np.array(sorted(used)), self.heldout_parts(used)
+        others = (self.total - self._parts)[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own]**2)
+        for sensor, axes in self._of_axis.items():
+            for axis, (means, _) in enumerate(axes):
+                places = self.space.places(sensor, axis)
+                _, at, of = np.intersect1d(own, places, return_indices=True)
+                slopes, known = np.zeros(others.shape[:2]), others.copy()
+                slopes[:, at] = np.einsum('fij,fj->fi', means[:, of], left[:, places])
+                known[:, at[:, None], at] += means[:, of[:, None], of]
+                found[sensor][0, axis] -= (slopes * solve_scaled(known, slopes)).sum()
+                found[sensor][1, axis] = _squares(self._within_whole[sensor][axis], left[:, places])[0]
         return found
 
     @cached_property
     def _within_whole(self):
-        """Sensor -> what is within the windows of each fold, with that of effects that are smooth in time."""
-        whole, numbers = replace(self.space, join_within=self.space.join), range(self.fold.max() + 1)
-        return {s: [within_matrix(whole, self.noise, self.fold == number, sensors=(s,)) for number in numbers] for s in SENSORS}
+        """Sensor -> of each axis what is within the windows of each fold, with that of effects that are smooth in time."""
+        whole, folds = replace(self.space, join_within=self.space.join), [self.fold == number for number in range(self.fold.max() + 1)]
+        return {sensor: [np.array([[within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own) for own in folds]])
+                         for axis in range(3)] for sensor in SENSORS}
 
-    def _heldout(self, parts, used):
-        places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
-        return float(sum(own @ part[np.ix_(places, places)] @ own for own, part in zip(left, parts)))
+    def _left_of_all(self, used):
+        """Return what turns rows of all parameters into residuals of the fit to all other folds, shape (k, q + 1)."""
+        left = np.zeros((len(self._parts), self.space.size + 1))
+        left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
+        return left
 
     def _left_by_others(self, used):
         """Return for each fold what turns rows of `used`, sorted, into residuals of the fit to all other folds, shape (k, n + 1)."""
@@ -220,3 +237,8 @@ class WindowEvidence(Evidence):
             return 0.0
         t_squared = values[places] @ np.linalg.solve(moved.T @ moved, values[places])
         return float(fisher.sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
+
+
+def _squares(parts, rows):
+    """Return sums of squares of what the normal matrices of folds, shape (p, f, n, n), and rows of residuals (f, n) leave, shape (p,)."""
+    return np.einsum('fi,pfij,fj->p', rows, parts, rows)

@@ -19,6 +19,8 @@ SHOWS = 0.2
 """An effect shows where it removes at least this share of what it removes elsewhere."""
 SIGNIFICANT_REST = 5.0
 """Standard deviations above what noise leaves from which a rest counts as significant."""
+ONE_OF_THREE = 6.0 / 5.0
+"""So many times that many are asked of one axis alone: there are three, and the fewer there are the more often squares are so large."""
 
 
 class Explained:
@@ -46,19 +48,38 @@ class Explained:
         self.n_means = 3.0 * len(recording.windows)
         self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
 
-    def excess(self, chosen: Sequence[Question]) -> dict[str, tuple[float, float]]:
-        """Return sensor -> (excess of the means, excess within windows): losses above what noise leaves, on held-out windows."""
+    def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
+        """Return sensor -> excess of the means and within windows, of each axis: losses above what noise leaves, held out, shape (2, 3)."""
         losses = self.floor.unpredicted(self.search.used(chosen))
-        return {s: (means - self.n_means, within - self.n_within) for s, (means, within) in losses.items()}
+        return {sensor: parts - self._numbers[:, None] / 3.0 for sensor, parts in losses.items()}
 
-    def rest(self, excess: tuple[float, float]) -> float:
+    @property
+    def _numbers(self):
+        return np.array([self.n_means, self.n_within])
+
+    def sigma(self, excess: np.ndarray) -> np.ndarray:
+        """
+        Return the standard deviations by which the means, and what is within windows, exceed noise, shape (2,).
+
+        Of all axes together or of the one that does so most, with the price for having three: what one axis has the others' quiet hides.
+        """
+        together, alone = self._sigmas(excess)
+        return np.maximum(together, alone.max(axis=1))
+
+    def _sigmas(self, excess):
+        """Return the same of all axes together, shape (2,), and of each alone, shape (2, 3)."""
+        sd = np.sqrt(2 * np.maximum(self._numbers, 1.0))
+        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(3.0) * ONE_OF_THREE)[:, None]
+
+    def rest(self, excess: np.ndarray) -> float:
         """Return the part of an excess that noise does not explain: zero where it is not significant."""
         return float(sum(self._rest(excess)))
 
     def _rest(self, excess):
         """Return the same of the means and within windows, shape (2,)."""
-        limits = SIGNIFICANT_REST * np.sqrt(2 * np.array([self.n_means, self.n_within]))
-        return np.where(np.asarray(excess) > limits, excess, 0.0)
+        together, alone = self._sigmas(excess)
+        left = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
+        return np.where(together > SIGNIFICANT_REST, np.maximum(excess.sum(axis=1), left), left)
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """
@@ -76,7 +97,7 @@ class Explained:
     def _where_it_shows(self, chosen, question):
         """Return (removed by the effect, significant rest beside it) of each sensor in which it shows, of the parts in which it does."""
         with_it, without = self.excess(chosen), self.excess([q for q in chosen if q is not question])
-        removed = {s: np.subtract(without[s], with_it[s]) for s in sensors_of(question.effect)}
+        removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in sensors_of(question.effect)}
         strongest = max(parts.sum() for parts in removed.values())
         # A cause of the table shows in both sensors; where it hardly shows it proves nothing.
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]

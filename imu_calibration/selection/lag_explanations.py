@@ -236,7 +236,7 @@ def _cost(told, chosen, judges, sensor):
     used, losses = told.attempt.search.used(chosen), []
     for judge in judges:
         space = replace(told.attempt.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
-        losses.append(sum(WindowEvidence(space, judge.noise, told.attempt.evidence.fold).heldout_parts(used)[sensor]))
+        losses.append(WindowEvidence(space, judge.noise, told.attempt.evidence.fold).heldout_parts(used)[sensor].sum())
     return 0.5 * float(np.mean(losses))
 
 

@@ -19,14 +19,20 @@ def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: n
 def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None, *,
                   sensors: Sequence[str] = SENSORS) -> np.ndarray:
     """Return the part of the normal matrix that comes from within the windows."""
-    total, kind = np.zeros((space.size + 1, space.size + 1)), space.recording.kind
+    total = np.zeros((space.size + 1, space.size + 1))
+    for sensor in sensors:
+        for axis in range(3):
+            at = space.places(sensor, axis)
+            total[np.ix_(at, at)] += within_of_axis(space, noise[sensor], sensor, axis, select=select)
+    return total
+
+
+def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, axis: int, *, select: np.ndarray | None = None) -> np.ndarray:
+    """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
+    total, kind = np.zeros((len(space.places(sensor, axis)),) * 2), space.recording.kind
     chosen = space.recording.moving if select is None else select & space.recording.moving
     for name in np.unique(kind[chosen]):
-        rows = chosen & (kind == name)
-        for sensor in sensors:
-            for axis, variance in enumerate(noise[sensor].row_variance(name)):
-                at = space.places(sensor, axis)
-                total[np.ix_(at, at)] += space.within_sum(sensor, axis, rows) / variance
+        total += space.within_sum(sensor, axis, chosen & (kind == name)) / noise.row_variance(name)[axis]
     return total
 
 

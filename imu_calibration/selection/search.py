@@ -140,7 +140,7 @@ class Search:
             return True
         rest = [q for q in chosen if q is not question]
         before, after = (self.evidence.heldout_parts(self.used(some)) for some in (rest, chosen))
-        return all(sum(after[sensor]) - sum(before[sensor]) < 2 * LEAST_GAIN for sensor in question.effect.acts_on)
+        return all((after[sensor] - before[sensor]).sum() < 2 * LEAST_GAIN for sensor in question.effect.acts_on)
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """Return the chosen questions in the order in which they were found, from none or from a first choice."""

@@ -80,6 +80,8 @@ SEARCH = _of(
     ('share of the unexplained that a finding must remove', 'explained_share.py', 'LEAST_SHARE = 0.7', 'LEAST_SHARE = 0.1', 'test_search.py::test_what_leaves_most_unexplained_is_not_named'),
     ('the same for what is smooth in time', 'explained_share.py', 'LEAST_SHARE_SMOOTH = 0.9', 'LEAST_SHARE_SMOOTH = 0.1', 'test_search.py::test_what_leaves_most_unexplained_is_not_named'),
     ('a cause of the table need not show in both sensors', 'explained_share.py', 'return min((removed / (removed', 'return max((removed / (removed', 'test_search.py::test_a_cause_of_the_table_shows_in_both_sensors'),
+    ('the quiet of two axes hides the third', 'explained_share.py', 'left = np.where(alone > SIGNIFICANT_REST, excess, 0.0)', 'left = np.where(alone > 1e9, excess, 0.0)', 'test_search.py::test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others'),
+    ('one of three axes costs no more than one', 'explained_share.py', 'ONE_OF_THREE = 6.0 / 5.0', 'ONE_OF_THREE = 1.0', 'test_search.py::test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others'),
     ('biases do not move by nature', 'bias_process_search.py', 'NATURAL = 0.5', 'NATURAL = 0.0', 'test_search.py::test_every_bias_moves_by_half_the_white_noise_of_a_second'),
     ('whatever a bias was found to do passes for noise', 'noise_beside_effects.py', 'PLAUSIBLE = 3.0', 'PLAUSIBLE = 800.0', 'test_search.py::test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander'),
     ('a cable that pulls along one axis passes for noise', 'noise_beside_effects.py', 'ALIKE, FAR = 3.0, 4.0', 'ALIKE, FAR = 300.0, 4.0',
