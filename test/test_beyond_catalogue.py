@@ -170,6 +170,8 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     for kind in ('force_cubed_in_gyro', 'gyro_scale_settling'):
         row, _ = row_of(141, kind, 'realistic', Beyond(kind, 141))
         assert row['found'] == [] and row['family'], row
+    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', Beyond('sticks_when_warm', 81013))
+    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.95, 'a step when it is warm looks like a curve of the temperature'
     for effect, cause in (('gyro_g_sensitivity', Beyond('gyro_cubic', 5, 0.3)), ('gyro_thermal_scale', None)):
         recording = record(5, {effect: None}, through_bag=False, **({'cause': cause} if cause else {}))
         found = diagnose(recording.windows, recording.table, recording.model)

@@ -1,30 +1,91 @@
-"""The question that `calibrate` and `diagnose` share: what a recording asks for, without names that a formula does without."""
+"""The question that `calibrate` and `diagnose` share: what a recording asks for, without names that a formula or a place does without."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from imu_calibration.beyond.blocks import RestBlocks, rest_blocks
 from imu_calibration.beyond.fitting import BlockFits
 from imu_calibration.beyond.proposals import Proposal, propose
-from imu_calibration.beyond.unexplained import unexplained
+from imu_calibration.beyond.regimes import MOST_OF_IT, RestRegime, find_regimes
+from imu_calibration.beyond.unexplained import Unexplained, unexplained
+from imu_calibration.effects.base import AXES
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
+from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.questions import Question
 
 CLEAR = 10.0
 """Standard deviations above noise at rest from which moving blocks are asked for a formula."""
 NOT_NEEDED = 0.05
-"""Share of what a finding takes off the rest that it must still take off beside a formula."""
+"""Share of what a finding takes off the rest that it must still take off beside a formula or a place."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Examination(Investigation):
+    """An Investigation with what its findings leave in each sensor: worked out when first asked for, once."""
+
+    table: Table
+    """The reference."""
+    _fits: dict = field(default_factory=dict, init=False, repr=False)
+    _proposals: dict = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, found: Investigation, table: Table) -> 'Examination':
+        """Return an Investigation as an Examination; one that is stays itself."""
+        return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
+
+    @cached_property
+    def rests(self) -> dict[str, Unexplained]:
+        """Sensor -> Unexplained."""
+        return unexplained(self.attempt, self.explained, self.named)
+
+    @cached_property
+    def blocks(self) -> dict[str, RestBlocks]:
+        """Sensor -> RestBlocks."""
+        return rest_blocks(self.used, self.table, self.attempt, explained=self.explained)
+
+    def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
+        """Return the fits of a choice, of the findings where not given, to the blocks of a sensor."""
+        space, used = self.attempt.space, tuple(self.search.used(self.named if chosen is None else chosen))
+        if (sensor, used) not in self._fits:
+            self._fits[sensor, used] = BlockFits(self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+        return self._fits[sensor, used]
+
+    def regimes(self, sensor: str, chosen: Sequence[Question] | None = None) -> list[RestRegime]:
+        """Return where the rest of a sensor sits beside a choice, beside the findings where not given (`find_regimes`)."""
+        return find_regimes(self.blocks[sensor], self.attempt, self.search.used(self.named if chosen is None else chosen),
+                            joint_names=self.table.joint_names)
+
+    def proposal(self, sensor: str) -> Proposal | None:
+        """
+        Return a formula for what the findings leave in a sensor, where that is significant or clear within moving windows.
+
+        What changes within moving windows passes for their noise; a formula that takes it away shows that it is none.
+        """
+        if sensor not in self._proposals:
+            fits = self.fits(sensor)
+            clear = self.rests[sensor].significant or fits.sigma > CLEAR
+            self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
+        return self._proposals[sensor]
+
+    def without(self, gone: Sequence[Question]) -> 'Examination':
+        """Return the Examination without some findings; they stay doubtful, and widen what is said of the others."""
+        names = {question.name for question in gone}
+        other = replace(self, named=[question for question in self.named if question not in gone], doubtful=[*self.doubtful, *gone],
+                        rivals=[rival for rival in self.rivals if rival.question.name not in names])
+        other.__dict__['blocks'] = self.blocks
+        return other
 
 
 def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
-            bias_processes: dict | None = None) -> Investigation:
+            bias_processes: dict | None = None) -> Examination:
     """
-    Ask every effect that a model lacks (`investigate`), and withdraw what a formula does without.
+    Ask every effect that a model lacks (`investigate`), and withdraw what a formula or a place does without.
 
     Parameters
     ----------
@@ -37,69 +98,65 @@ def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, prog
         As `investigate`.
 
     """
-    return without_superseded(investigate(windows, table, model, progress=progress, bias_processes=bias_processes), table)
+    return without_superseded(Examination.of(investigate(windows, table, model, progress=progress, bias_processes=bias_processes), table))
 
 
-def without_superseded(found: Investigation, table: Table) -> Investigation:
-    """Return the Investigation without findings that a formula does without; they stay doubtful, and widen what is said of the others."""
-    while found.named and (gone := superseded(found, table)):
-        names = {question.name for question in gone}
-        found = replace(found, named=[question for question in found.named if question not in gone], doubtful=[*found.doubtful, *gone],
-                        rivals=[rival for rival in found.rivals if rival.question.name not in names])
+def without_superseded(found: Examination) -> Examination:
+    """Return the Examination without findings that a formula or a place does without."""
+    while found.named and (gone := superseded(found)):
+        found = found.without(gone)
     return found
 
 
-def superseded(found: Investigation, table: Table) -> list[Question]:
+def superseded(found: Examination) -> list[Question]:
     """
-    Return the findings that a formula does without: they stood in for the part of it that looks like them.
+    Return the findings that a formula or a place does without: they stood in for the part of it that looks like them.
 
     A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside
-    a wrong name. So each finding of a sensor that has a formula is left out once, and counts where the windows held out miss it. What
-    follows the temperature is left out without a formula too: what settles while the sensor warms up looks like it, so well that hardly a
-    rest stays.
+    a wrong name; a step when it is warm looks like a curve of the temperature. So each finding is left out once, in all sensors on which
+    it acts, and counts where the windows held out miss it beside what stands in for it. That is asked where a finding leaves a rest; of
+    what follows the temperature always: what settles, or steps, while the sensor warms up looks like it so well that hardly a rest stays.
     """
-    rests = unexplained(found.attempt, found.explained, found.named)
-    if not any(question.sensor in rests for question in found.named):
-        return []
-    blocks = rest_blocks(found.used, table, found.attempt, explained=found.explained)
-    gone, proposals = [], {}
-    for question in found.named:
-        sensor = question.sensor
-        if sensor not in rests:
-            continue
-        own, kept = blocks[sensor], fits_of(found, blocks[sensor], found.named)
-        if sensor not in proposals:
-            proposals[sensor] = proposal_of(found, own, kept, significant=rests[sensor].significant)
-        if proposals[sensor] is None and 'temperature' not in question.effect.needs:
-            continue
-        left_out = fits_of(found, own, [other for other in found.named if other is not question])
-        proposal = proposals[sensor] or propose(own, found.attempt, left_out)
-        if proposal is None:
-            continue
-        formula = _columns(own, proposal, found.attempt.recording.model.temperature_ref_c)
-        alone, beside = (left_out.fit(columns).excess - kept.fit(columns).excess for columns in (None, formula))
-        if beside < NOT_NEEDED * alone:
-            gone.append(question)
-    return gone
+    return [question for question in found.named if _done_without(found, question)]
 
 
-def fits_of(found: Investigation, blocks: RestBlocks, chosen: Sequence[Question]) -> BlockFits:
-    """Return the fits of a choice to the blocks of a sensor."""
-    space = found.attempt.space
-    return BlockFits(blocks, found.search.used(chosen), prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+def _done_without(found, question):
+    """Return whether a finding takes hardly anything off the rest of its sensors beside what stands in for it in some of them."""
+    sensors = sensors_of(question.effect)
+    warm = 'temperature' in question.effect.needs
+    if not warm and not any(found.rests[sensor].significant or found.proposal(sensor) for sensor in sensors):
+        return False
+    others = [other for other in found.named if other is not question]
+    kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
+    alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
+    for stand_in in (lambda sensor: _formula(found, sensor, left_out[sensor] if warm else None),
+                     lambda sensor: _places(found, sensor, others) if warm or found.rests[sensor].significant else None):
+        beside = dict(alone)
+        for sensor in sensors:
+            columns = stand_in(sensor)
+            if columns is not None:
+                beside[sensor] = left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
+        if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):
+            return True
+    return False
 
 
-def proposal_of(found: Investigation, blocks: RestBlocks, fits: BlockFits, *, significant: bool) -> Proposal | None:
-    """
-    Return a formula for what the findings leave in a sensor, where that is significant or clear within moving windows.
-
-    What changes within moving windows passes for their noise; a formula that takes it away shows that it is none.
-    """
-    return propose(blocks, found.attempt, fits) if significant or fits.sigma > CLEAR else None
-
-
-def _columns(blocks, proposal, temperature_ref_c):
-    """Return the columns of the formulas over the blocks, shape (b, k, 3)."""
+def _formula(found, sensor, left_out):
+    """Return the columns of a formula for what all findings leave in a sensor, or `left_out` where given; shape (b, k, 3), or None."""
+    blocks, proposal = found.blocks[sensor], found.proposal(sensor)
+    if proposal is None and left_out is not None:
+        proposal = propose(blocks, found.attempt, left_out)
+    if proposal is None:
+        return None
     groups = [group for effect in proposal.effects for group in effect.groups]
-    means = [blocks.means(group.columns(blocks.ref, {'temperature_ref_c': temperature_ref_c})) for group in groups]
+    known = {'temperature_ref_c': found.attempt.recording.model.temperature_ref_c}
+    means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
     return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
+
+
+def _places(found, sensor, chosen):
+    """Return a column that is one where an offset takes most of what a choice leaves in an axis, shape (b, 1, 3), or None."""
+    offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset and regime.share >= MOST_OF_IT]
+    first = {regime.axis: regime.inside for regime in reversed(offsets)}
+    nowhere = np.zeros(len(found.blocks[sensor].time))
+    return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from imu_calibration.beyond.blocks import RestBlocks
-from imu_calibration.constants import DEG
+from imu_calibration.beyond.regime_variables import FEWEST, variables_of
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 
@@ -15,11 +15,12 @@ FALSE_DISCOVERIES = 0.05
 """Share of false regimes among those told."""
 MOST_OF_IT, MUCH_OF_IT = 0.8, 0.5
 """Share of the rest that lies in a regime, and that an offset in it takes away, which bins of finite width make smaller."""
+NEARLY_ALL = 0.95
+"""Share of what scatters in a range that the part of it which is told holds."""
+ALIKE = 16.0
+"""Twice the nats that a place may be less likely than another and still be told first, as it was asked first: joints before the sensor."""
 WIDEST = 0.6
 """Share of the blocks that a regime may hold: what is everywhere is nowhere."""
-FEWEST = 6
-"""Blocks that a regime holds at least."""
-N_BINS = 24
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
 
@@ -50,27 +51,13 @@ class RestRegime:
     """Minus twice the log likelihood of the windows that it was not found on: the smallest is told first."""
     bounds: tuple[float, float] | None
     """Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends."""
+    bins: tuple = ()
+    """Bins of the variable that it was found in, in order."""
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
         return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value,
                 'bounds': None if self.bounds is None else list(self.bounds)}
-
-
-@dataclass(frozen=True, eq=False)
-class Variable:
-    """What a regime may go by: a bin for each block, and the words for a range of bins."""
-
-    name: str
-    bins: np.ndarray
-    edges: np.ndarray | None
-    cyclic: bool
-    words: object
-
-    @property
-    def marks(self) -> np.ndarray:
-        """One column for each bin, 1 in the blocks that lie there, shape (b, k)."""
-        return np.eye(int(self.bins.max()) + 1)[self.bins]
 
 
 def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str]) -> list[RestRegime]:
@@ -79,55 +66,123 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
 
     For every variable and every range of it either the model is fitted to the blocks outside and those inside scatter by themselves, or
     those inside have an offset of their own; the likeliest range is found on every other window and tested on those between, by an F test
-    whose degrees of freedom count windows. Of all tests the false discoveries are held at 5 % (Benjamini, Hochberg 1995).
+    whose degrees of freedom count windows. Of all tests the false discoveries are held at 5 %. Where an offset
+    begins and ends is sharpened on all windows to between blocks, p-values times the places tried: one window on the wrong side of a step
+    hides all of it. Of what scatters the shortest part that holds nearly all is told.
     """
-    variables = _variables(blocks, joint_names)
+    variables = variables_of(blocks, joint_names)
     white = blocks.whitener(np.ones(len(blocks.time), bool))
-    found = []
-    for axis in range(3):
+    axes = [_AxisRest(blocks, axis, attempt, used=used, white=white) for axis in range(3)]
+    found = [(rest, variable, regime) for rest in axes for variable in variables for regime in rest.regimes(variable)]
+    limit = _few_false([regime.p_value for *_, regime in found])
+    sharp = [rest.sharpened(variable, regime) for rest, variable, regime in found if regime.p_value <= limit]
+    kept = [regime for regime in sharp if regime.p_value <= limit and regime.share >= (MUCH_OF_IT if regime.offset else MOST_OF_IT)]
+    return [regime for axis in AXES for regime in _likeliest_first([each for each in kept if each.axis == axis])]
+
+
+def _few_false(p_values):
+    """Return the p-value up to which discoveries are told (Benjamini, Hochberg 1995)."""
+    order = np.sort(p_values)
+    return max(order[order <= FALSE_DISCOVERIES * np.arange(1, len(order) + 1) / max(len(order), 1)], default=-1.0)
+
+
+def _likeliest_first(regimes):
+    """
+    Return the regimes of an axis in order; of those that are nearly as likely as the likeliest the one that was asked first.
+
+    What scatters is told where no offset takes most of it: an offset says how, too.
+    """
+    if any(regime.offset and regime.share >= MOST_OF_IT for regime in regimes):
+        regimes = [regime for regime in regimes if regime.offset]
+    alike = min((regime.cost for regime in regimes), default=0.0) + ALIKE
+    return sorted(regimes, key=lambda regime: max(regime.cost, alike))
+
+
+class _AxisRest:
+    """The rest of one axis, its blocks made independent."""
+
+    def __init__(self, blocks, axis, attempt, *, used, white):
         at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
-        rows = white(blocks.design[axis][:, [*at, -1]]) / white.scale[axis]
         own = blocks.index[axis][at]
-        prior = (1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
-        found += [regime for variable in variables for regime in _of_variable(blocks, axis, rows, prior, variable, white)]
-    kept = _few_false(found)
-    return sorted(kept, key=lambda regime: (regime.axis, regime.cost))
+        self.blocks, self.axis, self._white = blocks, axis, white
+        self.rows = self._of(blocks.design[axis][:, [*at, -1]])
+        self.prior = (1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
+        self.training = blocks.window % 2 == 0
+
+    def _of(self, columns):
+        return self._white(columns) / self._white.scale[self.axis]
+
+    def regimes(self, variable):
+        """Yield the regimes of one variable: by offset, and by scatter."""
+        training = self.training
+        found = cleanest(self.rows[training], self._of(variable.marks)[training], self.prior, bins=variable.bins[training],
+                         cyclic=variable.cyclic)
+        for best, offset in reversed(found):
+            chosen = np.isin(variable.bins, best)
+            if not FEWEST <= chosen.sum() <= WIDEST * len(chosen):
+                continue
+            bounds = variable.bounds(best)
+            made = self._with_offset(variable, best, chosen, bounds) if offset else self._with_scatter(variable, best, chosen)
+            if made is not None:
+                yield made
+
+    def _windows(self, chosen):
+        """Return (blocks inside, blocks outside, windows of both) that the range was not found on, or None where they are too few."""
+        inside, outside = ~self.training & chosen, ~self.training & ~chosen
+        windows = [len(np.unique(self.blocks.window[part])) for part in (inside, outside)]
+        return None if windows[0] < 1 or windows[1] < 3 else (inside, outside, windows)
+
+    def _with_offset(self, variable, best, chosen, bounds, tried=1):
+        parts = self._windows(chosen)
+        if parts is None:
+            return None
+        mark, test = self._of(chosen[:, None].astype(float))[:, 0], ~self.training
+        share, p_value = tested_offset(self.rows[test], mark[test], self.prior, n_windows=sum(parts[2]))
+        wide = _wider(self.rows, mark)
+        left = wide @ np.append(-_solved(wide[self.training], _for_one_more(self.prior))[0], 1.0)
+        cost = _cost(float((left[test]**2).sum()), test.sum())
+        return self._regime(variable, best, chosen, share=share, p_value=min(p_value * tried, 1.0), offset=True, cost=cost, bounds=bounds)
+
+    def _with_scatter(self, variable, best, chosen):
+        left = self.rows @ np.append(-_solved(self.rows[self.training & ~chosen], self.prior)[0], 1.0)
+        best = _tightened(best, variable.bins[self.training], left[self.training]**2 - 1.0)
+        chosen = np.isin(variable.bins, best)
+        parts = self._windows(chosen)
+        if parts is None or chosen.sum() < FEWEST:
+            return None
+        share, p_value = _tested_scatter(left, *parts)
+        cost = sum(_cost(float((left[part]**2).sum()), part.sum()) for part in parts[:2])
+        return self._regime(variable, best, chosen, share=share, p_value=p_value, offset=False, cost=cost, bounds=variable.bounds(best))
+
+    def _regime(self, variable, best, chosen, *, share, p_value, offset, cost, bounds):
+        return RestRegime(self.blocks.sensor, AXES[self.axis], variable.name, variable.words(best, bounds) + ', by another offset' * offset,
+                          share, p_value, chosen, self.blocks.time, offset, float(cost), bounds, tuple(best))
+
+    def sharpened(self, variable, regime):
+        """
+        Return a regime of another offset with bounds between blocks: the likeliest of some about the edges of its bins.
+
+        Where the windows that it was not found on do not say so too the edges stay.
+        """
+        bounds, tried = regime.bounds, 1
+        for end in (0, 1) if bounds and regime.offset else ():
+            options = [(place, bounds[1]) if end == 0 else (bounds[0], place) for place in variable.near(regime.bins, end)]
+            if options:
+                marks = self._of(np.stack([variable.inside(*each) for each in options], axis=1).astype(float))
+                bounds = options[int(np.argmin(_squares_left(self.rows, marks, np.eye(len(options)), self.prior)))]
+                tried *= len(options)
+        other = self._with_offset(variable, regime.bins, variable.inside(*bounds), bounds, 2 * tried) if tried > 1 else None
+        return regime if other is None or other.cost > regime.cost else other
 
 
-def _few_false(regimes):
-    order = sorted(regimes, key=lambda regime: regime.p_value)
-    passed = [k for k, regime in enumerate(order, 1) if regime.p_value <= FALSE_DISCOVERIES * k / len(order)]
-    return [regime for regime in order[:max(passed, default=0)] if regime.share >= (MUCH_OF_IT if regime.offset else MOST_OF_IT)]
-
-
-def _of_variable(blocks, axis, rows, prior, variable, white):
-    """Return the regimes of one variable, found on every other window and tested on those between: by scatter and by offset."""
-    marks = white(variable.marks) / white.scale[axis]
-    training = blocks.window % 2 == 0
-    found = cleanest(rows[training], marks[training], prior, bins=variable.bins[training], cyclic=variable.cyclic)
-    return [regime for best, offset in found if (regime := _tested(blocks, axis, rows, marks, prior, variable, best, offset)) is not None]
-
-
-def _tested(blocks, axis, rows, marks, prior, variable, best, offset):
-    """Return the RestRegime of a range of bins, tested on windows that it was not found on, or None where it is too many or too few."""
-    training, chosen = blocks.window % 2 == 0, np.isin(variable.bins, best)
-    inside, outside = ~training & chosen, ~training & ~chosen
-    windows = [len(np.unique(blocks.window[part])) for part in (inside, outside)]
-    if not FEWEST <= chosen.sum() <= WIDEST * len(chosen) or windows[0] < 1 or windows[1] < 3:
-        return None
-    if offset:
-        mark = marks[:, best].sum(axis=1)
-        share, p_value = tested_offset(rows[~training], mark[~training], prior, n_windows=sum(windows))
-        left = _wider(rows, mark) @ np.append(-_solved(_wider(rows, mark)[training], _for_one_more(prior))[0], 1.0)
-        cost = _cost(float((left[~training]**2).sum()), (~training).sum())
-    else:
-        left = rows @ np.append(-_solved(rows[training & ~chosen], prior)[0], 1.0)
-        share, p_value = _tested_scatter(left, inside, outside, windows)
-        cost = sum(_cost(float((left[part]**2).sum()), part.sum()) for part in (inside, outside))
-    bounds = None if variable.edges is None else (float(variable.edges[best[0]]), float(variable.edges[best[-1] + 1]))
-    return RestRegime(blocks.sensor, AXES[axis], variable.name, variable.words(best) + (', by another offset' if offset else ''), share,
-                      p_value, chosen,
-                  blocks.time, offset, float(cost), bounds)
+def _tightened(best, bins, excess):
+    """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
+    each = np.maximum([excess[bins == number].sum() for number in best], 0.0)
+    sums = np.append(0.0, np.cumsum(each))
+    parts = [(first, last) for first in range(len(best)) for last in range(first + 1, len(best) + 1)
+             if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]]
+    first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))
+    return best[first:last]
 
 
 def _tested_scatter(left, inside, outside, windows):
@@ -197,7 +252,7 @@ def cleanest(rows: np.ndarray, marks: np.ndarray, prior: tuple, *, bins: np.ndar
     inside = np.einsum('rk,kij->rij', member, parts)
     energy = _energies(inside, parts.sum(axis=0) - inside, prior)
     scatter = sum(_cost(e, n) for e, n in zip(energy, (n_inside, len(rows) - n_inside)))
-    offset = _cost(_with_offset(rows, marks, member, prior), len(rows))
+    offset = _cost(_squares_left(rows, marks, member, prior), len(rows))
     return [(ranges[int(np.argmin(cost))], by_offset) for cost, by_offset in ((scatter, False), (offset, True))]
 
 
@@ -209,7 +264,7 @@ def _energies(inside, outside, prior):
     return [np.einsum('ri,rij,rj->r', weights, part, weights) for part in (inside, outside)]
 
 
-def _with_offset(rows, marks, member, prior):
+def _squares_left(rows, marks, member, prior):
     """Return the sum of squares that the model and an offset of its own for each range leave, shape (r,)."""
     design = rows[:, :-1]
     values, left = _solved(rows, prior)
@@ -223,69 +278,3 @@ def _with_offset(rows, marks, member, prior):
 def _cost(energy, count):
     variance = np.maximum(energy / np.maximum(count, 1), 1.0)
     return count * np.log(variance) + energy / variance
-
-
-def _variables(blocks, joint_names):
-    """Return what a regime may go by in this recording."""
-    ref, found = blocks.ref, []
-    angles, rates = blocks.means(ref.joint_angle), blocks.means(ref.joint_rate)
-    for k, name in enumerate(joint_names):
-        if np.ptp(angles[:, k]) > 0.5:
-            found.append(_cyclic(f'angle of {name}', angles[:, k] / DEG))
-        found += ranged(f'rate of {name}', rates[:, k] / DEG, 'deg/s')
-        found += _before_rest(name, rates[:, k])
-    speed, force = np.linalg.norm(blocks.means(ref.rate_s), axis=1), np.linalg.norm(blocks.means(ref.force_s), axis=1)
-    found += ranged('speed', speed / DEG, 'deg/s') + ranged('specific force', force, 'm/s^2', least=0.5)
-    for k, axis in enumerate(AXES):
-        found += ranged(f'rate about {axis}', blocks.means(ref.rate_s)[:, k] / DEG, 'deg/s')
-        found += ranged(f'specific force along {axis}', blocks.means(ref.force_s)[:, k], 'm/s^2', least=0.5)
-    found += ranged('time', blocks.time, 's')
-    if ref.temperature_c is not None:
-        warm = blocks.means(ref.temperature_c)
-        found += ranged('temperature', warm, 'C', least=0.5)
-        slope = np.gradient(np.polynomial.Chebyshev.fit(blocks.time, warm, min(12, len(warm) // 10))(blocks.time))
-        found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'))
-    moving = speed > DEG
-    found += _classes('kind', moving, ('at rest', 'while it moves'))
-    last = np.maximum.accumulate(np.where(moving, blocks.time, -np.inf))
-    return found + ranged('time since motion', np.where(np.isfinite(last), np.minimum(blocks.time - last, 1e3), 1e3), 's')
-
-
-def _before_rest(name, rate):
-    """Return whether a joint came to a rest from one side or the other."""
-    moving = np.abs(rate) > 0.5 * DEG
-    side = np.where(moving, np.sign(rate), 0.0)
-    place = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
-    came = np.where(place >= 0, side[np.maximum(place, 0)], 0.0)
-    if min((came > 0).sum(), (came < 0).sum()) < FEWEST:
-        return []
-    return _classes(f'approach of {name}', came > 0, (f'after {name} turned backwards', f'after {name} turned forwards'))
-
-
-def _cyclic(name, degrees):
-    edges = np.linspace(0.0, 360.0, N_BINS + 1)
-
-    def words(chosen):
-        return f'while the {name} is {edges[chosen[0]]:.0f} to {edges[chosen[-1] + 1]:.0f} deg'
-    return Variable(name, np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1), edges, True, words)
-
-
-def ranged(name: str, values: np.ndarray, unit: str, *, least: float = 1e-3) -> list[Variable]:
-    """Return the variable of a value of each block in bins of as many blocks, or none where it hardly changes."""
-    edges = np.unique(np.round(np.quantile(values, np.linspace(0.0, 1.0, N_BINS + 1)), 3))
-    if len(edges) < 4 or np.ptp(edges) < least:
-        return []
-
-    def words(chosen):
-        low, high = edges[chosen[0]], edges[chosen[-1] + 1]
-        if chosen[0] == 0:
-            return f'while the {name} is below {high:.3g} {unit}'
-        span = f'{low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'{low:.3g} to {high:.3g} {unit}'
-        return f'while the {name} is {span}'
-    return [Variable(name, np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2), edges, False, words)]
-
-
-def _classes(name, mask, words):
-    if not FEWEST <= mask.sum() <= len(mask) - FEWEST:
-        return []
-    return [Variable(name, mask.astype(int), None, False, lambda chosen: words[chosen[0]])]

@@ -4,9 +4,8 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.beyond.inquiry import inquire
+from imu_calibration.beyond.inquiry import Examination, inquire
 from imu_calibration.beyond.look import look_beyond
-from imu_calibration.beyond.unexplained import unexplained
 from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
 from imu_calibration.diagnosis.sentences import candidates_of, sentence
@@ -78,7 +77,7 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
-    rests = look_beyond(found, table, unexplained(attempt, found.explained, named))
+    rests = look_beyond(Examination.of(found, table))
     baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
     solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline

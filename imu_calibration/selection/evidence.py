@@ -116,7 +116,7 @@ class WindowEvidence(Evidence):
         self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
         folds = [fold == number for number in range(fold.max() + 1)]
         self._of_axis = {sensor: [np.array([[rows[own].T @ rows[own] for own in folds],
-                                            [within_of_axis(space, noise[sensor], sensor, axis, select=own) for own in folds]])
+                                            [within_of_axis(space, noise[sensor], sensor, axis=axis, select=own) for own in folds]])
                                   for axis, rows in enumerate(self._white[sensor])] for sensor in SENSORS}
         self._parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
         self.total = np.sum(self._parts, axis=0)

@@ -61,7 +61,7 @@ class Explained:
         """
         Return the standard deviations by which the means, and what is within windows, exceed noise, shape (2,).
 
-        Of all axes together or of the one that does so most, with the price for having three: what one axis has the others' quiet hides.
+        Of all axes together or of the one that does so most, which must do so more clearly: the quiet of the others hides what one has.
         """
         together, alone = self._sigmas(excess)
         return np.maximum(together, alone.max(axis=1))

@@ -23,11 +23,11 @@ def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: n
     for sensor in sensors:
         for axis in range(3):
             at = space.places(sensor, axis)
-            total[np.ix_(at, at)] += within_of_axis(space, noise[sensor], sensor, axis, select=select)
+            total[np.ix_(at, at)] += within_of_axis(space, noise[sensor], sensor, axis=axis, select=select)
     return total
 
 
-def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, axis: int, *, select: np.ndarray | None = None) -> np.ndarray:
+def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, *, axis: int, select: np.ndarray | None = None) -> np.ndarray:
     """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
     total, kind = np.zeros((len(space.places(sensor, axis)),) * 2), space.recording.kind
     chosen = space.recording.moving if select is None else select & space.recording.moving

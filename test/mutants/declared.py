@@ -122,11 +122,15 @@ BEYOND = _of(
     ('any correlation is told', 'unexplained.py', 'if p_value < ALPHA and share > max(best[1], 0.15):', 'if share > best[1]:', 'test_search.py::test_noise_goes_with_nothing'),
     ('a line of few stretches is a tone', 'spectrum.py', 'np.where(hits > MOSTLY * count[:, None], binom',
      'np.where(hits > 0, 0 * binom', 'test_spectrum.py'),
-    ('a finding that a formula does without stays', 'inquiry.py', 'if beside < NOT_NEEDED * alone:', 'if False:',
+    ('a finding that a formula does without stays', 'inquiry.py', 'if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):', 'if False:',
      'test_beyond_catalogue.py'),
+    ('a place is known to its bins only', 'regimes.py', 'return regime if other is None or', 'return regime if True or', 'test_regimes.py'),
+    ('of what scatters the whole range is told', 'regimes.py', 'NEARLY_ALL = 0.95', 'NEARLY_ALL = 1.0', 'test_regimes.py'),
+    ('a place is no reason to withdraw a name', 'inquiry.py', 'return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None',
+     'return None', 'test_beyond_catalogue.py'),
     ('calibrate adopts what a formula does without', 'inquiry.py', 'while found.named and (gone', 'while False and (gone',
      'test_by_evidence.py::test_calibrate_does_not_adopt_what_diagnose_withdraws'),
-    ('a finding goes for any formula', 'inquiry.py', 'if beside < NOT_NEEDED * alone:', 'if True:',
+    ('a finding goes for any formula', 'inquiry.py', 'if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):', 'if True:',
      'test_beyond_catalogue.py'),
 )
 HAND = _of(

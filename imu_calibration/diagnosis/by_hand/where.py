@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.beyond.regimes import RestRegime, Variable, cleanest, ranged, tested_offset
+from imu_calibration.beyond.regime_variables import Variable, ranged
+from imu_calibration.beyond.regimes import RestRegime, cleanest, tested_offset
 from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.by_hand.effect_rows import Block
 from imu_calibration.effects.base import AXES
@@ -53,8 +54,8 @@ def _of_variable(block, axis, rows, sd, variable):
         return None
     mark = marks[:, best].sum(axis=1)
     share, p_value = tested_offset(rows, mark, prior, n_windows=len(rows))
-    bounds = (float(variable.edges[best[0]]), float(variable.edges[best[-1] + 1]))
-    return RestRegime(block.sensor, axis, variable.name, variable.words(best) + ', by another offset', share, p_value,
+    bounds = variable.bounds(best)
+    return RestRegime(block.sensor, axis, variable.name, variable.words(best, bounds) + ', by another offset', share, p_value,
                       np.isin(variable.bins, best), block.time, True, p_value, bounds)
 
 
