@@ -366,9 +366,11 @@ def test_what_only_one_window_tells_is_not_held_against_it():
     evidence = WindowEvidence.__new__(WindowEvidence)
     Evidence.__init__(evidence, np.full(1, 1e3), np.zeros(1))
     evidence._parts = np.array([rows[k::6].T @ rows[k::6] for k in range(6)])
-    evidence._means, evidence._within_whole, evidence.total = {'gyroscope': evidence._parts}, {'gyroscope': 0 * evidence._parts}, evidence._parts.sum(axis=0)
+    evidence.space = SimpleNamespace(size=1, places=lambda sensor, axis: np.array([0, 1]))
+    evidence._of_axis, evidence.total = {'gyroscope': [np.stack([evidence._parts, 0 * evidence._parts])]}, evidence._parts.sum(axis=0)
+    evidence._within_whole = {'gyroscope': [0 * evidence._parts[None]]}
     assert evidence.heldout([0]) > 500.0
-    assert evidence.unpredicted([0])['gyroscope'][0] < 30.0
+    assert evidence.unpredicted([0])['gyroscope'][0, 0] < 30.0
 
 
 def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it():
@@ -381,7 +383,7 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
         space = ParameterSpace(recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within)
         evidence = WindowEvidence(space, dict.fromkeys(SENSORS, NoiseModel(np.ones(3), np.ones(3))), np.arange(count) % 6)
         assert evidence.fit([0])[0] == pytest.approx(3.0, rel=1e-6)
-        assert evidence.unpredicted([0])['gyroscope'][1] == pytest.approx(3 * count * 100.0 * (1.0 + left), rel=1e-6)
+        assert evidence.unpredicted([0])['gyroscope'][1].sum() == pytest.approx(3 * count * 100.0 * (1.0 + left), rel=1e-6)
 
 
 def test_flicker_is_as_much_of_each_time():

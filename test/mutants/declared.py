@@ -102,7 +102,7 @@ SEARCH = _of(
     ('windows agree whatever they scatter', 'evidence.py', 'np.linalg.solve(moved.T @ moved, values[places])', 'np.linalg.solve(covariance[np.ix_(places, places)], values[places])',
      'test_search.py::test_windows_agree_on_a_finding'),
     ('all windows of a kind scatter alike', 'normal_matrices.py', '+ (scatter - 1) * own', '+ 0 * (scatter - 1) * own', 'test_search.py::test_a_window_that_scatters_more_within_has_a_less_certain_mean'),
-    ('what only one window tells is held against it', 'evidence.py', 'own @ part @ own - slopes', 'own @ part @ own - 0 * slopes', 'test_search.py::test_what_only_one_window_tells_is_not_held_against_it'),
+    ('what only one window tells is held against it', 'evidence.py', 'found[sensor][0, axis] -= (slopes', 'found[sensor][0, axis] -= 0 * (slopes', 'test_search.py::test_what_only_one_window_tells_is_not_held_against_it'),
     ('a drift of a quiet instrument is asked for as of a consumer one', 'noise_beside_effects.py', 'return np.minimum(prior_sd, WIDEST', 'return np.maximum(prior_sd, WIDEST',
      'test_search.py::test_a_quiet_instrument_drifts_less'),
     ('halves that disagree are not asked', 'investigation.py', 'if not attempt.agrees_in_halves(named, question)]', 'if False]', 'test_search.py::test_what_the_halves_disagree_on_is_denied'),
