@@ -19,10 +19,12 @@ def both(calibration, transfer, seed=0, n=12):
     force, rate, slope, temperature = random_motion(n, seed)
     alpha = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     branch = np.random.default_rng([seed, 23]).uniform(-1.0, 1.0, n)
-    expected = compensate(calibration, force, rate, alpha_s=alpha, temperature_c=temperature, thermal_branch=branch, transfer=transfer)
+    vibration = np.random.default_rng([seed, 24]).uniform(0.0, 0.1, (n, 3))
+    expected = compensate(calibration, force, rate, alpha_s=alpha, temperature_c=temperature, thermal_branch=branch, vibration=vibration,
+                          transfer=transfer)
     kernel = make_kernel(calibration, transfer)
     dt = temperature - calibration.model.temperature_ref_c
-    got = np.array([kernel(*row) for row in np.column_stack([force, rate, slope, dt, branch]).tolist()])
+    got = np.array([kernel(*row) for row in np.column_stack([force, rate, slope, dt, branch, vibration]).tolist()])
     return got, np.column_stack([expected.force, expected.rate])
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor, white_noise
+from imu_calibration.estimation.noise_at_rest import white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor
 from imu_calibration.simulation.sensor_noise import gauss_markov
 
 

@@ -118,7 +118,7 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
-    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), duration=np.ones(4), time=np.arange(4.0), sessions=[np.arange(4)])
+    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), duration=np.ones(4), keys=(), time=np.arange(4.0), sessions=[np.arange(4)])
     space = SimpleNamespace(recording=recording, mean={'gyroscope': [np.ones((4, 2))] * 3})
     for offset, weight in ((0.0, 10.0), (3.0, 1 / np.sqrt(9.01))):
         white = white_means(space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope')
@@ -328,7 +328,7 @@ def test_what_a_search_starts_from_is_significant_by_itself_too(p_value, kept):
 def evidence_of(rows, noise_within, scatter=None):
     """Return evidence of moving windows of 100 samples, whose parameter shows within alone: products of one column with itself, the residual and both."""
     count = len(rows)
-    recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 100.0), duration=np.ones(count), time=np.arange(float(count)),
+    recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 100.0), duration=np.ones(count), keys=(), time=np.arange(float(count)),
                                 sessions=[np.arange(count)], moving=np.ones(count, bool))
     products = np.array([[[100.0, 100.0 * a], [100.0 * a, 100.0 * (a**2 + noise_within)]] for a in rows])
     still = np.zeros((count, 2))
@@ -377,7 +377,7 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
     """Means say 3; within windows of 100 samples of unit noise the slope of the residual is 3 times that of the column too, or -7 times by a wander."""
     for slope, left in ((3.0, 0.0), (-7.0, 100.0)):
         count, each = 12, np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]])
-        recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 101.0), duration=np.ones(count), time=np.arange(float(count)), moving=np.ones(count, bool),
+        recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 101.0), duration=np.ones(count), keys=(), time=np.arange(float(count)), moving=np.ones(count, bool),
                                     sessions=[np.arange(count)], mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)), products=dict.fromkeys(product(SENSORS, ['within']), np.tile(each, (count, 1, 1))))
         index, join, within = ({sensor: [some] * 3 for sensor in SENSORS} for some in (np.array([0]), np.eye(2), np.diag([0.0, 1.0])))
         space = ParameterSpace(recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within)
@@ -464,7 +464,7 @@ def test_what_the_halves_disagree_on_is_denied(monkeypatch):
 def rest_of(sigma, residual):
     """Return the Unexplained of a residual whose windows exceed noise by so many standard deviations."""
     count = len(residual)
-    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), duration=np.ones(count),
+    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), duration=np.ones(count), keys=(),
                                 time=np.arange(float(count)),
                                 describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
                                           'specific force': np.full(count, 9.8)})

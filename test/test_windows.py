@@ -10,6 +10,7 @@ from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.segmentation.spike_filter import REACH
+from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
 from imu_calibration.segmentation.wander_limit import SHORTEST, WanderLimit
 from imu_calibration.segmentation.window_finder import MotionGatherer
@@ -231,12 +232,18 @@ def test_knock_stays_out_of_static_windows():
     assert 0 < counts['not quiet'] < 300
 
 
-def test_vibration_stays_out_of_static_windows():
+@pytest.mark.parametrize('hertz, swells, rests', [(31.0, 0.0, True), (1.5, 0.0, False), (31.0, 8.0, False)],
+                         ids=['vibration', 'hand', 'knocks'])
+def test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not(hertz, swells, rests):
     imu, joints = record(rest(20), imu_hz=200)
     time = seconds(imu)
-    imu.force_s[:, 2] += np.where((time > 8) & (time < 12), 0.05 * np.sin(2 * np.pi * 31 * time), 0.0)
+    size = 0.5 * np.exp(-swells * (time % 0.7))
+    imu.force_s[:, 2] += np.where((time > 8) & (time < 12), size * np.sin(2 * np.pi * hertz * time), 0.0)
     windows, _ = gather(imu, joints)
-    assert covered(windows, 8, 12) < 0.1 and covered(windows, 0, 20) > 14.5
+    assert bool(covered(windows, 8, 12) > 2.0) is rests and covered(windows, 0, 8) > 7.5 and covered(windows, 12, 20) > 6.5
+    in_hand = find_still(imu)
+    assert not any(piece.start < 1610 and piece.stop > 2390 for piece in in_hand), 'without joints it may be a hand'
+    assert (sum(time[piece][-1] - time[piece][0] for piece in in_hand) < 16.5)
 
 
 def test_settling_can_be_longer():

@@ -65,7 +65,7 @@ def _rest(attempt, explained, sensor, excess, values):
     space, recording = attempt.space, attempt.recording
     residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
-    white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration)
+    white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(excess)
     # Quiet axes hide what one alone has.

@@ -212,6 +212,8 @@ def _why_not(effect, poses, turns, follows_gravity):
         return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
     if 'cooling' in effect.needs:
         return 'which way the temperature came is not followed from pose to pose', 'record on a table'
+    if 'vibration' in effect.needs:
+        return 'poses in the hand are held still, so that nothing vibrates now more, now less', 'record on a table'
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
     if 'temperature' in effect.needs and poses.temperature_c is None:

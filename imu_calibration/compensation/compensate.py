@@ -103,7 +103,7 @@ def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarra
 
 def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray,
                temperature_c: np.ndarray | None = None, thermal_branch: np.ndarray | None = None,
-               transfer: Transfer | None = None) -> Corrected:
+               vibration: np.ndarray | None = None, transfer: Transfer | None = None) -> Corrected:
     """
     Return corrected samples.
 
@@ -123,6 +123,8 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
         Needed when the calibration has thermal effects.
     thermal_branch : ndarray, shape (n,), optional
         Which way the temperature came (`reference.thermal_branch`); zero where not given.
+    vibration : ndarray, shape (n, 3), optional
+        How much it vibrates (`reference.vibration`), (m/s^2)^2; zero where not given.
     transfer : Transfer, optional
         Point and frame to move to: ``f_target = f_s - (alpha x r + omega x (omega x r))``.
 
@@ -131,7 +133,7 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     if temperature_c is None and model.needs_temperature:
         raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
     with np.errstate(over='ignore', invalid='ignore'):
-        true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch))
+        true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration))
     beyond = left > CONVERGED
     true_force[beyond] = true_rate[beyond] = np.nan
     marks = saturation_marks(calibration, force_s, rate_s)
@@ -141,7 +143,7 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     return Corrected(*moved(transfer, true_force, true_rate, alpha_s=alpha_s), flagged, marks)
 
 
-def _invert(model, values, force_s, rate_s, alpha_s, warmth):
+def _invert(model, values, force_s, rate_s, alpha_s, beside):
     inverse = {s: np.linalg.inv(model.value(s, Role.LINEAR, values)) for s in SENSORS}
     bias = {s: model.value(s, Role.OFFSET, values) for s in SENSORS}
     measured = {'accelerometer': force_s, 'gyroscope': rate_s}
@@ -150,7 +152,7 @@ def _invert(model, values, force_s, rate_s, alpha_s, warmth):
     for _ in range(ITERATIONS):
         change = np.zeros(len(force_s))
         for sensor in ('gyroscope', 'accelerometer'):
-            ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, *warmth)
+            ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, *beside)
             step = (measured[sensor] - sensor_output(model, sensor, values, ref=ref)) @ inverse[sensor].T
             true[sensor] = true[sensor] + step
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))

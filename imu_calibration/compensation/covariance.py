@@ -105,7 +105,7 @@ class Uncertainty:
     def at(self, force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
            rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
            derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0), *, dt: float = 0.0, branch: float = 0.0,
-           slope_error: SlopeError | None = None) -> Sensitivity:
+           vibration: tuple[float, ...] = (0.0, 0.0, 0.0), slope_error: SlopeError | None = None) -> Sensitivity:
         """
         Return the Sensitivity at a measured sample.
 
@@ -117,24 +117,27 @@ class Uncertainty:
             Temperature above the calibration's reference temperature, K.
         branch : float
             Which way it came (`reference.thermal_branch`).
+        vibration : tuple of 3 floats
+            How much it vibrates (`reference.vibration`), (m/s^2)^2.
         slope_error : rate_slope.SlopeError, optional
             How far the derivative is off; None: only by the noise.
 
         """
-        sample = np.concatenate([force, rate, derivative])
-        gain = np.stack([self._slope(sample, step, (dt, branch)) for step in np.diag(STEPS)], axis=1)
-        true = self._inside(*sample.tolist(), dt, branch)
-        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], (dt, branch))
+        sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)
+        gain = np.stack([self._slope(sample, step, beside) for step in np.diag(STEPS)], axis=1)
+        true = self._inside(*sample.tolist(), *beside)
+        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], beside)
         jacobian = gain[:, :6] @ jacobian
         return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier, slope_error or SlopeError())
 
-    def _slope(self, sample, step, warmth):
-        above, below = self._kernel(*(sample + step).tolist(), *warmth), self._kernel(*(sample - step).tolist(), *warmth)
+    def _slope(self, sample, step, beside):
+        above, below = self._kernel(*(sample + step).tolist(), *beside), self._kernel(*(sample - step).tolist(), *beside)
         return (np.array(above) - below) / (2 * step.sum())
 
-    def _parameter_slopes(self, true, alpha, warmth):
+    def _parameter_slopes(self, true, alpha, beside):
         """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
-        temperature = np.full(1, self._model.temperature_ref_c + warmth[0])
-        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature, np.full(1, warmth[1]))
+        temperature = np.full(1, self._model.temperature_ref_c + beside[0])
+        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature, np.full(1, beside[1]),
+                        np.array([beside[2:]]))
         rows = [columns_at_point(self._model, sensor, ref)[0] for sensor in SENSORS]
         return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])

@@ -20,7 +20,7 @@ from imu_calibration.effects.regressors import LEVER
 
 SETTLED = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) after which there is nothing left to gain."""
-BEFOREHAND = {'temperature', 'thermal branch', 'reference temperature'}
+BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
 """What is known of a sample before either sensor is corrected."""
 
 
@@ -28,9 +28,10 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     Return the function that compensates one sample.
 
-    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch) -> (fx, fy, fz, wx, wy, wz)`` takes the measured specific force (m/s^2) and
-    rate (rad/s), the derivative of the *measured* rate (rad/s^2; it goes through the inverse gyroscope matrix here), and the
-    temperature above the calibration's reference temperature (K) and which way it came (`reference.thermal_branch`, 0 where left out).
+    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy, wz)`` takes the measured specific
+    force (m/s^2) and rate (rad/s), the derivative of the *measured* rate (rad/s^2; it goes through the inverse gyroscope matrix here),
+    and the temperature above the calibration's reference temperature (K). Where they are left out, which way that came
+    (`reference.thermal_branch`) and how much it vibrates (`reference.vibration`, (m/s^2)^2) are 0.
     Where the non-linear effects cannot be undone it returns NaN.
 
     Parameters
@@ -59,7 +60,7 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     products = LEVER.products(known)
     at_arm = [_sum(arm, products[start:start + 3]) for start in (0, 3, 6)]
     slope = _turned(gyro.inverse, _vector('a'))
-    lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0):']
+    lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):']
     if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends_with('g'):
         # Nothing has to be solved: the rate follows from what was measured, and what disturbs the force follows from the rate.
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
@@ -98,7 +99,8 @@ class _Part:
 
 def _known(temperature_ref_c):
     """Return name in a column -> the sum of products that stands for it in the function."""
-    vectors = {f'{letter}_{k}': {(f'{variable}{k}',): 1.0} for letter, variable in (('f', 'u'), ('w', 'v'), ('alpha', 'g')) for k in AXES}
+    letters = {'f': 'u', 'w': 'v', 'alpha': 'g', 'vibration': 's'}
+    vectors = {f'{name}_{k}': {(f'{variable}{k}',): 1.0} for name, variable in letters.items() for k in AXES}
     return vectors | {'temperature_c': {('dt',): 1.0, (): temperature_ref_c}, 'temperature_ref_c': {(): temperature_ref_c},
                       'thermal_branch': {('branch',): 1.0}}
 

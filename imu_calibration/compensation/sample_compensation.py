@@ -2,6 +2,7 @@
 
 from collections import Counter
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.reference.thermal_branch import ThermalBranch
+from imu_calibration.reference.vibration import BandVariance
 
 
 class SampleCompensation:
@@ -34,14 +36,15 @@ class SampleCompensation:
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
         self.needs_temperature = invertible(calibration.model).needs_temperature
         self.dt = None if self.needs_temperature else 0.0
-        self.branch = ThermalBranch()
+        self.branch, self.vibration = ThermalBranch(), BandVariance()
+        self._shakes = invertible(calibration.model).uses('vibration')
         self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
-        self._follows = self.needs_slope or calibration.knows_density   # the stamps say how large the noise of a sample is
+        self._follows = self.needs_slope or self._shakes or calibration.knows_density   # the stamps say how large the noise of a sample is
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer), self._take_derivative)
         self._kernel = make_kernel(calibration, transfer)
-        self.last = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0, 0.0)
+        self.last: tuple[Any, ...] = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0, 0.0, NO_SLOPE)
         self.revision = 0
         """Counts how often the covariances were taken anew."""
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -62,12 +65,13 @@ class SampleCompensation:
             self.refuse('no temperature yet' if dt is None else 'not finite')
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
-        ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now)
+        vibration = self.vibration.push(self.slope.period or 0.0, (fx, fy, fz)) if self._shakes else NO_SLOPE
+        ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
             self.refuse('beyond what can be undone')
             return None
-        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now)
+        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now, vibration)
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         self.corrected += 1
@@ -89,7 +93,7 @@ class SampleCompensation:
 
     def refresh(self) -> None:
         """Take the covariances of the corrected readings anew at the latest sample."""
-        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3], branch=self.last[4],
+        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3], branch=self.last[4], vibration=self.last[5],
                                                  slope_error=self.slope.error() if self.needs_slope else None)
         self.revision += 1
 
@@ -104,7 +108,7 @@ class SampleCompensation:
         self.counts, self.corrected, self.fastest_squared = before.counts, before.corrected, before.fastest_squared
         if before.dt is not None and before.needs_temperature and self.dt is None:
             self.dt = before.dt + before.calibration.model.temperature_ref_c - self.calibration.model.temperature_ref_c
-        self.branch = before.branch
+        self.branch, self.vibration = before.branch, before.vibration
         self.slope.follow(before.slope)
 
     def _take_derivative(self):

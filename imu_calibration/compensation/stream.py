@@ -15,6 +15,7 @@ from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.reference.thermal_branch import ThermalBranch
+from imu_calibration.reference.vibration import BandVariance
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
 
@@ -42,6 +43,7 @@ class CompensationStream:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
         if temperature is not None and invertible(calibration.model).uses('thermal branch'):
             self.temperature = replace(temperature, branch=ThermalBranch().of(temperature.temperature_c))
+        self._vibration = BandVariance() if invertible(calibration.model).uses('vibration') else None
         self.count, self.flagged, self.frame_id = 0, 0, ''
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -64,24 +66,35 @@ class CompensationStream:
         slope[finite] = self.slope.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
         force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
                            for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
+        vibration = self._vibration_of(imu)
         corrected = compensate(self.calibration, force_s, rate_s, alpha_s=slope @ self._inverse_rate.T, temperature_c=temperature,
-                               thermal_branch=branch, transfer=self.transfer)
+                               thermal_branch=branch, vibration=vibration, transfer=self.transfer)
         corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
         corrected.rate[~finite] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
         if finite.any():
             self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
-        self._remember(imu, slope, temperature, branch)
+        self._remember(imu, slope, temperature, branch=branch, vibration=vibration)
         return corrected
 
-    def _remember(self, imu, slope, temperature, branch):
+    def _remember(self, imu, slope, temperature, *, branch, vibration):
         usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
         if len(usable):
             k = usable[-1]
             dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
             self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k], 'dt': dt,
-                          'branch': 0.0 if branch is None else float(branch[k])}
+                          'branch': 0.0 if branch is None else float(branch[k]),
+                          'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist())}
+
+    def _vibration_of(self, imu):
+        """Return how much it vibrates at the samples of a block, as far as they are finite; None where nobody asks."""
+        if self._vibration is None:
+            return None
+        finite = np.isfinite(imu.force_s).all(axis=1)
+        vibration = np.tile(self._vibration.now, (len(imu), 1))
+        vibration[finite] = self._vibration.of(self.slope.period or 0.0, imu.force_s[finite])
+        return vibration
 
     def _warmth_at(self, stamp_ns):
         """Return (temperatures, thermal branches) at stamps; None where there are none or nobody asks for them."""

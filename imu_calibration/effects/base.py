@@ -103,7 +103,7 @@ class Effect:
     acts_on: tuple = SENSORS
     """Sensors that a warp concerns."""
     needs: tuple = ()
-    """Data it needs: 'temperature', 'cooling' (it turned), 'rotation', 'dynamic', 'joints'."""
+    """Data it needs: 'temperature', 'cooling' (it turned), 'vibration' (now more, now less), 'rotation', 'dynamic', 'joints'."""
     step: float = 1e-4
     """Step of the central difference that turns a warp into columns."""
     plausible: tuple = ()

@@ -16,7 +16,8 @@ JOINTS = ('outer', 'middle', 'inner')
 """Joint names where no table says other ones."""
 MOST_ADDED = 50
 """Effects that a document may add at most."""
-UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'thermal branch', 'reference temperature'}
+UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'thermal branch', 'vibration',
+               'reference temperature'}
 """Quantities that compensation knows of a sample."""
 
 

@@ -49,7 +49,7 @@ def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMot
     mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s',
                                                                                                     'mat_sn')}
     return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c,
-                     motion.thermal_branch, motion)
+                     motion.thermal_branch, motion.vibration, motion)
 
 
 INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}

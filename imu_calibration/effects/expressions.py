@@ -27,6 +27,7 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'time': {'time': ('time',)},
     'temperature': {'temperature_c': ('temperature_c',)},
     'thermal branch': {'thermal_branch': ('thermal_branch',)},
+    'vibration': {f'vibration_{a}': ('vibration', k) for k, a in enumerate('xyz')},
     'reference temperature': {'temperature_ref_c': (None,)},
     'time constant': {'tau': (None,)},
 }
@@ -35,7 +36,7 @@ Quantity -> {name in a text: where a Reference holds it}: true specific force, r
 from the base outwards.
 """
 KNOWN = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
-         'temperature_ref_c, tau')
+         'vibration_x .. z, temperature_ref_c, tau')
 """The names for people."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}

@@ -26,6 +26,7 @@ SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj
 THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({WARMTH})' for vi in v])
 TEMPERATURE = ColumnGroup('temperature', (WARMTH,))
 TEMPERATURE_SQUARED = ColumnGroup('temperature_squared', (f'({WARMTH}) ** 2',))
+VIBRATION = ColumnGroup('vibration', tuple(f'vibration_{a}' for a in AXES))
 BRANCH = ColumnGroup('thermal_branch', ('thermal_branch',))
 LEVER = ColumnGroup('lever', (
     '-(w_y * w_y + w_z * w_z)', 'w_x * w_y - alpha_z', 'w_x * w_z + alpha_y',

@@ -7,6 +7,8 @@ from imu_calibration.effects import regressors
 from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, VECTOR, Effect, Role
 from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, OfOthers, Products
 
+SHAKEN = 0.05
+"""Variance of a vibration that is plainly felt, (m/s^2)^2."""
 UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 
 
@@ -86,6 +88,17 @@ def _pair(sensor):
             plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
             motion=('warm_and_cool',), compensation='exact', needs=('temperature', 'cooling'),
             groups=(regressors.BRANCH,), coefficients=Amplitudes(f'{short}_thermal_hysteresis', 'thermal_branch')),
+        Effect(
+            name=f'{short}_vibration_rectification', sensor=sensor, components=VECTOR if accel else MATRIX, shape=(3,) if accel else (3, 3),
+            unit=f'{unit}/(m/s^2)^2', against=('time',),
+            explanation=f'The {sensor} bias shifts with vibration: what is even in its elements makes a mean of it, '
+            + ('along the axis of each' if accel else 'of each direction') + ', by this for each variance that is left in the band.',
+            tolerance=small / SHAKEN, tolerance_reason=f'as the bias, at a vibration of {np.sqrt(SHAKEN):.2g} m/s^2 rms',
+            prior_sd=100 * small / SHAKEN,
+            plausible=(('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
+                        + ', where a hundredth of the amplitude is left in the band'),),
+            motion=('shake',), compensation='exact', needs=('vibration',), groups=(regressors.VIBRATION,),
+            coefficients=Amplitudes(f'{short}_vibration_rectification', 'vibration', own_axis=accel)),
         Effect(
             name=f'{short}_thermal_scale', sensor=sensor, components=VECTOR, shape=(3,), unit='1/K', against=('temperature',),
             explanation=f'The {sensor} scale factor follows the temperature.',

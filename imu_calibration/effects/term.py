@@ -13,6 +13,7 @@ JOINTS = {'joint angle', 'joint rate'}
 """Quantities that only a table knows."""
 MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
            ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
+           ('vibration', ('shake',)),
            ('temperature', ('warm_up',)), ('time', ('warm_up',)),
            ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
 """Standard motions that show a quantity; the first that a column uses is taken."""
@@ -84,6 +85,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         del definition['time_constant']
     spread = MANY * tolerance if prior_sd is None else prior_sd
     needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
+    needs += ('vibration',) * ('vibration' in group.uses)
     needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
     shape: dict[str, Any] = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
     if settles:

@@ -101,6 +101,8 @@ class NoiseModel:
     """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
     reference: ReferenceNoise = ReferenceNoise()
     """What the reference adds to the means of windows."""
+    shaken: dict[tuple[int, float], np.ndarray] = field(default_factory=dict)
+    """(recording, middle in s) of rests that vibrate -> variance of their means as they show it themselves, shape (3,)."""
     left_out: frozenset[tuple[int, float]] = frozenset()
     """(recording, middle in s) of windows that the others contradict: their means count for nothing."""
 
@@ -124,15 +126,23 @@ class NoiseModel:
         """Correlation time of the largest bias process, s; None when there is none."""
         return max(self.bias_processes, key=lambda process: process.sd).time if self.bias_processes else None
 
-    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray | None = None) -> np.ndarray:
-        """Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3)."""
+    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray | None = None, *,
+                      keys: Sequence[tuple[int, float]] = ()) -> np.ndarray:
+        """
+        Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3).
+
+        Of windows with `keys` (recording, middle in s) that vibrate at least what they show themselves.
+        """
         factors = {kind: moving.means for kind, moving in self.moving.items()}
         white = self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
+        if self.shaken and keys:
+            white = np.maximum(white, [self.shaken.get(key, np.zeros(3)) for key in keys])
         return white if durations is None else white + self.reference.variance(kinds, durations)[:, None]
 
-    def variance_beside_bias(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray) -> np.ndarray:
+    def variance_beside_bias(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray, *,
+                             keys: Sequence[tuple[int, float]] = ()) -> np.ndarray:
         """Return the same beside the bias as it is in the middle of each window: with what it wanders within, shape (k, 3)."""
-        return self.mean_variance(kinds, counts, durations) + means_beside_middles(self.bias_processes, durations)[:, None]
+        return self.mean_variance(kinds, counts, durations, keys=keys) + means_beside_middles(self.bias_processes, durations)[:, None]
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
         """Return the covariance of the bias at instants about the middle of a window, s, beside its value there, shape (n, n)."""
@@ -192,35 +202,6 @@ def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray
 def dof_factor(dof: np.ndarray | float) -> np.ndarray:
     """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: by it a variance from few data grows."""
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
-
-
-def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """
-    Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
-
-    Windows whose variance lies far from the median (clipped, knocked) are left out.
-
-    Parameters
-    ----------
-    rows : sequence of WindowStatistics
-
-    """
-    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
-    if not static:
-        return None
-    variances = np.array([row.sensors[sensor].noise_variance for row in static])
-    inflations = np.array([row.sensors[sensor].inflation for row in static])
-    counts = np.array([row.count for row in static], float)
-    pooled, factors = np.empty(3), np.empty(3)
-    for axis in range(3):
-        median = np.median(variances[:, axis])
-        near = (variances[:, axis] <= 2 * median) & (variances[:, axis] >= 0.5 * median)
-        weight = counts * near
-        pooled[axis] = np.average(variances[:, axis], weights=weight) if weight.sum() else median
-        weight = (counts >= 32) * near
-        factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
-    floor = 1e-30 + np.finfo(float).eps**2 * np.max(np.abs([row.sensors[sensor].mean[-3:] for row in static]))**2
-    return np.maximum(pooled, floor), np.clip(factors, 0.8, None)
 
 
 def sessions_of(rows: Sequence) -> list[np.ndarray]:

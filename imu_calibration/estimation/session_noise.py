@@ -7,7 +7,8 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.band_misfit import BandMisfit, band_misfit, misfit_along, own_misfit
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise, white_noise
+from imu_calibration.estimation.noise_at_rest import shaken_means, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -28,7 +29,7 @@ def _at_rest(system, sensor, values):
     white = white_noise(system.accumulator.rows, sensor)
     reference = ReferenceNoise.of_steps(max(row.encoder_step for row in system.accumulator.rows), sensor)
     if white is not None:
-        return NoiseModel(*white, reference=reference)
+        return NoiseModel(*white, reference=reference, shaken=shaken_means(system.accumulator.rows, sensor))
     variance = np.full(3, 1e-30)
     for kind in system.within[sensor]:
         variance = np.maximum(variance, _misfit_of(system, sensor, kind, values).noise)

@@ -36,7 +36,8 @@ class Motion:
         return sum(REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY for piece in self.make(STANDARD_GRAVITY))
 
 
-def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None, branch=None):
+def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None, branch=None,
+          shaking=None):
     """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
     axis, up = np.asarray(axis, float) / np.linalg.norm(axis), np.asarray(up, float) / np.linalg.norm(up)
     cos, sin = np.cos(angle)[:, None], -np.sin(angle)[:, None]
@@ -45,7 +46,8 @@ def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=N
     force = gravity * up_s
     if arm is not None:
         force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
-    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c, branch)
+    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c, branch,
+                     None if shaking is None else np.tile(shaking, (len(time), 1)))
 
 
 def _attitudes(up_s):
@@ -57,6 +59,8 @@ def _attitudes(up_s):
 
 
 TIME = np.arange(0.0, 30.0, 0.02)
+SHAKEN = 0.05
+"""Variance of a vibration that a bench machine leaves in the band, (m/s^2)^2."""
 
 
 EDGES = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
@@ -86,6 +90,13 @@ def _poses(directions, temperatures=(None,)):
             pieces += [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, **warmth) for k, up in enumerate(directions)]
         return pieces
     return make
+
+
+def _shaken(gravity):
+    """Rest in six faces, quiet and while the sensor is shaken along each axis."""
+    one, shakes = np.zeros(1), (np.zeros(3), *SHAKEN * np.eye(3))
+    return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
+            for shaking in shakes for k, up in enumerate(sign * row for row in np.eye(3) for sign in (1, -1))]
 
 
 def rest_with_up(up: tuple | np.ndarray) -> 'Motion':
@@ -145,6 +156,7 @@ MOTIONS = (
            _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
     Motion('warm_and_cool', 'rest in six faces while it warms up by ten kelvins, and again while it cools',
            _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (20.0, 25.0, 30.0, 25.0, 20.0))),
+    Motion('shake', 'rest in six faces, quiet and while a machine shakes the sensor along each axis', _shaken),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
 
@@ -182,5 +194,6 @@ ONE_JOINT = {
     'slow_turn': 'turn the joint slowly through full circles',
     'warm_up': 'rest in several places, cold and warm',
     'warm_and_cool': 'rest in several places while it warms up by ten kelvins, and again while it cools',
+    'shake': 'rest in several places, quiet and while a machine shakes the table',
 }
 """What a table of one joint can do of them; for the others the sensor is mounted anew."""

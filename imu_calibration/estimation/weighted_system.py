@@ -79,7 +79,8 @@ class WeightedSystem:
 
         Beside the bias in the middle of each window, or by the noise within and the reference alone.
         """
-        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(self.kinds, self.counts, self.durations)
+        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(self.kinds, self.counts, self.durations,
+                                                                                            keys=self.keys)
         if noise.left_out:
             out = np.array([key in noise.left_out for key in self.keys])
             variance[out] = LOOSE**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)

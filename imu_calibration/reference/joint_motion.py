@@ -23,6 +23,8 @@ class JointMotion:
     """Third derivative, rad/s^3, shape (n, n_joints)."""
     thermal_branch: np.ndarray | None = None
     """Which way the temperature came to these instants (`reference.thermal_branch`), shape (n,); None: nobody knows."""
+    vibration: np.ndarray | None = None
+    """How much it vibrates there (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: nobody knows."""
 
     def __len__(self) -> int:
         return len(self.time)

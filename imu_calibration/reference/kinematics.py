@@ -96,7 +96,7 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
         mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
     return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=constants.gravity,
-                     temperature_c=temperature_c, branch=motion.thermal_branch, motion=motion)
+                     temperature_c=temperature_c, branch=motion.thermal_branch, shaking=motion.vibration, motion=motion)
 
 
 def _chain_steps(constants, motion):

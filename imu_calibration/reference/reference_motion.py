@@ -29,6 +29,8 @@ class Reference:
     """Temperature at the samples, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
     """Which way the temperature came to the samples (`reference.thermal_branch`), shape (n,); None: nobody knows."""
+    shaking: np.ndarray | None = None
+    """How much it vibrates at the samples (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: nobody knows."""
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
@@ -39,6 +41,11 @@ class Reference:
     def thermal_branch(self) -> np.ndarray:
         """Which way the temperature came, in [-1, 1], shape (n,); zero, between the branches, where nobody knows."""
         return np.zeros(len(self)) if self.branch is None else self.branch
+
+    @property
+    def vibration(self) -> np.ndarray:
+        """How much it vibrates, (m/s^2)^2, shape (n, 3); zero where nobody knows."""
+        return np.zeros((len(self), 3)) if self.shaking is None else self.shaking
 
     @property
     def joint_angle(self) -> np.ndarray:

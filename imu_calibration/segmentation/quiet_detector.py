@@ -3,11 +3,16 @@
 from collections import deque
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 SPANS = (0.25, 1.0)
 """Variances are taken over these times, s: the short one sees a knock, the long one a slow swing."""
-REACH = 1.1
+REACH = 1.3
 """Samples further away than this do not change quietness, s."""
+BELOW = 0.1
+"""Vibration is what means over this time, taken three times over, do not show, s: some 8 Hz and more."""
+STEADY = 0.75
+"""Vibration is steady when it is not above the quiet ratio of its least within this time on both sides, s; a knock is."""
 _LEAST_SAMPLES = 10
 _GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
 _GROWTH = 2.0
@@ -28,8 +33,59 @@ class QuietFloor:
         return np.median(np.array(history), axis=0) if history else None
 
 
+def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float,
+                        floors: tuple[QuietFloor, QuietFloor], resting: np.ndarray) -> np.ndarray:
+    """
+    Tell which samples lie in a quiet span, or in a vibration of a table whose joints stand.
+
+    Joints that stand tell rest where the IMU cannot: a vibration is steady, and nothing of it is left in means over a tenth of a second,
+    which are as quiet as ever. A hand, a shove and a slow turn are left in them; a knock is not steady.
+
+    Parameters
+    ----------
+    force_s, rate_s, period, ratio, longest
+        As for `quiet_samples`.
+    floors : (QuietFloor, QuietFloor)
+        Running floors of the readings and of their means.
+    resting : array of bool, shape (n,)
+        Samples with the joints at rest.
+
+    Returns
+    -------
+    array of bool, shape (n,)
+
+    """
+    quiet = quiet_samples(force_s, rate_s, period, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
+    width = 2 * int(round(BELOW / period / 2)) + 1
+    below = quiet_samples(_smooth(force_s, width), _smooth(rate_s, width), period, ratio=ratio, longest=longest, floor=floors[1],
+                          resting=resting, spans=SPANS[1:])
+    if quiet[resting].all() or width < 3:
+        return quiet
+    return quiet | (below & _steady(force_s, rate_s, period, ratio=ratio, resting=resting))
+
+
+def _smooth(values, width):
+    for _ in range(3):
+        values = uniform_filter1d(values, width, axis=0, mode='nearest')
+    return values
+
+
+def _steady(force_s, rate_s, period, *, ratio, resting):
+    """Tell which samples lie in a short span at rest whose variance is about the least of the spans around."""
+    cell = max(1, min(int(_GRID / period), len(force_s)))
+    edges = np.append(np.arange(0, len(force_s) - cell + 1, cell), len(force_s))
+    width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(SPANS[0] / period / cell))), len(edges) - 1)
+    variance = np.stack([_CellSums(values, edges).variance(width) for values in (force_s, rate_s)])
+    at_rest = _free_of(~np.logical_and.reduceat(resting, edges[:-1]), width)
+    around = 2 * int(round(STEADY / period / cell)) + 1
+    least = minimum_filter1d(np.where(at_rest, variance, np.inf), around, axis=1, mode='nearest')
+    floor = np.maximum(least, [[least_variance(force_s)], [least_variance(rate_s)]])
+    steady = _covered(at_rest & np.all(variance <= ratio**2 * floor, axis=0), width)
+    return np.repeat(_shrunk(steady, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+
+
 def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float, floor: QuietFloor,
-                  resting: np.ndarray | None = None) -> np.ndarray:
+                  resting: np.ndarray | None = None, spans: tuple[float, ...] = SPANS) -> np.ndarray:
     """
     Tell which samples lie in a quiet span.
 
@@ -50,6 +106,8 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
         Running floor, updated here.
     resting : array of bool, shape (n,), optional
         Samples with the joints at rest; the floor comes from spans within them. None: from the quietest tenth of all.
+    spans : tuple of float
+        Lengths of the spans, s.
 
     Returns
     -------
@@ -63,7 +121,7 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
     least = np.array([least_variance(values) for values in (force_s, rate_s)])
     at_rest = None if resting is None else np.logical_and.reduceat(resting, edges[:-1])
     quiet, shorter = np.ones(len(edges) - 1, bool), np.full(2, np.inf)
-    for span in SPANS:
+    for span in spans:
         width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
         variance = np.stack([item.variance(width) for item in sums], axis=1)
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
@@ -84,9 +142,14 @@ def _chunk_floor(variance, width, at_rest):
     separate = variance[::width]
     if at_rest is None:
         return np.quantile(separate, 0.1, axis=0)
-    busy = np.concatenate([[0], np.cumsum(~at_rest)])
-    separate = separate[(busy[width:] == busy[:-width])[::width]]
+    separate = separate[_free_of(~at_rest, width)[::width]]
     return np.quantile(separate, 0.25, axis=0) if len(separate) >= 3 else None
+
+
+def _free_of(busy, width):
+    """Return for the span of `width` cells from each cell on whether none of them is busy."""
+    sums = np.concatenate([[0], np.cumsum(busy)])
+    return sums[width:] == sums[:-width]
 
 
 def least_variance(values: np.ndarray) -> float:

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.reference.thermal_branch import ThermalBranch
+from imu_calibration.reference.vibration import BandVariance
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.segmentation import joint_phases
 from imu_calibration.segmentation.joint_phases import LOST, STILL
 from imu_calibration.segmentation.joint_run import LEAST_READINGS, JointRun
-from imu_calibration.segmentation.quiet_detector import REACH, QuietFloor, quiet_samples
+from imu_calibration.segmentation.quiet_detector import REACH, QuietFloor, quiet_beside_joints
 from imu_calibration.segmentation.sample_buffer import SampleBuffer
 from imu_calibration.segmentation.window import PhasedSamples
 from imu_calibration.segmentation.window_settings import WindowSettings
@@ -32,12 +33,12 @@ class MotionChunks:
     its margin (or are given up), so the cut of the streams into blocks plays no role. The waiting times bound the memory.
     """
 
-    def __init__(self, settings: WindowSettings, noise_rad: float | None, floor: QuietFloor):
+    def __init__(self, settings: WindowSettings, noise_rad: float | None, floors: tuple[QuietFloor, QuietFloor]):
         self.counts = {}
         self.time_origin = 0.0
-        self._settings, self._noise_rad, self._floor = settings, noise_rad, floor
+        self._settings, self._noise_rad, self._floors = settings, noise_rad, floors
         self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
-        self._branch = ThermalBranch()
+        self._branch, self._vibration = ThermalBranch(), BandVariance()
         self.margin = max(settings.overlap, _LEAST_MARGIN)
         self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
         self._start_ns: int | None = None
@@ -147,17 +148,17 @@ class MotionChunks:
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
         runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
         phase, level, joint_step = self._phases(time, runs, final)
-        quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=self._settings.quiet_ratio, longest=self._settings.static_minimum,
-                              floor=self._floor,
-                              resting=phase == STILL)
+        quiet = quiet_beside_joints(imu.force_s, imu.rate_s, period, ratio=self._settings.quiet_ratio,
+                                    longest=self._settings.static_minimum, floors=self._floors, resting=phase == STILL)
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
         warmth = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
         return self._without_lost(PhasedSamples(
-            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, *warmth, phase[core],
-            quiet[core], after_gap, np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
+            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, *warmth,
+            self._vibration.of(period, imu.force_s[core]), phase[core], quiet[core], after_gap,
+            np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):
         """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""

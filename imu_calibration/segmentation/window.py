@@ -95,6 +95,8 @@ class PhasedSamples(_Columns):
     """NaN where unknown, shape (n,)."""
     thermal_branch: np.ndarray
     """Which way the temperature came, NaN where it is unknown, shape (n,)."""
+    vibration: np.ndarray
+    """How much it vibrates (`reference.vibration`), (m/s^2)^2, shape (n, 3)."""
     phase: np.ndarray
     """STILL, STEADY or MOVING, shape (n,)."""
     quiet: np.ndarray
@@ -111,7 +113,7 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
     """Return the `Window` of a kind that holds all of `samples`."""
     temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
     moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk,
-                         None if temperature is None else samples.thermal_branch)
+                         None if temperature is None else samples.thermal_branch, samples.vibration)
     motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
                   samples.joint_step.max(axis=0))
@@ -142,4 +144,5 @@ def _mean_motion(samples):
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
     zero, branch = np.zeros((1, len(mean))), samples.thermal_branch.mean(keepdims=True)
-    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero, None if np.isnan(branch).any() else branch)
+    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero, None if np.isnan(branch).any() else branch,
+                       samples.vibration.mean(axis=0, keepdims=True))

@@ -42,10 +42,10 @@ class MotionGatherer:
         self._queue = {name: [] for name in STREAMS}
         self._epoch_shift = dict.fromkeys(STREAMS, 0)
         self._turns = _Unwrapper()
-        self._floor = QuietFloor()
+        self._floors = QuietFloor(), QuietFloor()
         self._lost_counts = {}
         self._epoch = 0
-        self._chunks = MotionChunks(settings, self._noise_rad, self._floor)
+        self._chunks = MotionChunks(settings, self._noise_rad, self._floors)
         self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
 
     @property
@@ -139,7 +139,7 @@ class MotionGatherer:
 
     def _next_epoch(self):
         windows = self._end_epoch()
-        old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floor)
+        old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floors)
         self._chunks.time_origin = old.end_time + self._settings.gap
         _add_counts(self._lost_counts, old.counts)
         self._epoch += 1

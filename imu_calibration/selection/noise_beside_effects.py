@@ -6,7 +6,8 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, white_noise
+from imu_calibration.estimation.noise_at_rest import shaken_means, white_noise
+from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.selection.bias_process_search import NATURAL, TIMES, BiasProcessSearch
@@ -92,7 +93,8 @@ def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
     found = {}
     for sensor in SENSORS:
         white, inflation = white_noise(space.recording.windows, sensor) or (_white_without_rest(space, sensor), np.ones(3))
-        found[sensor] = NoiseModel(white, inflation, reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor))
+        found[sensor] = NoiseModel(white, inflation, reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor),
+                                   shaken=shaken_means(space.recording.windows, sensor))
     return found
 
 
@@ -132,7 +134,7 @@ def _with_bias_process(space, sensor, noise, smooth):
     rows = np.zeros((len(recording.windows), 3, len(own) + 1))
     for axis in range(3):
         rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
-    white = noise[sensor].mean_variance(recording.kind, recording.count, recording.duration)
+    white = noise[sensor].mean_variance(recording.kind, recording.count, recording.duration, keys=recording.keys)
     likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
                                  information=_known_otherwise(space, sensor, noise, own),
                                  known=noise[sensor].known, durations=recording.duration)

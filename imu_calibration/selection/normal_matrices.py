@@ -64,7 +64,7 @@ def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str
     `scatter` says by how many times each window scatters more within than others of its kind, shape (k, 3).
     """
     recording, own = space.recording, noise[sensor]
-    variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration) + own.offset_sd**2
+    variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys) + own.offset_sd**2
     if scatter is not None:
         variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
     return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, processes=own.bias_processes)(rows[:, None])[:, 0]

@@ -7,8 +7,10 @@ import numpy as np
 
 from imu_calibration.effects.base import SECTIONS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_at_rest import VIBRATES
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.thermal_branch import HALF_WIDTH
+from imu_calibration.segmentation.quiet_detector import least_variance
 from imu_calibration.segmentation.window import Window
 
 TURN = 4 * HALF_WIDTH
@@ -17,6 +19,8 @@ TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
 BRANCHES_APART = 1.5
 """Least span of the thermal branch, from -1 to 1, that tells cooling from warming up."""
+SHAKEN, LEAST_SHAKEN = VIBRATES, 3
+"""It vibrates in a rest whose noise has this many times the variance of the quietest, and must in so many."""
 N_TIME_CONSTANTS = 12
 """Warm-ups are asked for at this many time constants."""
 
@@ -62,8 +66,9 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     kinds = {window.kind for window in windows}
     span = _temperature_span(windows)
     have = {e.key for e in model.effects}
-    turned = _branch_span(windows) >= BRANCHES_APART
-    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned))
+    turned, shaken = _branch_span(windows) >= BRANCHES_APART, _vibrates(windows)
+    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned)
+                        or _not_shaken(effect, shaken))
 
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
@@ -95,6 +100,19 @@ def _temperature_span(windows):
 def _branch_span(windows):
     branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
     return max(branches) - min(branches) if branches else 0.0
+
+
+def _vibrates(windows):
+    """Return whether it vibrates in some rests more than in others."""
+    rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
+    variances = np.array([max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s)) for window in rests])
+    return np.count_nonzero(variances > SHAKEN * variances.min(initial=np.inf)) >= LEAST_SHAKEN
+
+
+def _not_shaken(effect, shaken):
+    if 'vibration' in effect.needs and not shaken:
+        return 'it did not vibrate now more, now less at rest', f'record {LEAST_SHAKEN} rests and more while a machine on the table runs'
+    return None
 
 
 def _not_turned(effect, turned):

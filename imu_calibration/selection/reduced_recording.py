@@ -61,6 +61,11 @@ class ReducedRecording:
         """Length of each window, s, shape (k,)."""
         return np.array([window.duration for window in self.windows])
 
+    @cached_property
+    def keys(self) -> list[tuple[int, float]]:
+        """(Recording, middle in s) of each window."""
+        return [(window.session, window.time) for window in self.windows]
+
     @property
     def encoder_step(self) -> float:
         """Largest step of the encoders that shows in the readings, rad; 0 where none does."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.band_misfit import band_misfit, least_misfit
-from imu_calibration.estimation.noise_model import white_noise
+from imu_calibration.estimation.noise_at_rest import white_noise
 from imu_calibration.selection.parameter_space import ParameterSpace
 
 

@@ -10,7 +10,8 @@ SIZE = {'bias': 0.3, 'accel_quadratic': 2e-4, 'accel_cubic': 1e-5, 'accel_scale_
         'accel_size_effect': 0.02, 'accel_thermal_bias': 0.01, 'accel_thermal_scale': 3e-4, 'gyro_quadratic': 1e-3,
         'gyro_scale_asymmetry': 2e-3, 'gyro_rate_product': 3e-3, 'gyro_g_sensitivity': 1e-3, 'gyro_thermal_bias': 1e-3, 'gyro_thermal_scale': 3e-4,
         'gyro_force_squared': 1e-6, 'accel_cross_axis_lag': 1e-4, 'gyro_cross_axis_lag': 1e-4, 'accel_thermal_bias_2': 3e-4, 'gyro_thermal_bias_2': 3e-5,
-        'accel_thermal_hysteresis': 0.02, 'gyro_thermal_hysteresis': 1e-3}
+        'accel_thermal_hysteresis': 0.02, 'gyro_thermal_hysteresis': 1e-3,
+        'accel_vibration_rectification': 0.1, 'gyro_vibration_rectification': 4e-3}
 """Typical size of each further effect, SI."""
 FURTHER = {sensor: tuple(name for (owner, name), effect in CATALOGUE.effects().items()
                          if owner == sensor and effect.compensation == 'exact' and name not in ('bias', 'matrix'))

@@ -62,7 +62,8 @@ def record(seed, hidden=None, noise='white', through_bag=True, **options):
 
 def options_of(*effects):
     """Return the options of sessions that hide effects."""
-    return {'temperature': 'cycle'} if any(name.endswith('_hysteresis') for name in effects) else {}
+    wanted = {'_hysteresis': {'temperature': 'cycle'}, '_rectification': {'machine': True}}
+    return {key: value for ending, options in wanted.items() if any(name.endswith(ending) for name in effects) for key, value in options.items()}
 
 
 @lru_cache(maxsize=8)

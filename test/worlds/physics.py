@@ -21,6 +21,7 @@ from worlds.physics_cause import NO_CAUSE
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
 from worlds.physics_sensor import filtered
 from worlds.physics_table import local_gravity, move_table
+from worlds.physics_vibration import Machine
 from worlds.wanders import WANDERS, add_wander
 
 PLACE = {'gravity': None, 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 20.0}
@@ -60,7 +61,7 @@ class Session:
 
 def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_rate=100.0, joint_rate=100.0, duration=None, profile='random',
                  table='three_axis', arms=False, mount_rpy_deg=None, temperature='warm_up', velocity='good', encoder_resolution=None,
-                 dropped=None, only_at_rest=False, knock=False, wrong_covariance=False, oversampling=8, unit=None, cause=None):
+                 dropped=None, only_at_rest=False, knock=False, wrong_covariance=False, oversampling=8, unit=None, cause=None, machine=False):
     """
     Return a `Session` with effects hidden in it.
 
@@ -105,6 +106,8 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
         Draws the IMU in place of `seed`: sessions of one unit.
     cause : worlds.physics_cause.Cause, optional
         What the world does beside the motion.
+    machine : bool
+        A machine on the bench shakes the sensor, now more, now less (`worlds.physics_vibration`).
 
     """
     cause = cause or NO_CAUSE
@@ -129,6 +132,10 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     outputs = [filtered(out, sampling.step, triad)[:: sampling.factor] for out, triad in zip(outputs, triads)]
     if knock or 'knock_step' in values:
         outputs = [out + shock for out, shock in zip(outputs, _shock(sampling.time, events['knock']))]
+    if machine:
+        shaken = Machine(moves.duration, imu_rate, generator(seed, 'machine')).shake(
+            sampling.time, lambda vectors: world.to_sensor(np.repeat(vectors, sampling.factor, axis=0)[:len(world.time)])[::sampling.factor], triads)
+        outputs = [out + more for out, more in zip(outputs, shaken)]
     _set_limits(triads, outputs, values)
     if noise in WANDERS:
         outputs = add_wander(outputs, noise, GRADES[grade].noise, 1.0 / imu_rate, generator(seed, 'wander'))

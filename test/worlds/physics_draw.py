@@ -19,6 +19,7 @@ EFFECTS = {
     'accel_saturation': (0.02, None), 'accel_bandwidth': (4e-3, None),
     'accel_thermal_bias_2': (0.05 * MG, (3,)), 'gyro_thermal_bias_2': (2e-3 * DEG, (3,)), 'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
     'accel_thermal_hysteresis': (2 * MG, (3,)), 'gyro_thermal_hysteresis': (0.05 * DEG, (3,)), 'accel_delay': (4e-3, None), 'gyro_delay': (4e-3, None), 'accel_filter': (4e-3, None), 'gyro_filter': (4e-3, None),
+    'accel_vibration_rectification': (0.3, (3,)), 'gyro_vibration_rectification': (4e-3, (3, 3)),
     'accel_cross_axis_lag': (2e-4, (3, 2)), 'gyro_cross_axis_lag': (2e-4, (3, 2)),
     'axis_sag': (5 * ARCMIN, None), 'axis_wobble': (3 * ARCMIN, None), 'axis_offset': (5e-3, None),
     'load_compliance': (1 * ARCMIN / G, (3, 3)),
@@ -83,6 +84,7 @@ def draw_imu(grade, values, arms, rng):
         triad.thermal_bias = values.get(short + '_thermal_bias', 0.0)
         triad.thermal_bend = values.get(short + '_thermal_bias_2', 0.0)
         triad.hysteresis = values.get(short + '_thermal_hysteresis', 0.0)
+        triad.rectifies = values.get(short + '_vibration_rectification', 0.0)
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
         triad.low_pass, triad.late = float(values.get(short + '_bandwidth', 0.0)), float(values.get(short + '_delay', 0.0))
         triad.second_order, triad.crosstalk = float(values.get(short + '_filter', 0.0)), values.get(short + '_cross_axis_lag')

@@ -35,6 +35,8 @@ class Triad:
     thermal_scale: np.ndarray | float = 0.0
     hysteresis: np.ndarray | float = 0.0
     """Half of what the bias differs between the branches of warming up and cooling: strain that grains of unlike friction let go one after the other."""
+    rectifies: np.ndarray | float = 0.0
+    """Bias by the mean square of vibration: of an accelerometer along its own axis, shape (3,), of a gyroscope along each, shape (3, 3)."""
     drift: np.ndarray | float = 0.0
     drift_constant: float = 1.0
     """Bias warm-up: drift (1 - exp(-t / constant))."""

@@ -1,0 +1,64 @@
+"""White noise from windows at rest, and what the means of those scatter that vibrate."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
+"""Noise at low frequency is not taken for less than these shares of white noise of the same variance, at rest and where it vibrates."""
+VIBRATES = 4.0
+"""A table vibrates in a window whose variance is above so many times that of quiet ones."""
+
+
+def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """
+    Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
+
+    Windows whose variance lies far from the median (clipped, knocked) are left out; far from the quietest level where a table vibrates,
+    now more, now less: a vibration leaves the means nearly as they are.
+
+    Parameters
+    ----------
+    rows : sequence of WindowStatistics
+
+    """
+    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
+    if not static:
+        return None
+    variances = np.array([row.sensors[sensor].noise_variance for row in static])
+    inflations = np.array([row.sensors[sensor].inflation for row in static])
+    counts = np.array([row.count for row in static], float)
+    pooled, factors = np.empty(3), np.empty(3)
+    for axis in range(3):
+        usual, shaken = _usual(variances[:, axis], inflations[:, axis])
+        near = (variances[:, axis] <= 2 * usual) & (variances[:, axis] >= 0.5 * usual)
+        weight = counts * near
+        pooled[axis] = np.average(variances[:, axis], weights=weight) if weight.sum() else usual
+        weight = (counts >= 32) * near
+        factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
+        factors[axis] = max(factors[axis], LEAST_SHAKEN if shaken else LEAST_INFLATION)
+    floor = 1e-30 + np.finfo(float).eps**2 * np.max(np.abs([row.sensors[sensor].mean[-3:] for row in static]))**2
+    return np.maximum(pooled, floor), factors
+
+
+def _usual(variances, inflations):
+    """Return (the median variance, False); where most windows vibrate far above the band of their means, (the second least, True)."""
+    median = float(np.median(variances))
+    quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
+    louder = variances > VIBRATES * quiet
+    shaken = 0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < LEAST_INFLATION
+    return (quiet if shaken else median), shaken
+
+
+def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndarray]:
+    """Return `NoiseModel.shaken` of a sensor: of each rest that vibrates far more than the quiet ones."""
+    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
+    if not static:
+        return {}
+    variances, inflations = (np.array([getattr(row.sensors[sensor], name) for row in static]) for name in ('noise_variance', 'inflation'))
+    own = np.zeros(variances.shape)
+    for axis in range(3):
+        quiet, shaken = _usual(variances[:, axis], inflations[:, axis])
+        loud = (variances[:, axis] > VIBRATES * quiet) & shaken
+        own[loud, axis] = variances[loud, axis] * inflations[loud, axis]
+    return {(row.session, row.time): each / row.count for row, each in zip(static, own) if each.any()}
