@@ -24,6 +24,8 @@ MOST = 0.75
 """Share of the windows that must be, more than."""
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
+FEWEST_SAMPLES = 16
+"""Of a window, or of equal steps of a turning joint, that are taken apart into frequencies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +91,16 @@ def _alike(number, sums, weight, wave):
     return (in_phase & known[..., None]).sum(axis=0) / known.sum(axis=0)[:, None]
 
 
+def long_enough(windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool) -> Iterator[tuple[int, Window, np.ndarray]]:
+    """Yield (number, window, rest) of the windows that have enough samples for a spectrum, and the joints at each of them where asked."""
+    for place, (window, rest) in enumerate(zip(windows, rests)):
+        if len(window) >= FEWEST_SAMPLES and (not with_joints or len(window.motion) == len(window)):
+            yield place, window, rest
+
+
 def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
     """Yield (number of the window, rest, time, angle) of pieces of moving windows."""
-    for place, (window, rest) in enumerate(zip(windows, rests)):
-        if len(window) < 16 or len(window.motion) != len(window):
-            continue
+    for place, window, rest in long_enough(windows, rests, with_joints=True):
         number = max(1, round((window.time[-1] - window.time[0]) / PIECE_S))
         yield from zip([place] * number, np.array_split(rest, number), np.array_split(window.time, number),
                        np.array_split(window.motion.position[:, joint], number))

@@ -8,7 +8,7 @@ from scipy.signal import detrend
 from scipy.stats import binom
 
 from imu_calibration.beyond.blocks import residuals
-from imu_calibration.beyond.orders import MOST, OUT, orders_of
+from imu_calibration.beyond.orders import FEWEST_SAMPLES, MOST, OUT, long_enough, orders_of
 from imu_calibration.constants import DEG
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.reference.table import Table
@@ -118,18 +118,16 @@ def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:
 
 def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None) -> Iterator[tuple[np.ndarray, float, float]]:
     """Yield (rest at equal steps, shape (n, 3), step in seconds or turns, highest frequency) of stretches that can show a tone."""
-    for window, rest in zip(windows, parts):
-        if len(window) < 16:
-            continue
+    for _, window, rest in long_enough(windows, parts, with_joints=joint is not None):
         step = float(np.median(np.diff(window.time)))
         if joint is None:
             # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
             yield from ((piece, step, HIGHEST / step) for piece in _cut(rest, round(1 / (STEP * step))))
-        elif len(window.motion) == len(window) and _keeps_turning(window.motion.rate[:, joint]):
+        elif _keeps_turning(window.motion.rate[:, joint]):
             turns = window.motion.position[:, joint] / (2 * np.pi)
             order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
             even = np.arange(turns[order][0], turns[order][-1], 1 / PER_TURN)
-            if len(even) < 16:
+            if len(even) < FEWEST_SAMPLES:
                 continue
             taken = np.stack([np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1)
             fastest = float(np.abs(window.motion.rate[:, joint]).max()) * step / (2 * np.pi)
