@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.lags import total_lags
+from imu_calibration.selection import lag_explanations
 from imu_calibration.selection.lag_explanations import COMMON, Explanation, LagExplanations, _Option, _rivals, _told_together, simplest
 from imu_calibration.selection.search import TIE
 
@@ -35,6 +36,18 @@ def test_a_story_that_did_not_help_gives_way_to_a_shorter_one():
     explanations = LagExplanations(None, [both, one], [], None)
     assert explanations.told() is both
     assert explanations.told(1, [both]) is one
+
+
+def test_what_did_not_help_is_not_tried_again_under_another_name():
+    both, same, other = explanation(0.0, gyro_delay=3e-3), explanation(0.0, gyro_filter=3e-3), explanation(1.0, time_offset=3e-3)
+    assert LagExplanations(None, [both, same, other], [], None).others(None, [both]) == [other]
+
+
+def test_what_costs_more_than_no_lag_explains_nothing(monkeypatch):
+    monkeypatch.setattr(lag_explanations, '_none', lambda told, judges, sensor: option(sensor, (), [], cost=10.0))
+    monkeypatch.setattr(lag_explanations, '_option', lambda told, judges, sensor: option(sensor, ('delay',), [1e-3], cost=5.0 if sensor == 'gyroscope' else 10.5))
+    told = lag_explanations._explanations([None], [], [])
+    assert told and all('gyro' in name or name == 'time_offset' for name in told[0].lags) and {'accel_delay'} not in [set(each.lags) for each in told]
 
 
 def option(sensor, kind, lags, sd=1e-5, cost=0.0):

@@ -439,11 +439,11 @@ def test_halves_agree_within_chance(apart, agree):
     assert attempt.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
 
 
-def with_attempt(monkeypatch, paid=None, agree=lambda question: True, windows_agree=lambda named, question: True):
+def with_attempt(monkeypatch, paid=None, agree=lambda question: True, windows_agree=lambda named, question: True, standing=list):
     """Return an attempt of which the residual in the sensor's unit and the halves say this."""
     monkeypatch.setattr(investigation, '_sure_reduction', lambda attempt, kept, each: (paid or {}).get(each, 0.5))
     monkeypatch.setattr(investigation, '_needed_reduction', lambda *given: 0.0)
-    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True), windows_agree=windows_agree, agrees_in_halves=lambda named, question: agree(question))
+    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True, standing=standing), windows_agree=windows_agree, agrees_in_halves=lambda named, question: agree(question))
 
 
 def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
@@ -459,6 +459,21 @@ def test_what_the_windows_disagree_on_is_not_named(monkeypatch):
 def test_what_the_halves_disagree_on_is_denied(monkeypatch):
     attempt = with_attempt(monkeypatch, agree=lambda question: question is not CUBIC)
     assert investigation._agreed(attempt, None, [QUADRATIC, CUBIC]) == ([QUADRATIC], [CUBIC])
+
+
+def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
+    """A clock that is early and a lag that makes up for it: each is significant beside the other alone."""
+    losses = {frozenset(): 100.0, frozenset([0]): 99.0, frozenset([1]): 99.0, frozenset([0, 1]): 0.0}
+    standing = Search(Known(losses.get), (), [QUADRATIC, CUBIC]).standing
+    for agree, named in ((lambda question: True, [QUADRATIC, CUBIC]), (lambda question: question is not CUBIC, [])):
+        assert investigation._agreed(with_attempt(monkeypatch, agree=agree, standing=standing), None, [QUADRATIC, CUBIC])[0] == named
+
+
+@pytest.mark.parametrize(('value', 'fall', 'asked_about'), ((-1e-4, 100.0, True), (1e-4, 100.0, False), (-1e-4, 2.0, False)))
+def test_a_lag_that_would_be_negative_is_no_finding_and_asks_for_an_explanation(value, fall, asked_about):
+    lag = asked('accelerometer', 'accel_delay', 0)
+    search = Search(Known(lambda used: -fall * (0 in used), values=[value]), (), [lag])
+    assert search.early([]) == ([lag] if asked_about else []) and search.run() == ([lag] if value > 0 else [])
 
 
 def rest_of(sigma, residual):

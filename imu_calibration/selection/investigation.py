@@ -98,7 +98,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     chosen = attempt.search.run()
     chosen = [question for question in chosen if question.name not in FAMILY or attempt.windows_agree(chosen, question)]
     report(0.5)
-    explanations = lag_explanations(attempt, chosen, attempted)
+    explanations = lag_explanations(attempt, [*chosen, *attempt.search.early(chosen)], attempted)
     if explanations is not None:
         attempted = partial(attempted, resolved=FAMILY)
         outcome, rivals = _with_lags(explanations, attempted)
@@ -147,8 +147,10 @@ def _with_lags(explanations, attempted):
         most, refused = max(len(told.lags) - 1, 1), [*refused, told]
         kept = [len(told.lags.keys() & {question.name for question in some}) for some in (outcome.named, outcome.chosen)]
         tried.append((kept, outcome, [*of_lags, *rivals]))
-        if kept[0] == len(told.lags) or not explanations.others(most, refused):
+        if kept[0] == len(told.lags):
             return tried[-1][1:]
+        if not explanations.others(most, refused):
+            break
     return max(tried, key=lambda entry: entry[0])[1:]
 
 
@@ -210,10 +212,10 @@ def too_few_windows(count: int) -> NotObservableError:
 
 
 def _agreed(attempt, explained, named):
-    """Return (findings on which both halves of the recording agree, those on which they do not), the worst taken out first."""
+    """Return (findings on which both halves of the recording agree and that stand without the others, those on which halves do not)."""
     denied = [question for question in named if not attempt.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in denied]
-    return _that_help(attempt, explained, kept) if denied else kept, denied
+    return attempt.search.standing(_that_help(attempt, explained, kept) if denied else kept), denied
 
 
 def _that_help(attempt, explained, named):

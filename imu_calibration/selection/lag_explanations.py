@@ -94,8 +94,9 @@ class LagExplanations:
     """Held-out cost without any lag, nats, where nothing rests; None where the noise is known from rests."""
 
     def others(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> list[Explanation]:
-        """Return the explanations of at most so many effects without some."""
-        return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each not in refused]
+        """Return the explanations of at most so many effects without some, and without others of the same columns, which cost the same."""
+        costs = {each.cost for each in refused}
+        return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each.cost not in costs]
 
     def told(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
         """Return the simplest explanation of `others`."""
@@ -113,7 +114,7 @@ class LagExplanations:
 
 def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> LagExplanations | None:
     """
-    Return the LagExplanations of a choice; None where no lag is among it, or some of the family cannot be asked about.
+    Return the LagExplanations of a choice; None where no lag is among it, none explains, or some of the family cannot be asked about.
 
     Parameters
     ----------
@@ -131,6 +132,8 @@ def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Ca
     described = _described(attempted, effects, rest)
     judges = [each.attempt for each in described]
     explanations = _explanations(described, judges, attempt.baseline.param_names)
+    if not explanations:
+        return None
     return LagExplanations(attempt, explanations, rest, _silence(described, judges) if attempt.recording.moving.all() else None)
 
 
@@ -188,16 +191,13 @@ def _silence(described, judges):
 
 
 def _explanations(described, judges, names):
-    """Return every Explanation that the descriptions of each sensor make together."""
+    """Return every Explanation that the descriptions of each sensor make together, and that is better than none."""
     options = {sensor: [_none(described[0], judges, sensor), *(_option(told, judges, sensor) for told in described)] for sensor in SENSORS}
     if len(described) == 1:   # without curvature the kinds are one column
         for some in options.values():
             some += [replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')]
-    found = []
-    for one, two in product(*(options[sensor] for sensor in SENSORS)):
-        if one.kind or two.kind:
-            found += _told_together(one, two, names)
-    return found
+    found = [told for one, two in product(*options.values()) if one.kind or two.kind for told in _told_together(one, two, names)]
+    return [told for told in found if told.cost < sum(none.cost for none, *_ in options.values())]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import AbstractSet, Sequence
 
 import numpy as np
@@ -117,6 +117,11 @@ class Search:
             return False
         return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(chosen, question)
 
+    def early(self, chosen: Sequence[Question]) -> list[Question]:
+        """Return the lags that would be significant, were they not negative: a clock that is early behind a sensor that is late."""
+        scores = [self.score(chosen, q) for q in self.others(chosen) if q.effect.nonnegative and self.estimate([*chosen, q], q)[0][0] < 0]
+        return [score.question for score in scores if replace(score, allowed=True).significant]
+
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
         """Return whether the estimate of a chosen effect is beyond what is known of any instrument: a range is a prior, not a wall."""
         amplitudes = question.effect.size - question.effect.time_constant
@@ -192,6 +197,12 @@ class Search:
                 if value < cost and all(self.allowed(trial, each) for each in trial) and self.score(rest, other).significant:
                     best, cost = trial, value
         return best
+
+    def standing(self, chosen: Sequence[Question]) -> Sequence[Question]:
+        """Return what stays significant of a choice that others were taken from: half of a clock and a lag that make up for it is nothing."""
+        while (smaller := self._dropped(chosen)) is not None:
+            chosen = smaller
+        return chosen
 
     def class_mates(self, chosen: Sequence[Question], question: Question, *,
                     most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
