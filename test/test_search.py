@@ -325,6 +325,15 @@ def test_what_a_search_starts_from_is_significant_by_itself_too(p_value, kept):
     assert Search(evidence, (), [QUADRATIC, CUBIC]).reconsidered([QUADRATIC]) == kept
 
 
+def test_windows_agree_on_what_they_tell_of_an_effect():
+    """The second of two parameters shows nowhere, as one arm of three that add up to nothing."""
+    evidence, alone = (evidence_of(0.3 + 0.1 * np.random.default_rng(4).normal(0.0, 1.0, 40), 1.0) for _ in range(2))
+    space = evidence.space
+    space.size, space.places, space.reduced = 2, lambda sensor, axis: np.array([0, 2]), lambda used, values: np.array([-values[0], 0.0, 1.0])
+    evidence.fit = lambda used: (np.append(alone.fit([0])[0], 0.0), np.diag([alone.fit([0])[1][0, 0], 1e12]))
+    assert evidence.p_value_by_scatter([0, 1], [0, 1]) == pytest.approx(alone.p_value_by_scatter([0], [0]))
+
+
 def evidence_of(rows, noise_within, scatter=None):
     """Return evidence of moving windows of 100 samples, whose parameter shows within alone: products of one column with itself, the residual and both."""
     count = len(rows)

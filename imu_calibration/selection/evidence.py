@@ -12,6 +12,7 @@ from scipy.stats import f as fisher
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
+from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.selection.normal_matrices import white_means, within_of_axis
 from imu_calibration.selection.parameter_space import ParameterSpace
 
@@ -231,11 +232,14 @@ class WindowEvidence(Evidence):
                 within = self.space.slopes_within(sensor, axis, reduced[at]) / np.array([variance[name][axis] for name in kind])[:, None]
                 slopes[:, at] += means * (means @ reduced[at])[:, None] + within
         places = [list(used).index(k) for k in parameters]
-        moved = slopes[:, list(used)] @ covariance[:, places]
-        n_windows, n_own = moved.shape
+        sd = np.sqrt(np.diag(covariance)[places])
+        moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
+        sizes, directions = np.linalg.eigh(moved.T @ moved)
+        told = sizes > SURE * sizes[-1]   # compliances that no pose shows, arms that add up to nothing
+        n_windows, n_own = len(moved), int(told.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
-        t_squared = values[places] @ np.linalg.solve(moved.T @ moved, values[places])
+        t_squared = ((directions.T @ (values[places] / sd))[told]**2 / sizes[told]).sum()
         return float(fisher.sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
 
 

@@ -199,7 +199,7 @@ class Search:
         return best
 
     def standing(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return what stays significant of a choice that others were taken from: half of a clock and a lag that make up for it is nothing."""
+        """Return what stays significant of a choice that others were taken from: of a clock and a lag that make up for it none does."""
         while (smaller := self._dropped(chosen)) is not None:
             chosen = smaller
         return chosen
