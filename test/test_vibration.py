@@ -14,10 +14,13 @@ from imu_calibration.reference.vibration import BandVariance
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import SimulatedNoise
+from imu_calibration.simulation.session import SimulationOptions, answered, simulate
 
 from worlds.compensation_cases import random_calibration
 from worlds.hiding import record
-from worlds.physics import make_session
+from worlds.physics import TABLES, make_session
 
 RECTIFICATION = ('accel_vibration_rectification', 'gyro_vibration_rectification')
 SHORT = {'profile': 'random_short', 'duration': 180.0}
@@ -78,6 +81,25 @@ def test_it_is_asked_only_where_rests_vibrate_unlike(shaken, windows):
         known, lacking = asked_of(model, table, some)
         assert (set(RECTIFICATION) <= {effect.name for effect in known}) is asked
         assert asked or {entry['why'] for entry in lacking if entry['effect'] in RECTIFICATION} == {'it did not vibrate now more, now less at rest'}
+
+
+def test_a_machine_shakes_simulated_sensors_whose_bias_follows_vibration_recorded_and_live():
+    table = Table.from_mapping(TABLES['three_axis'] | {'gravity': 9.8, 'azimuth_deg': None, 'mount': {'rpy_deg': [0, 0, 0], 'xyz': [0, 0, 0]}})
+    plain = SensorModel(joint_names=table.joint_names)
+    model, size = plain.with_effect('accelerometer', RECTIFICATION[0]), np.array([0.5, -0.4, 0.3])
+    values = model.start()
+    values[model.slices['accelerometer', RECTIFICATION[0]]] = size
+    profile, options = make_profile('static_only', seed=1, table=TABLES['three_axis']), SimulationOptions(noise=SimulatedNoise())
+    imu, joints, _ = simulate(model, values, table, profile=profile, options=options)
+    bare = simulate(plain, plain.start(), table, profile=profile, options=options)[0]
+    gatherer = MotionGatherer(table)
+    vibration = np.concatenate([w.motion.vibration for w in gatherer.push(SampleBlock(imu, joints)) + gatherer.finish() if w.kind == 'static'])
+    assert np.count_nonzero(vibration.min(axis=1) > 0.005) >= 3 and np.count_nonzero(vibration.max(axis=1) < 1e-4) >= 1
+    added = (imu.force_s - bare.force_s).mean(axis=0)
+    np.testing.assert_allclose(added, size * BandVariance().of(0.01, imu.force_s).mean(axis=0), rtol=0.1)
+    time = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9
+    live = answered(model, values, table, motion=profile.at(time[:900]), time=time[:900], options=options)
+    np.testing.assert_allclose(live[0], imu.force_s[:900], atol=1e-12)
 
 
 def test_compensation_live_and_of_a_recording_take_the_rectification_out():

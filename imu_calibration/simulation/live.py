@@ -1,20 +1,20 @@
 """A simulated table with an IMU on it, block after block: what a live simulator publishes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import warped_reference
-from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.effects.forward_equations import clip
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.simulation.hidden_causes import Cause, Felt
 from imu_calibration.simulation.sensor_noise import quantise, read_encoders
-from imu_calibration.simulation.session import SimulationOptions, branch_at, temperature_at
+from imu_calibration.simulation.session import SimulationOptions, answered, temperature_at
 from imu_calibration.simulation.table_controller import TableController
 
 TEMPERATURE_RATE = 1.0
@@ -99,12 +99,11 @@ class LiveSimulation:
 
     def _answered(self, time, motion):
         """Return what the sensors answer without noise."""
-        motion = replace(motion, thermal_branch=branch_at(time, self.options))
-        answered = predict(self.model, self.values, self.table, motion=motion, temperature_c=temperature_at(time, self.options))
+        force, rate = answered(self.model, self.values, self.table, motion=motion, time=time, options=self.options)
         if not self.causes:
-            return answered
+            return force, rate
         truth = self._truth(np.zeros(len(time), np.int64), motion)
-        felt = Felt(truth.force_s, truth.rate_s, *answered)
+        felt = Felt(truth.force_s, truth.rate_s, force, rate)
         for cause in self.causes:
             felt = cause(felt)
         return felt.force, felt.rate

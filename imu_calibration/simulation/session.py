@@ -8,9 +8,11 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.thermal_branch import HALF_WIDTH
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.simulation.bench_machine import hum_and_variance
 from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders
 
@@ -118,9 +120,19 @@ def _outputs(model, values, table, profile, time, options):
     parts = []
     for start in range(0, len(time), BLOCK):
         now = time[start:start + BLOCK]
-        motion = replace(profile.at(now), thermal_branch=branch_at(now, options))
-        parts.append(predict(model, values, table, motion=motion, temperature_c=temperature_at(now, options)))
+        parts.append(answered(model, values, table, motion=profile.at(now), time=now, options=options))
     return tuple(np.concatenate(sensor) for sensor in zip(*parts))
+
+
+def answered(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion, time: np.ndarray,
+             options: SimulationOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the sensors answer without noise, each (n, 3): to motion, warm-up, and a machine where biases follow vibration."""
+    motion, hum = replace(motion, thermal_branch=branch_at(time, options)), 0.0
+    if model.uses('vibration'):
+        hum, variance = hum_and_variance(time, options.imu_rate)
+        motion = replace(motion, vibration=variance)
+    force, rate = predict(model, values, table, motion=motion, temperature_c=temperature_at(time, options))
+    return force + hum, rate
 
 
 def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
