@@ -7,6 +7,7 @@ import pytest
 
 from imu_calibration.beyond import regimes
 from imu_calibration.beyond.blocks import RestBlocks
+from imu_calibration.beyond.fitting import BlockFits
 from imu_calibration.beyond.regime_variables import Variable, ranged
 from imu_calibration.estimation.noise_model import BiasProcess
 
@@ -42,6 +43,14 @@ def test_noise_sits_nowhere(monkeypatch):
 def test_of_what_scatters_the_shortest_part_that_holds_nearly_all_is_told():
     excess = np.array([0.0, 1.0, 30.0, 60.0, 8.0, 1.0, 500.0])
     assert regimes._tightened([1, 2, 3, 4, 5], np.arange(7), excess) == [2, 3, 4]
+
+
+@pytest.mark.parametrize(('excess', 'axes'), [((90.0, 309.0, 42.0), ('y',)), ((900.0, 309.0, 42.0), ('x', 'y')), ((20.0, 3.0, 0.0), ('x',)), ((0.0,) * 3, ())])
+def test_an_axis_carries_a_rest_that_is_above_noise_or_the_strongest(excess, axes):
+    fits = BlockFits.__new__(BlockFits)
+    fits.blocks = SimpleNamespace(variance=np.ones((600, 3)), locked=np.zeros(600, bool))
+    fits._excess = lambda: np.array(excess)
+    assert fits.axes() == axes
 
 
 def regime(name, cost, share=0.9, offset=True):

@@ -14,6 +14,8 @@ WIDE = 1e6
 RESAMPLES = 500
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis carries a rest too."""
+ABOVE_NOISE = 3.0
+"""Standard deviations above noise that it has then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +79,11 @@ class BlockFits:
 
     def axes(self) -> tuple[str, ...]:
         """Return the axes that carry what the model leaves, the strongest first: in the windows that choose, in plain squares."""
-        excess = self._excess() * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
-        return tuple(AXES[k] for k in np.argsort(-excess) if excess[k] > LEAST_OF_AXIS * excess.max() > 0)
+        excess = self._excess()
+        noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
+        squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
+        return tuple(AXES[k] for k in np.argsort(-squares)
+                     if squares[k] > LEAST_OF_AXIS * squares.max() and excess[k] > min(noise, 0.99 * excess.max()))
 
     @property
     def sigma(self) -> float:

@@ -131,6 +131,7 @@ BEYOND = _of(
     ('a finding that a formula does without stays', 'inquiry.py', 'if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):', 'if False:',
      'test_beyond_catalogue.py'),
     ('a place is known to its bins only', 'regimes.py', 'return regime if other is None or', 'return regime if True or', 'test_regimes.py'),
+    ('an axis of noise carries a rest', 'fitting.py', 'ABOVE_NOISE = 3.0', 'ABOVE_NOISE = 0.0', 'test_regimes.py'),
     ('of what scatters the whole range is told', 'regimes.py', 'NEARLY_ALL = 0.95', 'NEARLY_ALL = 1.0', 'test_regimes.py'),
     ('a place is no reason to withdraw a name', 'inquiry.py', 'return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None',
      'return None', 'test_beyond_catalogue.py'),
