@@ -114,8 +114,9 @@ def superseded(found: Examination) -> list[Question]:
 
     A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside
     a wrong name; a step when it is warm looks like a curve of the temperature. So each finding is left out once, in all sensors on which
-    it acts, and counts where the windows held out miss it beside what stands in for it. That is asked where a finding leaves a rest; of
-    what follows the temperature always: what settles, or steps, while the sensor warms up looks like it so well that hardly a rest stays.
+    it acts, and counts where the windows held out miss it beside what stands in for it: the formula of what all findings leave, one of what
+    is left without it, or the places of that. That is asked where a finding leaves a rest; of what follows the temperature always: what
+    settles, or steps, while the sensor warms up looks like it so well that hardly a rest stays.
     """
     return [question for question in found.named if _done_without(found, question)]
 
@@ -124,15 +125,17 @@ def _done_without(found, question):
     """Return whether a finding takes hardly anything off the rest of its sensors beside what stands in for it in some of them."""
     sensors = sensors_of(question.effect)
     warm = 'temperature' in question.effect.needs
-    if not warm and not any(found.rests[sensor].significant or found.proposal(sensor) for sensor in sensors):
+    asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposal(sensor)]
+    if not asked:
         return False
     others = [other for other in found.named if other is not question]
     kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
     alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
-    for stand_in in (lambda sensor: _formula(found, sensor, left_out[sensor] if warm else None),
-                     lambda sensor: _places(found, sensor, others) if warm or found.rests[sensor].significant else None):
+    for stand_in in (lambda sensor: _columns(found, sensor, found.proposal(sensor)),
+                     lambda sensor: _columns(found, sensor, propose(found.blocks[sensor], found.attempt, left_out[sensor])),
+                     lambda sensor: _places(found, sensor, others)):
         beside = dict(alone)
-        for sensor in sensors:
+        for sensor in asked:
             columns = stand_in(sensor)
             if columns is not None:
                 beside[sensor] = left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
@@ -141,13 +144,11 @@ def _done_without(found, question):
     return False
 
 
-def _formula(found, sensor, left_out):
-    """Return the columns of a formula for what all findings leave in a sensor, or `left_out` where given; shape (b, k, 3), or None."""
-    blocks, proposal = found.blocks[sensor], found.proposal(sensor)
-    if proposal is None and left_out is not None:
-        proposal = propose(blocks, found.attempt, left_out)
+def _columns(found, sensor, proposal):
+    """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
     if proposal is None:
         return None
+    blocks = found.blocks[sensor]
     groups = [group for effect in proposal.effects for group in effect.groups]
     known = {'temperature_ref_c': found.attempt.recording.model.temperature_ref_c}
     means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
