@@ -15,6 +15,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
 from worlds import physics, physics_table
+from worlds.hiding import options_of
 from worlds.physics import TABLES, Session, make_session
 from worlds.physics_draw import EFFECTS, OUTSIDE, G
 from worlds.physics_sensor import Triad, low_pass
@@ -139,7 +140,8 @@ def test_without_effects_the_readings_are_bias_plus_matrix_times_true():
 
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_touches_only_its_own_sensor(name):
-    before, after = clean(), clean({name: None})
+    options = options_of(name)   # a machine, for what follows its vibration
+    before, after = clean(**options), clean({name: None}, **options)
     change = [np.abs(getattr(after.imu, part) - getattr(before.imu, part)).max() for part in ('force_s', 'rate_s')]
     # An axis that passes beside the others moves the sensor to another point, not to another attitude.
     expected = ((True, False) if name.startswith(('accel', 'lever', 'table', 'axis_offset')) else
