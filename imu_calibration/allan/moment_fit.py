@@ -11,7 +11,6 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import nnls
 
 from imu_calibration.allan.between_parts import Parts
 from imu_calibration.allan.processes import NoiseProcess, gauss_markov
@@ -121,6 +120,8 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
         Coefficients that the first weights are made with.
 
     """
+    from scipy.optimize import nnls  # here, because it takes long to import
+
     design, tensor, target = moments.design(processes), moments.tensor(processes), moments.target
     free = np.array([k for k in range(len(processes)) if k not in (fixed or {})], int)
     values = _first_guess(design, target, moments) if start is None else np.array(start, float)
@@ -183,6 +184,8 @@ def _rounded(time):
 
 def _first_guess(design, target, moments):
     """Return coefficients that follow the curve on a logarithmic scale, more closely at short averaging times."""
+    from scipy.optimize import nnls
+
     weight = 1.0 / (target * np.sqrt(moments.scales.tau[moments.used]))
     values = nnls(design * weight[:, None], target * weight)[0]
     return np.maximum(values, 1e-6 * np.min(target[:, None] / design, axis=0))

@@ -10,7 +10,6 @@ should be: zero and infinity can belong to it.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import gammainc, gammaincc, ndtr
 
 from imu_calibration.allan.moment_fit import MomentFit, Moments, Whitener, fit_processes, fit_with_time
@@ -209,6 +208,8 @@ def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
 
 def _crossing(function, start, step):
     """Return where a positive function becomes negative, from `start` on by growing steps of the logarithm."""
+    from scipy.optimize import brentq  # here, because it takes long to import
+
     if not function(start) > 0:
         return start
     near, far = np.log(start), np.log(start) + 2.0 * step

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import svd
-from scipy.stats import chi2
 
 from imu_calibration.beyond.blocks import RestBlocks
 from imu_calibration.beyond.grammar import Formula
+from imu_calibration.chances import chi2_sf
 from imu_calibration.effects.expressions import array_function, read
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.selection.search import FAMILY_WISE, TIE
@@ -96,7 +96,7 @@ class FormulaSearch:
         price = 2.0 * counts
         order = np.argsort(price - gains)
         likeliest = order[0]
-        p_value = min(1.0, float(chi2.sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas))
+        p_value = min(1.0, float(chi2_sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas))
         if p_value > FAMILY_WISE or gains[likeliest] <= price[likeliest]:
             return None
         dof = max(3 * len(self._rest[0]) - sum(self.known), 1)

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
+from imu_calibration.chances import f_sf
 from imu_calibration.segmentation.window import Window
 
 LOWEST, HIGHEST_ORDER = 4, 64
@@ -77,7 +77,7 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     scatter = about / (count - 1)[:, None, None, None]
     t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0])
     degrees = (count - 2)[:, None]
-    p_value = f_distribution.sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
+    p_value = f_sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
     wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
     power = np.abs(wave)**2
     return Orders(order, 2 * np.abs(wave), p_value, power / np.median(power, axis=0), _alike(number, sums, weight, wave))

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from imu_calibration.beyond.blocks import RestBlocks
 from imu_calibration.beyond.regime_variables import FEWEST, variables_of
+from imu_calibration.chances import f_sf
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 
@@ -190,7 +190,7 @@ def _tested_scatter(left, inside, outside, windows):
     energy = [float((left[part]**2).sum()) for part in (inside, outside)]
     ratio = (energy[0] / inside.sum()) / max(energy[1] / outside.sum(), 1e-300)
     excess = [max(e - part.sum(), 0.0) for e, part in zip(energy, (inside, outside))]
-    return excess[0] / max(sum(excess), 1e-300), float(f_distribution.sf(ratio, *windows))
+    return excess[0] / max(sum(excess), 1e-300), float(f_sf(ratio, *windows))
 
 
 def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows: int) -> tuple[float, float]:
@@ -213,7 +213,7 @@ def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows
     after = _solved(_wider(rows, mark), _for_one_more(prior))[1]
     dof = max(n_windows - rows.shape[1], 3)
     ratio = max(before - after, 0.0) / max(after / len(rows), 1.0)
-    return 1.0 - max(after - len(rows), 0.0) / max(before - len(rows), 1e-300), float(f_distribution.sf(ratio, 1, dof))
+    return 1.0 - max(after - len(rows), 0.0) / max(before - len(rows), 1e-300), float(f_sf(ratio, 1, dof))
 
 
 def _wider(rows, mark):

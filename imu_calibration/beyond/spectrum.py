@@ -4,8 +4,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import detrend
-from scipy.stats import binom
 
 from imu_calibration.beyond.blocks import residuals
 from imu_calibration.beyond.orders import FEWEST_SAMPLES, MOST, OUT, long_enough, orders_of
@@ -145,6 +143,8 @@ def _cut(rest, longest):
 
 def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None) -> Iterator[Tone]:
     """Yield the Tone of each axis that stands out most, where one does; its p-value counts frequencies only."""
+    from scipy.stats import binom  # here, because it takes long to import
+
     every = list(stretches)
     if not every:
         return
@@ -175,6 +175,8 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
 
 def _powers(rest, size, inside):
     """Return (power, power around it by octaves, both shape (n, 3), which frequencies have enough around them)."""
+    from scipy.signal import detrend  # here, because it takes long to import
+
     window = np.hanning(len(rest))
     power = np.abs(np.fft.rfft(detrend(rest, axis=0) * window[:, None], size, axis=0))**2 / (window**2).sum()
     around, inside = np.ones_like(power), inside.copy()

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
+from imu_calibration.chances import f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
@@ -101,7 +101,7 @@ def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None,
         k, n = columns.shape[1], rows.sum()
         share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
         layers = residual.shape[1]
-        p_value = f_distribution.sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1))
+        p_value = f_sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1))
         if p_value < ALPHA and share > max(best[1], 0.15):
             best = (name, float(share))
     return best

@@ -4,9 +4,9 @@ from functools import cached_property
 from typing import Sequence
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from imu_calibration.by_hand.effect_rows import Block, HandSpace
+from imu_calibration.chances import f_sf
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.whitening import Whitening
@@ -108,7 +108,7 @@ class HandEvidence(Evidence):
         spare = sum(map(len, concerned)) - int(in_use)
         if spare < 3 or squares[1] <= 0:
             return 1.0
-        return float(f_distribution.sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare))
+        return float(f_sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare))
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """Return how many combinations of the added columns the smaller choice cannot imitate."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.stats import chi2
 
 from imu_calibration.beyond.inquiry import inquire
 from imu_calibration.calibration.calibrate import conclude, solve_recordings
@@ -20,6 +19,7 @@ from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import Demand, ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.chances import chi2_sf
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -213,7 +213,7 @@ def stands_out(solution: Solution, question: Question) -> bool:
     far = (solution.values - make_prior(solution.model).mean)[at]
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
     known = sizes > SURE * sizes[-1]   # arms of three sensors add up to nothing by convention
-    return bool(chi2.sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
+    return bool(chi2_sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:

@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from imu_calibration.chances import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
@@ -112,7 +111,7 @@ def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[
 
 def fisher(p_values: list[float]) -> float:
     """Return the p-value of several independent ones together (Fisher)."""
-    return float(chi2.sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
+    return float(chi2_sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
 
 
 def block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
@@ -206,9 +205,9 @@ class Waves:
         dof = mean**2 / spread
         if fast.sum() < fast_dof:
             mean = mean * fast.sum() / fast_dof
-            p_value = f_distribution.sf(score / mean, dof, fast_dof)
+            p_value = f_sf(score / mean, dof, fast_dof)
         else:
-            p_value = chi2.sf(score / mean * dof, dof)
+            p_value = chi2_sf(score / mean * dof, dof)
         return float(p_value), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
 
     def scatter(self, group: np.ndarray) -> tuple[float, np.ndarray]:
@@ -216,7 +215,7 @@ class Waves:
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
         single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
-        return float(chi2.sf(ratio * moved.size, moved.size)), 1.0 + UNSEEN * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+        return float(chi2_sf(ratio * moved.size, moved.size)), 1.0 + UNSEEN * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
 
     def _inverse(self, group):
         return np.array([inverse_normal(expected) for expected in self.expected[:, group][:, :, group]])

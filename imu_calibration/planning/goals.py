@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.stats import chi2, ncx2, norm
 
+from imu_calibration.chances import chi2_isf, norm_ppf
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
@@ -129,7 +129,9 @@ def enough(size: int, questions: int) -> float:
     Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
     logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
     """
-    threshold = chi2.isf(FAMILY_WISE / questions, size)
+    from scipy.stats import ncx2  # here, because it takes long to import
+
+    threshold = chi2_isf(FAMILY_WISE / questions, size)
     named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= POWER)
-    quantile = norm.ppf(POWER)
+    quantile = norm_ppf(POWER)
     return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))

@@ -1,7 +1,6 @@
 """Where the joints may stand: attitudes spread over all that the chain reaches within its limits."""
 
 import numpy as np
-from scipy.stats import qmc
 
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
@@ -34,6 +33,8 @@ def up_at(table: Table, position: np.ndarray) -> np.ndarray:
 
 def candidates(limits: MotionLimits) -> np.ndarray:
     """Return positions to choose from, the first that nearest to zero, shape (n, n_joints)."""
+    from scipy.stats import qmc  # here, because it takes long to import
+
     lower, upper = reachable(limits)
     home = np.clip(np.zeros(len(limits)), limits.lower, limits.upper)
     spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)

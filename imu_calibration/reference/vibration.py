@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 CORNER = 5.0
 """
@@ -47,6 +46,8 @@ class BandVariance:
 
     def of(self, period: float, force_s: np.ndarray) -> np.ndarray:
         """Return the variances after each of the next samples, shape (n, 3): the same as `push` one by one."""
+        from scipy.signal import lfilter  # here, because it takes long to import
+
         if not len(force_s):
             return np.zeros((0, 3))
         if not self._inputs:

@@ -6,9 +6,8 @@ from functools import cached_property
 from typing import Sequence
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
+from imu_calibration.chances import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
@@ -212,7 +211,7 @@ class WindowEvidence(Evidence):
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
         fall = self.loss(smaller) - self.loss(larger)
-        return float(chi2.sf(max(fall, 0.0), len(larger) - len(smaller)))
+        return float(chi2_sf(max(fall, 0.0), len(larger) - len(smaller)))
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
@@ -240,7 +239,7 @@ class WindowEvidence(Evidence):
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
         t_squared = ((directions.T @ (values[places] / sd))[told]**2 / sizes[told]).sum()
-        return float(fisher.sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
+        return float(f_sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
 
 
 def _squares(parts, rows):

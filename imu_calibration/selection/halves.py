@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+
+from imu_calibration.chances import chi2_sf
 
 DISAGREE = 1e-4
 """Chance that halves which agree are taken to disagree."""
@@ -35,4 +36,4 @@ def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarr
     apart = float(difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference))
     value = whole[0][at]
     explained = float(value @ np.linalg.solve(whole[1][np.ix_(at, at)], value))
-    return bool(chi2.sf(apart, len(at)) > DISAGREE or apart < APART * explained)
+    return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < APART * explained)

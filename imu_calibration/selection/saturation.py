@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Sequence
 
 import numpy as np
-from scipy.stats import norm
 
+from imu_calibration.chances import norm_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
@@ -131,7 +131,7 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
     expected = np.concatenate([np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape) for w, p in zip(windows, predicted)])
     level = np.abs(output).max()
     clipped = np.abs(output) >= level * (1 - 1e-12)
-    beyond = norm.sf((level - np.abs(expected)) / noise_sd)
+    beyond = norm_sf((level - np.abs(expected)) / noise_sd)
     n_expected = float(beyond.sum())
     if n_expected < LEAST_CLIPPED or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
         return None

@@ -1,0 +1,33 @@
+"""The tails of distributions are those of scipy.stats, to the last bit: what is significant does not depend on which of them is asked."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from imu_calibration.chances import chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
+
+RNG = np.random.default_rng(1)
+VALUES = np.concatenate([RNG.exponential(10.0, 300), RNG.normal(0.0, 3.0, 200), [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan]])
+CHANCES = RNG.uniform(1e-12, 1.0, 200)
+DOFS = (0.5, 1, 2, 7, 120, 1e5, 0, -1)
+
+
+@pytest.mark.parametrize('dof', DOFS)
+def test_chi_square_and_f_have_the_tails_of_scipy_stats(dof):
+    np.testing.assert_array_equal(chi2_sf(VALUES, dof), stats.chi2.sf(VALUES, dof))
+    assert chi2_sf(3.0, dof) == stats.chi2.sf(3.0, dof) or dof <= 0
+    for below in DOFS:
+        np.testing.assert_array_equal(f_sf(VALUES, dof, below), stats.f.sf(VALUES, dof, below))
+    if dof > 0:
+        np.testing.assert_array_equal(chi2_isf(CHANCES, dof), stats.chi2.isf(CHANCES, dof))
+
+
+def test_gaussian_numbers_have_the_tails_of_scipy_stats():
+    np.testing.assert_array_equal(norm_sf(VALUES), stats.norm.sf(VALUES))
+    np.testing.assert_array_equal(norm_ppf(CHANCES), stats.norm.ppf(CHANCES))
+
+
+def test_each_value_has_its_own_degrees_of_freedom():
+    dof = RNG.integers(0, 9, len(VALUES))
+    np.testing.assert_array_equal(chi2_sf(VALUES, dof), stats.chi2.sf(VALUES, dof))
+    np.testing.assert_array_equal(f_sf(VALUES, 2, dof), stats.f.sf(VALUES, 2, dof))
