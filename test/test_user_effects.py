@@ -11,11 +11,15 @@ import pytest
 
 from imu_calibration import documents, files
 from imu_calibration.cli.main import main
+from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.effects.expressions import PLACES, read
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.term import term
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.simulation.session import hidden_effect
 
 MINE = """
 effects:
@@ -79,6 +83,19 @@ def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, said):
     with pytest.raises(InputError) as caught:
         files.read_effects(tmp_path / 'wrong.yaml')
     assert said in str(caught.value) and 'wrong.yaml' in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text, shown', [('A remark without its stop', 'A remark without its stop.'), ('Said in full.', 'Said in full.'),
+                                         ('', 'The gyroscope output follows f_x.')])
+def test_what_is_said_of_it_is_a_sentence(text, shown):
+    effect = term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text=text)
+    assert sentence(effect, {'gyroscope.mine.x': (2.7902e-4, 3.1e-7, 'strange')}, None) == f'{shown} Its size is 0.00027902 +- 0.00000031 strange.'
+
+
+def test_one_of_unknown_size_cannot_be_simulated_by_name_and_what_to_write_is_said():
+    catalogue = CATALOGUE.with_effects(term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text='Mine.'))
+    with pytest.raises(InputError, match='its size is not known; .* or say in its definition how large'):
+        hidden_effect(SensorModel(catalogue=catalogue), 'mine')
 
 
 def test_a_choice_may_be_a_mapping_too():

@@ -13,7 +13,7 @@ from imu_calibration.effects.term import term
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH
-from imu_calibration.units import for_people, significant
+from imu_calibration.units import for_people, with_sd
 
 LEAST_SHARE = 0.6
 """Share of the rest that a formula removes from held-out windows at least; less is a story."""
@@ -240,7 +240,7 @@ def _shown(formula: Formula) -> str:
 def _size(effect, values, sd):
     k = int(np.argmax(np.abs(values)))
     factor, unit = for_people(effect.unit_of(k))
-    return f'{significant(values[k] * factor)} ± {significant(sd[k] * factor, 2)} {unit} on {AXES[k]}'
+    return f"{' ± '.join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}"
 
 
 def _motion(effects):

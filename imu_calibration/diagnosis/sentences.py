@@ -3,14 +3,13 @@
 from collections.abc import Collection, Sequence
 from typing import Any
 
-import numpy as np
-
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Candidate
 from imu_calibration.effects.base import Effect
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
+from imu_calibration.units import with_sd
 
 READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'),
             'm': (1e-3, 'mm'),
@@ -57,8 +56,7 @@ def _percent(share):
 
 def _size(value, sd, unit):
     step, name = READABLE.get(unit, (1.0, unit))
-    digits = max(0, 1 - int(np.floor(np.log10(max(sd / step, 1e-12)))))
-    return f'{value / step:.{min(digits, 6)}f} +- {sd / step:.{min(digits, 6)}f} {name}'
+    return f"{' +- '.join(with_sd(value / step, sd / step))} {name}"
 
 
 def readable(value: float, unit: str) -> str:

@@ -92,7 +92,8 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
                  'prior': (0.0, 0.0, 0.0, time_constant), 'prior_sd': (spread, spread, spread, 10 * time_constant / 3)}
     return Effect(
-        name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason, explanation=text, needs=needs,
+        name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason,
+        explanation=_explanation(text, sensor, columns), needs=needs,
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINTS} else 'exact', groups=(group,),
         coefficients=Amplitudes(name, name, len(columns) == 3, settles),
@@ -100,6 +101,12 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
+
+
+def _explanation(text, sensor, columns):
+    """Return the text as a sentence; what no text explains is said by its columns."""
+    text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
+    return text if text.endswith(('.', '!', '?')) else f'{text}.'
 
 
 def from_definition(name: str, definition: dict[str, Any]) -> Effect:

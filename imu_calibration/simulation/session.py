@@ -69,7 +69,9 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
-        raise InputError(f"effect '{name}' cannot be simulated by name; simulate with a calibration that contains it", key='calibration')
+        or_else = ', or say in its definition how large it may be (largest)' if effect.definition else ''
+        raise InputError(f"effect '{name}' cannot be simulated by name, for its size is not known; "
+                         f'simulate with a calibration that contains it{or_else}', key='calibration')
     rng = np.random.default_rng([seed, 11])
     values = share * effect.largest * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
     if effect.nonnegative:
