@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -75,7 +76,8 @@ class WindowPredictor:
         model = self.coordinates.model
         temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
         designs = {sensor: columns(model, sensor, self.table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
-        windows = iter([self._window(cut, {s: designs[s][a:b] for s in SENSORS})
+        wander = cache(self._wander)   # many motions last as long as others, forth and back at the least
+        windows = iter([self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander)
                         for cut, a, b in zip(flat, edges, edges[1:], strict=False)])
         return [[next(windows) for _ in one] for one in cuts]
 
@@ -92,17 +94,20 @@ class WindowPredictor:
                 yield Profile('', (segment,)).at(time), kind, begin + lost + seconds / 2, segment.duration, seconds
             begin += segment.duration
 
-    def _window(self, cut, designs):
+    def _wander(self, sensor, count, seconds):
+        """Return how the bias wanders within a window: variances and the directions that they belong to."""
+        return np.linalg.eigh(self.noise[sensor].wander_within(((np.arange(count) + 0.5) / count - 0.5) * seconds))
+
+    def _window(self, cut, designs, wander_of):
         motion, kind, middle, length, seconds = cut
         samples, count = seconds * self.rate, len(motion)
-        offsets = ((np.arange(count) + 0.5) / count - 0.5) * seconds
         means, variance, within = {}, {}, {}
         for sensor, design in designs.items():
             slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
             means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
             within[sensor] = np.zeros((slope.shape[2],) * 2)
             reference = noise.reference.variance([kind], np.array([seconds]))[0]
-            wander, turned = np.linalg.eigh(noise.wander_within(offsets))
+            wander, turned = wander_of(sensor, count, seconds)
             rows, ones = turned.T @ design, turned.sum(axis=0)
             for axis in range(3):
                 weight = 1 / (noise.low_variance[axis] * count / samples + wander)
