@@ -29,7 +29,9 @@ def to_text(document: dict[str, Any]) -> str:
     """
     import yaml
 
-    class Dumper(yaml.SafeDumper):
+    base: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+    class Dumper(base):
         """Writes lists of scalars on one line and floats with all their digits."""
 
         def ignore_aliases(self, _data):

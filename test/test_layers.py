@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -52,9 +53,15 @@ def core_modules():
     return [path for path in modules('imu_calibration') if path.relative_to(ROOT).with_suffix('').parts[1] not in EDGE]
 
 
+@lru_cache(maxsize=None)
+def parsed(path):
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
 def imports(path, top_level_only=False):
     """Absolute names of what `path` imports, at any depth or at import time only."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     package = module_name(path).split('.')
     if path.name != '__init__.py':
         package = package[:-1]

@@ -11,6 +11,10 @@ import numpy as np
 import yaml
 
 
+def safe_load(text):
+    return yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+
+
 def skew(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
@@ -22,7 +26,7 @@ def kalibr(text, force, rate, alpha):
     ethz-asl/kalibr, IccSensors.py, IccScaledMisalignedSizeEffectImu.addAccelerometerErrorTerms and
     IccScaledMisalignedImu.addGyroscopeErrorTerms, with C_i_b = I, r_b = 0.
     """
-    data = yaml.safe_load(text)
+    data = safe_load(text)
     accel, gyro = data['accelerometers'], data['gyroscopes']
     m, mg, c, ma = (np.array(x) for x in (accel['M'], gyro['M'], gyro['C_gyro_i'], gyro['A']))
     inner = force.copy()
@@ -40,7 +44,7 @@ def openvins(text, am, wm):
     rpng/open_vins: the file is read by VioManagerOptions.h (print_and_load_state), which inverts Tw and Ta and keeps the lower (model
     kalibr) or upper (rpng) triangle of the inverse column by column; State.h (Dm, Tg) builds the matrices; Propagator.cpp applies them.
     """
-    chain = yaml.safe_load(text.split('\n', 1)[1])['imu0']
+    chain = safe_load(text.split('\n', 1)[1])['imu0']
     get = {name: np.array(chain.get(name, default)) for name, default in
            (('Tw', np.eye(3)), ('Ta', np.eye(3)), ('R_IMUtoACC', np.eye(3)), ('R_IMUtoGYRO', np.eye(3)), ('Tg', np.zeros((3, 3))))}
     dw, da = np.linalg.inv(get['Tw']), np.linalg.inv(get['Ta'])
@@ -127,9 +131,9 @@ def autoware(text, accel, gyro):
 
     autowarefoundation/autoware_universe, imu_corrector_core.cpp (callback_imu).
     """
-    p = yaml.safe_load(text)['/**']['ros__parameters']
+    p = safe_load(text)['/**']['ros__parameters']
     told = next(line for line in text.splitlines() if 'gyro_scale_input geometry_msgs' in line)
-    scale = yaml.safe_load(told[told.index('"') + 1:told.rindex('"')])['vector']
+    scale = safe_load(told[told.index('"') + 1:told.rindex('"')])['vector']
     if p['on_off_correction']['correct_for_static_bias'] and not p['on_off_correction']['correct_for_dynamic_bias']:
         gyro = gyro - [p[f'angular_velocity_offset_{a}'] for a in 'xyz']
     return accel, gyro / [scale[a] for a in 'xyz']
@@ -137,7 +141,7 @@ def autoware(text, accel, gyro):
 
 def imu_calib(text, accel, gyro):
     """Return corrected accel, and gyro as it is; dpkoch/imu_calib, accel_calib.cpp (loadCalib, applyCalib)."""
-    node = yaml.safe_load(text)
+    node = safe_load(text)
     matrix = np.array([[node['SM'][3 * i + j] for j in range(3)] for i in range(3)])
     return matrix @ accel - node['bias'], gyro
 
@@ -158,7 +162,7 @@ def spread_in_a_second(name, text, dt):
     """
     steps = 1.0 / dt
     head = text.split('\n', 1)[1] if text.startswith('%YAML') else text
-    c = yaml.safe_load(head) if name != 'basalt' else json.loads(text)['value0']
+    c = safe_load(head) if name != 'basalt' else json.loads(text)['value0']
     pairs = {'accelerometer': ('acc', 'Acc'), 'gyroscope': ('gyr', 'Gyr')}
     if name == 'kalibr':       # IccSensors.py: noise density * sqrt(rate) is the sd of a sample; the walk enters a continuous spline
         found = {s: ((c[f'{s}_noise_density'] * c['update_rate']**0.5 * dt)**2 * steps, c[f'{s}_random_walk']**2) for s in pairs}
