@@ -8,7 +8,7 @@ import pytest
 from imu_calibration.diagnosis import diagnose as on_a_table
 from imu_calibration.diagnosis.by_hand import diagnose as by_hand
 from imu_calibration.diagnosis.findings import finding
-from imu_calibration.diagnosis.sentences import candidates_of, sentence
+from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, sentence
 from imu_calibration.diagnosis.separating_motion import motions_of_one_joint
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -77,6 +77,13 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
     assert set(made[1].parameters) == {f'accelerometer.accel_cubic.{axis}' for axis in 'xyz'}
 
 
+@pytest.mark.parametrize('agree, verdict', [(True, LEAVES_MOST), (False, DISAGREED)])
+def test_what_is_not_named_for_its_windows_disagree_is_not_said_to_leave_the_rest(agree, verdict):
+    asked = []
+    rows = {row.effect: row.verdict for row in candidates_of(Search(), [], agree=lambda *those: asked.append(those) or agree)}
+    assert rows[FIRST.name] == verdict and ([FIRST], FIRST) in asked
+
+
 def test_both_diagnoses_put_findings_together_in_one_place():
     assert on_a_table.finding is by_hand.finding is finding
     assert on_a_table.candidates_of is by_hand.candidates_of is candidates_of
@@ -85,12 +92,13 @@ def test_both_diagnoses_put_findings_together_in_one_place():
 def test_what_explains_much_but_leaves_most_is_said():
     """An effect that explains thousands of nats is not passed over in silence because it may not be named."""
     from imu_calibration.diagnosis.result import Candidate
-    from imu_calibration.diagnosis.sentences import LEAVES_MOST
     from imu_calibration.diagnosis.workflow import nothing_named
 
     class Told:
         candidates = (Candidate('time_offset', 'reference', 4321.0, 0.0, 4321.0, 0.0, LEAVES_MOST),)
     assert 'time_offset explains much (4321 nats' in nothing_named(Told)
+    Told.candidates = (Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 163.0, 0.0, DISAGREED),)
+    assert 'gyro_delay explains much (163 nats' in nothing_named(Told) and 'the windows do not agree' in nothing_named(Told)
     Told.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
     assert nothing_named(Told).startswith('nothing found')
 

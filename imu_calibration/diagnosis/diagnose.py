@@ -105,7 +105,7 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named),
+    return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
                      tuple(found.not_testable),
                      baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),
                      residual_traces(windows, table, baseline, after=solution),

@@ -1,6 +1,6 @@
 """Findings as sentences that an engineer would write."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
@@ -21,6 +21,8 @@ READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), '
 
 LEAVES_MOST = 'refused: it leaves most of the unexplained where it was'
 """Verdict on an effect that is significant, but removes too small a share."""
+DISAGREED = 'refused: the windows do not agree on it'
+"""Verdict on an effect whose evidence is that of few windows, or of some against others."""
 
 
 def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
@@ -65,8 +67,13 @@ def readable(value: float, unit: str) -> str:
     return f'{value / step:.4g} {name}'
 
 
-def candidates_of(search: Search, named: Sequence[Question]) -> tuple[Candidate, ...]:
-    """Return every effect that a search asked about beside the findings, the strongest first; of a warm-up its best time constant."""
+def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[[Sequence[Question], Question], bool] | None = None,
+                  ) -> tuple[Candidate, ...]:
+    """
+    Return every effect that a search asked about beside the findings, the strongest first; of a warm-up its best time constant.
+
+    `agree(chosen, question)` says whether the windows agree on one of the chosen effects.
+    """
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:
         for mate, _ in search.class_mates(named, question):
@@ -76,9 +83,11 @@ def candidates_of(search: Search, named: Sequence[Question]) -> tuple[Candidate,
         if question.name in rows and rows[question.name].gain_alone >= alone.gain:
             continue
         beside = None if question.name in found else search.score(named, question)
+        verdict = verdict_of(question.name, alone, beside, found=found, mates=mates)
+        if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
+            verdict = DISAGREED
         rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, None if beside is None else beside.gain,
-                                        None if beside is None else beside.p_value,
-                                        verdict_of(question.name, alone, beside, found=found, mates=mates))
+                                        None if beside is None else beside.p_value, verdict)
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 

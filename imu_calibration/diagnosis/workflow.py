@@ -17,7 +17,7 @@ from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
-from imu_calibration.diagnosis.sentences import LEAVES_MOST
+from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.lags import total_lags
 from imu_calibration.effects.named_models import BARE
@@ -28,6 +28,10 @@ from imu_calibration.units import for_people, significant
 
 MUCH = 100.0
 """Gain of held-out log likelihood from which an effect that is refused is worth a word, nats."""
+WHY_NOT = {LEAVES_MOST: 'leaves most of the rest, so that something else may be the cause of both',
+           DISAGREED: 'the windows do not agree on it: a few carry it, or some speak against it; '
+           'more windows of the same motions would settle it'}
+"""Verdict on what explains much -> why it is not named."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +203,12 @@ def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:
-    """Return why nothing was named: nothing explains more than noise, or what explains much leaves most of the rest."""
-    much = [row for row in diagnosis.candidates if row.verdict == LEAVES_MOST and row.gain_alone > MUCH]
+    """Return why nothing was named: nothing explains more than noise, or what explains much is not sure to be the cause."""
+    much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
     if not much:
         return 'nothing found: no effect of the catalogue explains more than noise does'
     return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
-            'but leaves most of the rest, so that something else may be the cause of both')
+            f'but {WHY_NOT[much[0].verdict]}')
 
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:
