@@ -13,6 +13,8 @@ SOAK_HOURS ?= 6
 # One thread per process: the tests run on two cores already, and sums come out in the same order every time.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Containers often ask for no bytecode: every node and command that a test starts, and pytest for every test file, would compile all anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 ifeq ($(ROS_DISTRO),jazzy)
 JAZZY := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
