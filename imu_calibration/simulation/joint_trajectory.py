@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import perm
 
 import numpy as np
 
@@ -47,7 +48,8 @@ class JointTrajectory:
         length = np.diff(self.time)[piece][:, None]
         share = (inside - self.time[piece])[:, None] / length
         coefficients = [coefficient[piece] for coefficient in self._coefficients]
-        motion = [_polynomial(coefficients, share, order) / length**order for order in range(4)]
+        powers = [share**degree for degree in range(len(coefficients))]
+        motion = [_polynomial(coefficients, powers, order) / length**order for order in range(4)]
         outside = (time < self.time[0]) | (time > self.time[-1])
         for derivative in motion[1:]:
             derivative[outside] = 0.0
@@ -67,13 +69,11 @@ class JointTrajectory:
         return p0, v0, a0, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
 
 
-def _polynomial(coefficients, share, order):
-    """Return the derivative of an order of the polynomial, by the share."""
+def _polynomial(coefficients, powers, order):
+    """Return the derivative of an order of the polynomial, by the share, of which `powers` are."""
     total = np.zeros_like(coefficients[0])
-    for degree, coefficient in enumerate(coefficients):
-        if degree >= order:
-            factor = np.prod(np.arange(degree - order + 1, degree + 1)) if order else 1.0
-            total = total + factor * coefficient * share**(degree - order)
+    for degree in range(order, len(coefficients)):
+        total = total + perm(degree, order) * coefficients[degree] * powers[degree - order]
     return total
 
 
