@@ -1,6 +1,7 @@
 """Causes that no catalogue holds: where the rest sits, the formula that it follows, and the way of that formula into a model."""
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from imu_calibration.beyond.blocks import rest_blocks
 from imu_calibration.beyond.fitting import BlockFits, share_interval, share_removed
 from imu_calibration.beyond.grammar import grammar
 from imu_calibration.beyond.proposals import propose
+from imu_calibration.beyond.regime_variables import variables_of
 from imu_calibration.beyond.regimes import find_regimes
 from imu_calibration.cli.main import main
 from imu_calibration.diagnosis.diagnose import diagnose
@@ -51,6 +53,36 @@ def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
     for formula in formulas:
         for column in formula.columns:
             assert ColumnGroup('c', (column,) if isinstance(column, str) else column).names, 'reads and speaks of something'
+
+
+def test_the_sense_of_a_rate_is_not_that_of_the_rate_of_the_earth():
+    """At rest the sign of a rate is that of 7.3e-5 rad/s, or of noise: a column of it would shake every bias there."""
+    texts = [text for formula in grammar(3, True, 300.0) for text in np.ravel(formula.columns)]
+    assert any('tanh(w_x' in text for text in texts) and any('tanh(joint_rate_1' in text for text in texts) and 'sign(f_x)' in texts
+    assert not any('sign(w' in text or 'sign(joint' in text for text in texts)
+
+
+@pytest.mark.parametrize('span, warms', [(None, False), (0.3, False), (4.0, True)])
+def test_a_temperature_that_stays_is_no_cause(span, warms):
+    _, blocks, _ = looked()
+    changed = {sensor: replace(of, ref=replace(of.ref, temperature_c=None if span is None else np.linspace(25.0, 25.0 + span, len(of.ref.rate_s))))
+               for sensor, of in blocks.items()}
+    for of in changed.values():
+        assert of.warms is warms
+        assert any('temperature' in str(formula.columns) for formula in proposals._grammar(of)) is warms
+        assert any('temperature' in variable.name for variable in variables_of(of, ('outer', 'middle', 'inner'))) is warms
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('kind, formula', [(None, None), ('gyro_cubic', 'w_z ** 3')])
+def test_a_recording_without_noise_is_judged_too(kind, formula):
+    """As of a simulator whose noise is off: no sample is taken for exact, and nothing is divided by nothing."""
+    cause = {'cause': Beyond(kind, 5)} if kind else {}
+    recording = record(5, None, 'none', through_bag=False, **cause)
+    found = diagnose(recording.windows, recording.table, recording.model)
+    assert not found.findings and not found.unexplained['accelerometer'].significant
+    told = found.unexplained['gyroscope'].proposal
+    assert (told and told.columns[0]) == formula
 
 
 def test_blocks_of_a_recording_that_hides_nothing_are_noise():

@@ -10,7 +10,7 @@ from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
-from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, explained_share
+from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, explained_share, variables
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -51,8 +51,13 @@ def test_the_finding_is_told_drawn_and_measured(result):
 
 def test_it_is_drawn_against_its_cause(result):
     finding = result.diagnosis.findings[0]
-    sensor, _, label, _ = cause_of(result.diagnosis.traces, finding)
+    sensor, _, label, _ = cause_of(result.diagnosis, finding)
     assert sensor == 'gyroscope' and label.startswith('specific force')
+
+
+def test_a_joint_goes_by_its_name(result):
+    labels = variables(result.diagnosis.traces, result.diagnosis.baseline.model.joint_names)
+    assert [label for label in labels if label.startswith('angle')] == ['angle of outer, deg', 'angle of middle, deg', 'angle of inner, deg']
 
 
 def test_the_document_and_the_calibration_agree(result):

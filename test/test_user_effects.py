@@ -92,6 +92,15 @@ def test_what_is_said_of_it_is_a_sentence(text, shown):
     assert sentence(effect, {'gyroscope.mine.x': (2.7902e-4, 3.1e-7, 'strange')}, None) == f'{shown} Its size is 0.00027902 +- 0.00000031 strange.'
 
 
+@pytest.mark.parametrize('z_of_y, said', [(5.0, 'Its size is 5.0 +- 1.0 strange (largest: y).'),
+                                          (1.5, 'Its size is known here in combinations only, none of its values by itself: ')])
+def test_what_cannot_be_told_from_another_is_no_size(z_of_y, said):
+    """Of an asymmetry on one axis that a recording holds against the bias, 40 +- 90 was told, and the 5 +- 1 of the other axis was not."""
+    effect = term('mine', sensor='gyroscope', column='w_x', unit='1', tolerance=1e-6, text='Mine.')
+    values = {f'gyroscope.mine.{axis}': (value, sd, 'strange') for axis, value, sd in zip('xyz', (40.0, z_of_y, 0.1), (90.0, 1.0, 3.0))}
+    assert said in sentence(effect, values, None)
+
+
 def test_one_of_unknown_size_cannot_be_simulated_by_name_and_what_to_write_is_said():
     catalogue = CATALOGUE.with_effects(term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text='Mine.'))
     with pytest.raises(InputError, match='its size is not known; .* or say in its definition how large'):

@@ -159,7 +159,8 @@ class TrendSearch:
             basis, triangle = np.linalg.qr(inverse @ (design / size))
             rest = inverse @ target
             along = basis.T @ rest
-            squares = float(rest @ rest - along @ along)
+            # An axis that stays on one step leaves nothing but rounding.
+            squares = max(float(rest @ rest - along @ along), np.finfo(float).eps * float(rest @ rest), np.finfo(float).tiny)
             freedom = len(target) - design.shape[1]
             cost = logs + 2 * np.log(np.abs(np.diag(triangle))).sum() + freedom * np.log(squares)
             fits.append((cost, triangle, along, squares / freedom))

@@ -10,6 +10,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
@@ -17,6 +18,7 @@ from imu_calibration.segmentation.window import Window, all_samples
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.noise_beside_effects import natural_processes
+from imu_calibration.selection.questions import TEMPERATURE_SPAN
 
 BLOCK = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
@@ -50,6 +52,11 @@ class RestBlocks:
     """Variance of a block's residual by the white noise, shape (b, 3)."""
     processes: tuple
     """How every bias moves (BiasProcess)."""
+
+    @property
+    def warms(self) -> bool:
+        """Whether the temperature is known and changes by as much as a thermal effect needs to show."""
+        return self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN)
 
     def means(self, rows: np.ndarray) -> np.ndarray:
         """Return means over the blocks of something known at the rows, shape (b, ...)."""
@@ -139,6 +146,7 @@ def _busier(windows, sensor, floor, kinds, judged):
     found = np.ones((len(windows), 3))
     own = np.array([window.noise_sd[place]**2 if len(window) > 8 else np.full(3, np.nan) for window in windows])
     still = np.nanmedian(own[judged & (kinds == 'static')], axis=0) if np.any(judged & (kinds == 'static')) else floor.white_variance
+    still = np.maximum(still, LEAST_NOISE[sensor]**2)
     for kind in np.unique(kinds[kinds != 'static']):
         most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
         found[kinds == kind] = np.clip(np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most)

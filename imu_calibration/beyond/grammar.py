@@ -12,6 +12,8 @@ ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
 """Harmonics per turn: of one joint, of two joints at once, of a joint times something else."""
 CONSTANTS = (0.07, 0.2, 0.6)
 """Time constants of what settles, as shares of the recording."""
+SOFT_SIGN = 'tanh({} / 0.005)'
+"""The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise, and would shake the bias there."""
 WARMTH = '(temperature_c - temperature_ref_c)'
 UNIT_OF = {'force': 'm/s^2', 'rate': 'rad/s', 'angular acceleration': 'rad/s^2', 'temperature': 'K', 'joint rate': 'rad/s', 'time': 's'}
 """Quantity -> unit that one factor of it has; angles, attitudes and what stands inside a function have none."""
@@ -87,6 +89,10 @@ def _atoms(*letters):
     return [(f'{letter}_{a}', (kinds[letter],)) for letter in letters for a in AXES]
 
 
+def _sense(text):
+    return SOFT_SIGN.format(text) if text.startswith('w') else f'sign({text})'
+
+
 def _times(*parts):
     """Return (text, factors) of a product, powers gathered."""
     texts, factors = [text for text, _ in parts], tuple(factor for _, own in parts for factor in own)
@@ -104,7 +110,7 @@ def _of_motion() -> Iterator:
     yield from _atoms('alpha')
     yield from (_times(*pair) for pair in product(_atoms('alpha'), felt))
     for text, own in felt:
-        for part in ((f'abs({text})', own), (f'sign({text})', ())):
+        for part in ((f'abs({text})', own), (_sense(text), ())):
             yield part
             yield from (_times(part, other) for other in felt if other[0] != text or part[1])
     for letter, name in (('f', 'force'), ('w', 'rate')):
@@ -120,7 +126,7 @@ def _slow(thermal: bool, duration: float) -> Iterator:
         yield from (_times(slow, entry) for degree in (1, 2) for entry in _monomials(degree))
         for text, own in _atoms('f', 'w'):
             yield _times(slow, (f'abs({text})', own))
-            yield _times(slow, (f'sign({text})', ()))
+            yield _times(slow, (_sense(text), ()))
     yield from (_times(*warm, *warm, entry) for entry in _monomials(1) if thermal)
 
 
@@ -148,7 +154,7 @@ def _of_joint_rates(n_joints):
     rates = [(f'joint_rate_{joint}', ('joint rate',)) for joint in range(1, n_joints + 1)]
     for text, own in rates:
         yield Formula((f'abs({text})',), own)
-        yield Formula((f'sign({text})',), ())
+        yield Formula((SOFT_SIGN.format(text),), ())
         yield Formula((f'{text} * abs({text})',), own * 2)
     yield from (Formula((text,), own) for degree in (1, 2)
                 for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree)))

@@ -140,7 +140,7 @@ def _plausible(sensor, attempt):
 
 def _grammar(blocks):
     duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
-    return grammar(blocks.ref.joint_angle.shape[1], blocks.ref.temperature_c is not None, duration)
+    return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
 
 
 def _joined(choices):

@@ -73,7 +73,7 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
         found += ranged(f'rate about {axis}', blocks.means(ref.rate_s)[:, k] / DEG, 'deg/s')
         found += ranged(f'specific force along {axis}', blocks.means(ref.force_s)[:, k], 'm/s^2', least=0.5)
     found += ranged('time', blocks.time, 's')
-    if ref.temperature_c is not None:
+    if blocks.warms and ref.temperature_c is not None:
         warm = blocks.means(ref.temperature_c)
         found += ranged('temperature', warm, 'C', least=0.5)
         slope = np.gradient(np.polynomial.Chebyshev.fit(blocks.time, warm, min(12, len(warm) // 10))(blocks.time))

@@ -117,7 +117,8 @@ def _explanations(recording):
         if name.startswith('angle'):
             number = name[len('angle'):]
             angle, known = describe[name], describe['span' + number] < 0.7
-            yield f'angle of joint {int(number) + 1}', np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1), known
+            turns = np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1)
+            yield f'angle of {recording.model.joint_names[int(number)]}', turns, known
     yield 'motion (moving windows against windows at rest)', recording.moving[:, None].astype(float), every
 
 

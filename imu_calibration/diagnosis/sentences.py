@@ -40,8 +40,13 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
 
     """
     values = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
-    label, value, sd, unit = max(effect.amplitudes(values), key=lambda v: abs(v[1]))
+    amplitudes = effect.amplitudes(values)
+    # What this recording cannot tell from another, such as the bias, is no size.
+    known = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
+    label, value, sd, unit = max(known or amplitudes, key=lambda v: abs(v[1]))
     size = _size(value, sd, unit)
+    if not known and len(values) > 1:
+        size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         return (f'{effect.explanation} The limit is {readable(value, unit)}; {n_clipped} samples sit on it and were left out, with those '
                 'close to it.')

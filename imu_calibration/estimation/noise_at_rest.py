@@ -6,6 +6,8 @@ import numpy as np
 
 LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
 """Noise at low frequency is not taken for less than these shares of white noise of the same variance, at rest and where it vibrates."""
+LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
+"""No sample is taken for better than this, m/s^2 and rad/s: readings of a simulator without noise are exact but for stamps in whole ns."""
 VIBRATES = 4.0
 """A table vibrates in a window whose variance is above so many times that of quiet ones."""
 
@@ -37,7 +39,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
         weight = (counts >= 32) * near
         factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
         factors[axis] = max(factors[axis], LEAST_SHAKEN if shaken else LEAST_INFLATION)
-    floor = 1e-30 + np.finfo(float).eps**2 * np.max(np.abs([row.sensors[sensor].mean[-3:] for row in static]))**2
+    floor = LEAST_NOISE[sensor]**2
     return np.maximum(pooled, floor), factors
 
 

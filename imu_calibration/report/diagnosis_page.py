@@ -1,5 +1,6 @@
 """The report of a diagnosis: the finding as a sentence, the plot that convinces, and the evidence on everything that was asked."""
 
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -121,7 +122,7 @@ def _finding(diagnosis, finding, number):
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> str:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis.traces, finding), label=label)
+    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis, finding), label=label)
 
 
 def draw_over_time(result: DiagnosisResult) -> str:
@@ -130,7 +131,7 @@ def draw_over_time(result: DiagnosisResult) -> str:
                 label='Residuals over time before and after the extension')
 
 
-def variables(traces: Traces) -> dict[str, tuple[str, np.ndarray]]:
+def variables(traces: Traces, joint_names: Sequence[str]) -> dict[str, tuple[str, np.ndarray]]:
     """Return {label: (kind, values)} of everything that a residual may be drawn against, in people's units."""
     found = {'time, s': ('time', traces.time)}
     if traces.temperature_c is not None:
@@ -138,8 +139,8 @@ def variables(traces: Traces) -> dict[str, tuple[str, np.ndarray]]:
     for k, axis in enumerate('xyz'):
         found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
         found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
-    for k in range(traces.position.shape[1]):
-        found[f'angle of joint {k + 1}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * traces.position[:, k]))))
+    for k, name in enumerate(joint_names):
+        found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * traces.position[:, k]))))
     return found
 
 
@@ -153,14 +154,14 @@ def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
     return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
 
 
-def cause_of(traces: Traces, finding: Finding) -> tuple[str, int, str, np.ndarray | None]:
+def cause_of(diagnosis: Diagnosis, finding: Finding) -> tuple[str, int, str, np.ndarray | None]:
     """Return (sensor, axis, label, values): what the residual of a finding is drawn against, and for which component."""
-    sensor = finding.gain.sensor
+    sensor, traces = finding.gain.sensor, diagnosis.traces
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
     kinds = finding.against if len(signal) >= FEW else ()  # a mean over bins of few poses says nothing
     best = max(((explained_share(values, signal[:, axis]), label, values)
-                for label, (kind, values) in variables(traces).items() if kind in kinds),
+                for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
     if best[0] < CLEAR:
         factor, unit = for_people(UNIT[sensor])
@@ -171,12 +172,12 @@ def cause_of(traces: Traces, finding: Finding) -> tuple[str, int, str, np.ndarra
 class _AgainstCause:
     """Two panels with one scale: before with the fitted curve, and after."""
 
-    def __init__(self, traces, finding):
-        self.traces, self.finding = traces, finding
+    def __init__(self, diagnosis, finding):
+        self.diagnosis, self.finding = diagnosis, finding
 
     def __call__(self, figure):
-        traces = self.traces
-        sensor, axis, label, values = cause_of(traces, self.finding)
+        traces = self.diagnosis.traces
+        sensor, axis, label, values = cause_of(self.diagnosis, self.finding)
         factor, unit = for_people(UNIT[sensor])
         before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
         left, right = figure.subplots(1, 2, sharey=True)
