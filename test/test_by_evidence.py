@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
+from imu_calibration.beyond.inquiry import Examination
+from imu_calibration.beyond.unexplained import Unexplained, biases_off
 from imu_calibration.calibration import by_evidence, spread_windows
 from imu_calibration.calibration.by_evidence import _moves, stands_out
 from imu_calibration.calibration.model_changes import Demand
@@ -88,7 +90,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
             made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
         return made
     bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
-    whole, half = (investigate(measured(share), TABLE, bare) for share in (0.0, 0.5))
+    whole, half = (Examination.of(investigate(measured(share), TABLE, bare), TABLE) for share in (0.0, 0.5))
     assert [question.name for question in whole.named] == ['gyro_g_sensitivity'] and not whole.denied
     assert not half.named
     question = next(question for question in half.attempt.questions if question.name == 'gyro_g_sensitivity')
@@ -138,7 +140,8 @@ def _disagreement(found, names):
 
 def investigated(late):
     """Return what the search finds in the session beyond biases and matrices."""
-    return investigate(calibrated(late[0]).windows, late[1], SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names)))
+    model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names))
+    return Examination.of(investigate(calibrated(late[0]).windows, late[1], model), late[1])
 
 
 def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late):
@@ -160,7 +163,7 @@ def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(
     names = found.attempt.baseline.param_names
     added = _disagreement(found, names)
     assert np.sqrt(added[names.index('gyroscope.matrix.xx'), names.index('gyroscope.matrix.xx')]) > 3e-3
-    assert not _disagreement(replace(found, doubtful=[]), names).any()
+    assert not _disagreement(replace(found, doubtful=[]), names)[names.index('gyroscope.matrix.xx')].any()
 
 
 def test_a_finding_of_the_model_as_asked_must_stand_out_too(late, monkeypatch):
@@ -198,3 +201,24 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     assert not {'added', 'denied'} & set(found.statistics)
     bias = [found.param_names.index(f'gyroscope.bias.{axis}') for axis in 'xyz']
     assert np.all(np.abs(found.values[bias] - session.truth['gyroscope'].bias) < 4 * found.sd[bias])
+
+
+def test_a_bias_is_not_known_better_than_windows_agree_on_it():
+    """An offset after the outer joint turned forwards: poses of each sense agree so well that their mean passed for sure, ten sd from the truth."""
+    cause = Beyond('backlash', 2)
+    session = make_session(2, None, 'realistic', cause=cause)
+    calibration = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
+    axis, = cause.axes
+    places = {name: calibration.param_names.index(f'accelerometer.bias.{name}') for name in 'xyz'}
+    errors = {name: abs(calibration.values[place] - session.truth['accelerometer'].bias['xyz'.index(name)]) for name, place in places.items()}
+    assert errors[axis] < 2.5 * calibration.sd[places[axis]] and errors[axis] > 0.01
+    assert all(calibration.sd[places[axis]] > 3 * calibration.sd[places[name]] for name in places if name != axis), 'the others are as good as ever'
+
+
+def test_what_a_rest_may_move_biases_by():
+    """Of the axes that carry it, by the scatter of the means beyond noise; of a rest that is none, nothing."""
+    model, noise = SensorModel(), np.full((400, 3), 3.0)
+    residual = np.outer(np.where(np.arange(400) % 2, 5.0, -5.0), [1.0, 1.0, 0.1])
+    rest = Unexplained(True, 4.0, 9.0, None, 0.0, None, residual, noise, axes=('y',))
+    assert biases_off(model, {'gyroscope': rest, 'accelerometer': replace(rest, significant=False)}) == [{'gyroscope.bias.y': pytest.approx(4.0)}]
+    assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [{'gyroscope.bias.z': 0.0}]

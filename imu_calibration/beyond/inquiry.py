@@ -41,8 +41,9 @@ class Examination(Investigation):
 
     @cached_property
     def rests(self) -> dict[str, Unexplained]:
-        """Sensor -> Unexplained."""
-        return unexplained(self.attempt, self.explained, self.named)
+        """Sensor -> Unexplained, with the axes that carry it where it is significant."""
+        found = unexplained(self.attempt, self.explained, self.named)
+        return {sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest for sensor, rest in found.items()}
 
     @cached_property
     def blocks(self) -> dict[str, RestBlocks]:

@@ -16,7 +16,7 @@ def look_beyond(found: Examination) -> dict[str, Unexplained]:
     for sensor, rest in looked.items():
         proposal = found.proposal(sensor)
         if rest.significant or proposal is not None:
-            regimes, axes = found.regimes(sensor), found.fits(sensor).axes()
+            regimes, axes = found.regimes(sensor), rest.axes or found.fits(sensor).axes()
             first = [next((regime for regime in regimes if regime.axis == axis), None) for axis in axes]
             looked[sensor] = replace(rest, regimes=tuple(regime for regime in first if regime is not None), proposal=proposal,
                                      axes=axes if proposal is None else proposal.axes)

@@ -1,13 +1,14 @@
 """What remains when every effect has been asked about: how much, what it goes with, and where in the session it sits."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.chances import f_sf
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import Question
@@ -59,6 +60,22 @@ def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Questio
     excess, used = explained.excess(chosen), attempt.search.used(chosen)
     values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
     return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+
+
+def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
+    """
+    Return bias -> what it may be off by, one for each axis that carries a significant rest.
+
+    What has another offset in half of the windows makes their means scatter by as much as it moves the bias: nobody knows which half is
+    right, and windows however many do not tell.
+    """
+    found = []
+    for sensor, rest in rests.items():
+        if rest.significant:
+            names = model.param_names[model.part(sensor, Role.OFFSET)]
+            scatter = np.sqrt(np.maximum(np.mean(rest.residual**2 - rest.noise_sd**2, axis=0), 0.0))
+            found += [{names[k]: float(scatter[k])} for k in map(AXES.index, rest.axes)]
+    return found
 
 
 def _rest(attempt, explained, sensor, excess, values):

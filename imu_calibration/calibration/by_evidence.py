@@ -3,8 +3,8 @@ One mind for `calibrate` and `diagnose`: what a recording demands is in the mode
 
 The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
 names joins the model; what a formula beyond the catalogue does without, what parts of the recording deny, or what is no more than chance
-once the standard deviations allow for all that the model misses, does not, and widens the standard deviations instead, as does what would
-do nearly as well as a choice.
+once the standard deviations allow for all that the model misses, does not, and widens the standard deviations instead. So does what would
+do nearly as well as a choice, and what stays unexplained: by how much it may move a bias.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from imu_calibration.beyond.inquiry import inquire
+from imu_calibration.beyond.unexplained import biases_off
 from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import Demand, ModelChanges
@@ -251,7 +252,8 @@ def _point(found):
 
 
 def _moves(found, lacking=()):
-    """Return (what other choices would have moved the parameters by, weight): what is denied, doubtful, implausible or lacking, rivals."""
+    """Return (what other choices may move parameters by, weight): what is denied, doubtful, implausible or lacking, a rest, rivals."""
     moves = [(found.attempt.moved_by(found.named, question), 1.0)
              for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
+    moves += [(moved, 1.0) for moved in biases_off(found.attempt.baseline, found.rests)]
     return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.beyond.unexplained import Unexplained
+from imu_calibration.beyond.unexplained import Unexplained, biases_off
 from imu_calibration.by_hand.inquiry import too_few_poses
 from imu_calibration.by_hand.workflow import evident_result, read_by_hand
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
-from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
@@ -121,7 +122,10 @@ def _with_proposals(source, table, options, result, diagnosis, provenance):
                                *(e.name for e in effects if e.sensor == sensor)]) for sensor in (*SENSORS, 'reference')}
     chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
                      reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
-    return calibrate([source], table, chosen, provenance=provenance).calibration
+    solution, gathered, gathered_model = solve_recordings([source], table, chosen)
+    # A formula says how the output changes, not where what it stands for is nothing.
+    unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
+    return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
 
 
 def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(), provenance: dict[str, Any] | None = None,

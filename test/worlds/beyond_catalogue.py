@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.beyond.unexplained import biases_off
+from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.attempt import Attempt
@@ -37,7 +39,7 @@ def row_of(seed, kind, noise, cause=None):
 
 
 def _known(found, recording):
-    """Return {parameter: (value, sd)} of the baseline, beside what was found and with the formulas that were proposed in the model."""
+    """Return {parameter: (value, sd)} beside what was found, with the formulas that were proposed in the model, as a user gets them."""
     effects = [effect for rest in found.unexplained.values() if rest.proposal for effect in rest.proposal.effects]
     model = replace(found.model, catalogue=found.model.catalogue.with_effects(*effects))
     for effect in effects:
@@ -45,7 +47,8 @@ def _known(found, recording):
     windows = [window for window in recording.windows if window.kind != 'unused']
     attempt = Attempt(windows, recording.table, model, effects=[], locked=np.zeros(len(windows), bool))
     solution = extended_solution(attempt.space, attempt.noise, model, chosen=[])
-    sd = np.sqrt(np.diag(solution.covariance))
+    unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, found.unexplained)))
+    sd = np.sqrt(np.diag(unsure.applied(solution).covariance))
     places = {name: solution.model.param_names.index(name) for name in SensorModel().param_names}
     return {name: (float(solution.values[k]), float(sd[k])) for name, k in places.items()}
 
@@ -89,7 +92,7 @@ def figures(rows):
         ('a false name', 'at most 2 %', count(row['found'] for row in hidden)),
         ('nothing hidden: a formula', 'at most 2 %', count(row['formulas'] for row in empty)),
         ('nothing hidden: a name', 'at most 2 %', count(row['found'] for row in empty)),
-        ('what the cause moves biases and matrices by, rms', '0.5 sd', f'{np.sqrt(np.mean(np.square(bias))) if bias else np.nan:.2f} sd; median world '
+        ('what the cause moves biases and matrices by, rms', '0.5 sd', f'{np.sqrt(np.mean(np.square(bias))) if bias else np.nan:.3f} sd; median world '
          f'{np.median(bias) if bias else np.nan:.2f} sd'),
         ('processor time, median and 95 %', '5 s, 10 s', f'{np.median(seconds):.1f} s, {np.quantile(seconds, 0.95):.1f} s')]
 
