@@ -15,9 +15,11 @@ from imu_calibration.calibration.by_evidence import _moves, stands_out
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.spread_windows import SpreadWindows
 from imu_calibration.diagnosis.diagnose import told
+from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.table import Table
+from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.extended_model import extended_solution
@@ -222,3 +224,14 @@ def test_what_a_rest_may_move_biases_by():
     rest = Unexplained(True, 4.0, 9.0, None, 0.0, None, residual, noise, axes=('y',))
     assert biases_off(model, {'gyroscope': rest, 'accelerometer': replace(rest, significant=False)}) == [{'gyroscope.bias.y': pytest.approx(4.0)}]
     assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [{'gyroscope.bias.z': 0.0}]
+
+
+def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
+    session = make_session(7, {'knock_step': 0.05}, 'realistic')
+    result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
+    assert not result.diagnosis.findings and not result.diagnosis.unexplained['accelerometer'].significant
+    note, = result.notes
+    assert note.startswith('the accelerometer reads the same motion differently') and f'note: {note}' in result.lines
+    assert result.document['notes'] == [note] and note[1:] in diagnosis_report(result)
+    plain = make_session(7, None, 'realistic')
+    assert not diagnose_recording(lambda: iter([plain.block]), Table.from_mapping(plain.table)).notes

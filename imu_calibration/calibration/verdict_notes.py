@@ -3,6 +3,7 @@
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.proof import UNITS
 from imu_calibration.calibration.proof_words import disproved, proven
 from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, Reason, misfit_ratios, quiet
 from imu_calibration.effects.base import SENSORS, Role
@@ -14,7 +15,7 @@ LOST_SHARE = 0.05
 
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return what leaves the verdict alone and is worth knowing; arguments as in `verdict.judge`."""
-    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + _unstable(calibration, tolerances)
+    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
             + _left_out(calibration) + _lost(calibration))
 
 
@@ -65,18 +66,19 @@ def _loose(calibration):
             for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
 
 
-def _unstable(calibration, tolerances):
+def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return notes on biases that move from window to window by more than the tolerance on their mean."""
     reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
     for sensor in SENSORS:
-        offset = calibration.model.find(sensor, Role.OFFSET)
+        part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
-        if scatter > tolerances[calibration.model.slices[offset.key]][0]:
-            factor, unit = for_people(offset.unit)
+        if scatter > tolerances[part][0]:
+            factor, unit = for_people(UNITS[sensor])
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
                                         f'{significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',
-                                  f'let the IMU warm up{"" if by_hand else " and the table stand firm"}, or estimate the bias in use'))
+                                  f'let the IMU warm up{"" if by_hand else " and the table stand firm"}, or estimate the bias in use',
+                                  sensors=(sensor,)))
     return reasons
 
 

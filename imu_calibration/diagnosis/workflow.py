@@ -14,6 +14,7 @@ from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.verdict_notes import unsteady
 from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
@@ -58,13 +59,21 @@ class DiagnosisResult:
     def document(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""
         lags = {sensor: {'value': value, 'sd': sd, 'unit': 's'} for sensor, (value, sd) in self.lags.items()}
-        return to_mapping(self.diagnosis) | {'lags': lags}
+        return to_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
 
     @property
     def lines(self) -> list[str]:
         """What was found, in lines for people."""
         words = [f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms' for sensor, (value, sd) in self.lags.items()]
-        return diagnosis_lines(self.diagnosis) + [f'lag in all, however it is told: {", ".join(words)}'] * bool(words)
+        lag = [f'lag in all, however it is told: {", ".join(words)}'] * bool(words)
+        return [*diagnosis_lines(self.diagnosis), *(f'note: {note}' for note in self.notes), *lag]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is neither a finding nor a rest: a bias that steps, or wanders, on every axis passes for the noise of its sensor."""
+        quiet = {sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant}
+        return [f'{reason.what}; no effect of the catalogue says why: it steps or wanders'
+                for reason in unsteady(self.calibration, self.tolerances) if quiet.issuperset(reason.sensors)]
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:

@@ -42,16 +42,21 @@ def diagnosis_report(result: DiagnosisResult) -> str:
                   lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
                   traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
-                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()], beyond=_beyond(diagnosis),
+                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
+                  beyond=[*_beyond(diagnosis), *(f'{_capital(note)}.' for note in result.notes)],
                   spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
                   not_testable=list(diagnosis.not_testable),
                   groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
 
 
+def _capital(line):
+    return line[0].upper() + line[1:]
+
+
 def _beyond(diagnosis):
     """Return where rests sit and what formulas they follow, and what may be done with these."""
-    lines = [line[0].upper() + line[1:] + '.' for sensor, rest in diagnosis.unexplained.items() for line in beyond_lines(sensor, rest)]
+    lines = [_capital(line) + '.' for sensor, rest in diagnosis.unexplained.items() for line in beyond_lines(sensor, rest)]
     if proposed_effects(diagnosis):
         lines.append('extended.yaml holds the model with the formula in it; take it where another recording confirms it: check it '
                      'there, or give it to another diagnosis as the file of effects.')
