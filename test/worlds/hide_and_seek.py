@@ -25,7 +25,7 @@ from worlds.hide_and_seek_figures import write_figures  # noqa: E402
 from worlds.hide_and_seek_report import report  # noqa: E402
 from worlds.hide_and_seek_worlds import GRADES, PARTS, failed, run, tasks_of  # noqa: E402
 
-FIRST_SEED = 77000
+FIRST_SEED = 277000
 """Seeds from here on were never used while the search was developed; those of earlier runs were 7000 on, 8000 to 8019."""
 
 
