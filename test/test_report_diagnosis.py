@@ -1,6 +1,7 @@
 """The report of a diagnosis: the finding, its evidence and its picture, on a recording with a hidden g-sensitivity."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,6 +59,8 @@ def test_it_is_drawn_against_its_cause(result):
 def test_a_joint_goes_by_its_name(result):
     labels = variables(result.diagnosis.traces, result.diagnosis.baseline.model.joint_names)
     assert [label for label in labels if label.startswith('angle')] == ['angle of outer, deg', 'angle of middle, deg', 'angle of inner, deg']
+    by_hand = replace(result.diagnosis.traces, position=np.empty((len(result.diagnosis.traces.time), 0)))
+    assert not [label for label in variables(by_hand, ('outer', 'middle', 'inner')) if label.startswith('angle')]
 
 
 def test_the_document_and_the_calibration_agree(result):

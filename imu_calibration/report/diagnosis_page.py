@@ -144,8 +144,8 @@ def variables(traces: Traces, joint_names: Sequence[str]) -> dict[str, tuple[str
     for k, axis in enumerate('xyz'):
         found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
         found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
-    for k, name in enumerate(joint_names):
-        found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * traces.position[:, k]))))
+    for name, angle in zip(joint_names, traces.position.T):   # by hand no joint is known
+        found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * angle))))
     return found
 
 
