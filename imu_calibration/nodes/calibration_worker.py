@@ -69,6 +69,7 @@ class CalibrationWorker(threading.Thread):
         self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
         self.place.note_saved(self.live.n_windows)
         self._covered: tuple[int, int, int] | None = None
+        self._looked = time.monotonic()
         self._trouble = ''
         self._faults: dict[str, str] = {}
         self._note_fault('place', self.place.try_place())
@@ -132,9 +133,10 @@ class CalibrationWorker(threading.Thread):
         self._faults[name] = line
 
     def _take(self) -> None:
-        now = time.monotonic()
+        # Silence is judged by when the thread last looked: what came while it made a solution waits for the next look.
+        self._looked = time.monotonic()
         block = self.gatherer.flush()
-        self._watch.note(block, now)
+        self._watch.note(block, self._looked)
         windows = self.live.push(block)
         if block.imu is not None or block.joints is not None:
             self._closed = False
@@ -158,7 +160,7 @@ class CalibrationWorker(threading.Thread):
             request.answer(success, message)
 
     def _solve_when_due(self) -> None:
-        idle = not self._closed and time.monotonic() - (self._watch.last_arrival or 0.0) > IDLE
+        idle = not self._closed and self._looked - (self._watch.last_arrival or 0.0) > IDLE
         if idle:
             self._closed, self._new_windows = True, True
         if not self._new_windows or not self._pacer.due(time.monotonic()):
@@ -282,8 +284,8 @@ class CalibrationWorker(threading.Thread):
             self._note_fault('place', '')
 
     def _tell(self) -> None:
-        now, counts = time.monotonic(), self.live.counts
-        self._watch.note_counts(counts, now)
+        counts = self.live.counts
+        self._watch.note_counts(counts, self._looked)
         self._watch.note_stamping(self.live.stamping)
         result = self.live.result
         verdict, lines = ('', []) if result is None else summary(result, self.hints)
@@ -295,7 +297,7 @@ class CalibrationWorker(threading.Thread):
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
         groups = self.live.groups() if stale else self.state.groups
         diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
-        self.state = WorkerState(groups, self._watch.state(now), self._n_solutions, verdict, tuple(lines), self._trouble,
+        self.state = WorkerState(groups, self._watch.state(self._looked), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
                                  self.live.status(self.hints), diagnosis,
                                  str(self.place.calibration), '' if result is None else result.verdict.text)

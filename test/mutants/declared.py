@@ -222,6 +222,8 @@ SIGNS = _of(
 )
 LIVE = _of(
     'imu_calibration',
+    ('its own work taken for silence of the sensor', 'nodes/calibration_worker.py', 'self._watch.state(self._looked)', 'self._watch.state(time.monotonic())', 'test_calibration_worker.py'),
+    ('its own work taken for the end of the motion', 'nodes/calibration_worker.py', 'not self._closed and self._looked -', 'not self._closed and time.monotonic() -', 'test_calibration_worker.py'),
     ('an open window counts twice', 'calibration/live.py', 'gathered, store = collector.snapshot(pending)',
      'gathered, store = collector.snapshot(True)', 'test_live_calibration.py::test_windows_that_are_open_count_only_when_asked_for'),
     ('what is found live never joins the model', 'calibration/live.py', 'collector.take_model(model)', 'pass', 'test_live_diagnosis.py::test_a_resumed_session_keeps_what_joined'),

@@ -1,0 +1,46 @@
+"""The thread behind calibration_node does not take its own work for silence of the sensor. No ROS here."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.files import read_table
+from imu_calibration.nodes import calibration_worker
+from imu_calibration.nodes.calibration_worker import IDLE, CalibrationWorker
+from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.worker_requests import Listeners
+from imu_calibration.preflight.stream_watch import SILENT_AFTER
+from imu_calibration.resources import config_file
+from imu_calibration.samples import SampleBlock
+
+from worlds.physics import make_session
+
+LONG = 2 * max(IDLE, SILENT_AFTER)
+"""Seconds for which a solution keeps the thread busy."""
+
+
+@pytest.fixture
+def station(tmp_path, monkeypatch):
+    """(A worker that is not started, the blocks that wait for its next look, its clock)."""
+    clock, waiting = SimpleNamespace(now=100.0), []
+    monkeypatch.setattr(calibration_worker, 'time', SimpleNamespace(monotonic=lambda: clock.now))
+    gatherer = SimpleNamespace(flush=lambda: waiting.pop() if waiting else SampleBlock())
+    live = LiveCalibration(read_table(config_file('table_three_axis.yaml')))
+    worker = CalibrationWorker(gatherer, live, lambda: live, place=SessionFiles(str(tmp_path / 'calibration.yaml')), autosave_period=0.0,
+                               listeners=Listeners(lambda text: None, lambda residuals: None))
+    return worker, waiting, clock
+
+
+def test_what_came_while_a_solution_was_made_is_no_silence(station):
+    worker, waiting, clock = station
+    waiting.append(make_session(1, profile='quick').block)
+    worker._take()
+    clock.now += LONG   # a solution, on a slow machine; messages wait meanwhile
+    worker._solve_when_due()
+    worker._tell()
+    assert worker.state.streams.silent == () and not worker._closed
+    worker._take()   # and now nothing has come
+    worker._solve_when_due()
+    worker._tell()
+    assert worker.state.streams.silent == ('imu', 'joints') and worker._closed
