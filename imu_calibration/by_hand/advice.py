@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_calibration.by_hand.equations import Poses
-from imu_calibration.by_hand.hand_step import TURNED, HandStep, shortest_turn, turn_rows
+from imu_calibration.by_hand.hand_step import TURNED, HandStep, steps_from, turn_rows
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
@@ -58,18 +58,18 @@ class HandKnowledge:
     up: np.ndarray | None
     """What is up now, shape (3,); None: nobody knows."""
 
-    def after(self, ups: np.ndarray) -> np.ndarray:
-        """Return the information after going to each of some directions and resting there, shape (k, n, n)."""
+    def after(self, ups: np.ndarray, turns: Sequence[np.ndarray] | np.ndarray | None = None) -> np.ndarray:
+        """Return the information after going to each of some directions, by turns of known `turn_rows`, and a rest there, shape (k, n, n)."""
         bias, matrix, *_ = unpack(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
         norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
-        rows = self.rows(norms, [turn_rows(self.up, to) for to in ups])
+        rows = self.rows(norms, [turn_rows(self.up, to) for to in ups] if turns is None else turns)
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
-    def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray]) -> np.ndarray:
+    def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """Return what poses say of the parameters, in sd, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
@@ -96,11 +96,11 @@ class HandKnowledge:
             Power with which seconds count; 0: not at all.
 
         """
-        information = self.after(DIRECTIONS)
+        steps, turns = steps_from(self.up)
+        information = self.after(DIRECTIONS, turns)
         worth = share_gained(float(self.missing(self.information, only)), self.missing(information, only))
         if self.up is not None:
             worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # it is there already
-        steps = [HandStep(up, *shortest_turn(self.up, up)) if self.up is not None else HandStep(up) for up in DIRECTIONS]
         place = int(np.argmax(worth / np.array([step.seconds for step in steps])**weight))
         return steps[place], worth, information[place]
 

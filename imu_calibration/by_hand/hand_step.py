@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -75,6 +76,20 @@ def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
         return np.zeros((2, 9))
     across = tangent(end[None])[0].T
     return (across @ skew(end) @ rotation_slopes(about, angle)).reshape(2, 9)
+
+
+def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
+    """Return the step to each of `DIRECTIONS`, by the shortest turn from what is up, and the `turn_rows` of each, shape (26, 2, 9)."""
+    return _steps_from(None if up is None else tuple(up.tolist()))
+
+
+@lru_cache(maxsize=256)   # a plan goes from direction to direction, and another one through the same again
+def _steps_from(up):
+    start = None if up is None else np.array(up)
+    steps = tuple(HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to)) for to in DIRECTIONS)
+    rows = np.array([turn_rows(start, to) for to in DIRECTIONS])
+    rows.flags.writeable = False
+    return steps, rows
 
 
 def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:

@@ -49,18 +49,19 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
         matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
         paint(figure)
-        _lay_out(figure)
-        text = io.StringIO()
-        figure.savefig(text, format='svg', metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
+        canvas, text = _laid_out(figure), io.StringIO()
+        figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
+        canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
     return Markup(_inside(text.getvalue(), str(escape(label))))
 
 
-def _lay_out(figure):
-    """Place the axes once; saving would do it twice more."""
+def _laid_out(figure):
+    """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once for nothing."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
-    FigureCanvasSVG(figure)
+    canvas = FigureCanvasSVG(figure)
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine('none')
+    return canvas
 
 
 def _inside(svg, label):

@@ -162,16 +162,12 @@ def _still(position):
 
 def _places_of(table, position):
     """Return where the reference point is, shape (n, 3): products of frames, since the recursion knows no places."""
-    found = np.empty((len(position), 3))
-    for row, values in enumerate(position):
-        turn, place = Rotation.from_matrix(table.mat_nb), np.zeros(3)
-        at = dict(zip(table.joint_names, values, strict=True))
-        for joint in table.joints:
-            place = place + turn.apply(joint.xyz)
-            turn = turn * Rotation.from_euler('xyz', joint.rpy_deg,
-                                              degrees=True) * Rotation.from_rotvec(at[joint.source] * np.array(joint.axis))
-        found[row] = place + turn.apply(table.mount_xyz)
-    return found
+    turn, places = Rotation.from_matrix(table.mat_nb), np.zeros((len(position), 3))
+    at = dict(zip(table.joint_names, position.T, strict=True))
+    for joint in table.joints:
+        places = places + turn.apply(joint.xyz)
+        turn = turn * Rotation.from_euler('xyz', joint.rpy_deg, degrees=True) * Rotation.from_rotvec(at[joint.source][:, None] * np.array(joint.axis))
+    return places + turn.apply(table.mount_xyz)
 
 
 def truth(world):
