@@ -59,7 +59,7 @@ class HandKnowledge:
     """What is up now, shape (3,); None: nobody knows."""
 
     def after(self, ups: np.ndarray, turns: Sequence[np.ndarray] | np.ndarray | None = None) -> np.ndarray:
-        """Return the information after going to each of some directions, by turns of known `turn_rows`, and a rest there, shape (k, n, n)."""
+        """Return the information after going to each of some directions, by turns with these rows, and a rest there, shape (k, n, n)."""
         bias, matrix, *_ = unpack(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
