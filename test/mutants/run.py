@@ -35,21 +35,17 @@ def copied(folder):
     return folder
 
 
-def _limited():
-    resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST + 5))
-
-
-def tested(folder, tests, *options):
-    """Return pytest's exit code and the last line that it printed."""
+def tested(folder, tests, *options, longest=LONGEST):
+    """Return pytest's exit code and the last line that it printed; `longest` is the processor time of each process."""
     env = os.environ | {'PYTHONPATH': os.pathsep.join([str(folder), os.environ.get('PYTHONPATH', '')]), 'PYTHONDONTWRITEBYTECODE': '1'}
     command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *options, *tests]
     try:
         done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=PATIENCE * LONGEST, stdin=subprocess.DEVNULL,
-                              preexec_fn=_limited)
+                              preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (longest, longest + 5)))
     except subprocess.TimeoutExpired:
         return 1, f'did not end within {PATIENCE * LONGEST} s'
     if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-        return 1, f'took more than {LONGEST} s of processor time'
+        return 1, f'took more than {longest} s of processor time'
     return done.returncode, next((line for line in reversed(done.stdout.splitlines()) if line.startswith(('FAILED', 'ERROR'))), '')
 
 
@@ -85,7 +81,7 @@ def main():
         for number in range(asked.workers):
             folders.put(copied(Path(place) / str(number)))
         needed = sorted({test for mutant in chosen for test in mutant.tests})
-        code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile')
+        code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile', longest=PATIENCE * LONGEST)   # all of them in one go
         if code:
             sys.exit(f'the tests must pass before anything is broken: {line or code}')
 
