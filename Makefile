@@ -33,7 +33,7 @@ endif
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 # Three processes on two cores: tests over DDS mostly wait. conftest.py says which files begin first.
-PYTEST = $(PY) -m pytest $(PLUGINS) -n 3 --dist loadfile --no-loadscope-reorder
+PYTEST = $(PY) -m pytest $(PLUGINS) -n 3 --dist loadfile
 
 .PHONY: help setup demo live-demo test test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
 

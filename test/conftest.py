@@ -23,6 +23,12 @@ def recordings():
     return folder
 
 
+def pytest_configure(config):
+    """Keep the order of the files that `pytest_collection_modifyitems` gives; earlier versions of xdist, as in Ubuntu 24.04, know no other."""
+    if hasattr(config.option, 'loadscopereorder'):
+        config.option.loadscopereorder = False
+
+
 def pytest_collection_modifyitems(items):
     """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
     long = Counter(item.path for item in items if item.get_closest_marker('slow') or item.get_closest_marker('dds'))
