@@ -85,7 +85,9 @@ class DeadReckoning:
         if self.attitude is None:
             if stop is not None:
                 up = stop.mean[:3] / np.linalg.norm(stop.mean[:3])
-                self.attitude = Rotation.align_vectors([[0, 0, 1]], [up])[0]
+                across = np.cross(up, [0, 0, 1])   # the heading is that of the start, the robot stands nearly level
+                sine = np.linalg.norm(across)
+                self.attitude = Rotation.from_rotvec(across / max(sine, 1e-12) * np.arctan2(sine, up[2]))
         else:
             seconds = now - self._before
             self.attitude = self.attitude * Rotation.from_rotvec(np.array(rate) * seconds)
@@ -140,8 +142,12 @@ def navigate(bag, calibration, domain_id):
             navigators, executor = [Navigator(*names) for names in TOPICS.items()], SingleThreadedExecutor()
             for navigator in navigators:
                 executor.add_node(navigator.node)
-            player = processes.start('bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2})
             end = time.monotonic() + PATIENCE
+            while not all(each.input.node.count_publishers(each.input.topic_name) for each in navigators[1:]):
+                if time.monotonic() > end:
+                    raise SystemExit('the compensator did not begin in time; is the machine very busy?')
+                executor.spin_once(timeout_sec=0.1)   # who hears of the first rest late begins at the second
+            player = processes.start('bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2})
             while player.poll() is None or time.monotonic() - max(navigator.last for navigator in navigators) < 2.0:
                 if time.monotonic() > end:
                     raise SystemExit('the drive did not come to an end in time; is the machine very busy?')
@@ -172,7 +178,7 @@ def draw(found, path, picture):
     for (topic, (_, last, places)), color in zip(found.items(), ('tab:red', 'tab:blue'), strict=True):
         axes.plot(*places.T, color=color, label=f'/{topic}: {last:.1f} m off at the end')
     axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', title=f'Dead reckoning for {SECONDS:.0f} s, at rest every {LEG:.0f} s')
-    figure.legend(loc='outside lower center', ncols=3, fontsize=8)
+    axes.legend(loc='lower left', fontsize=8)
     figure.savefig(picture, dpi=90)
 
 

@@ -14,6 +14,8 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
 
+from worlds.hand_sessions import turned_up
+
 
 def blocks(imu, seed=0, mean=20):
     """Cut samples into uneven blocks as they would come from a topic."""
@@ -116,10 +118,8 @@ def test_before_any_motion_it_asks_for_attitudes():
 
 def test_the_direction_that_is_missing_is_named():
     """Faces up one after the other: those that have not been up are named beside the step of the picture."""
-    from scipy.spatial.transform import Rotation
     ups = [FACES[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
-    attitudes = [Rotation.align_vectors([[0, 0, 1]], [up])[0] for up in ups]
-    imu = simulate(5, n_poses=6, attitudes=attitudes)[0]
+    imu = simulate(5, n_poses=6, attitudes=[turned_up(up) for up in ups])[0]
     live, asked = make_live(), {}
     for block in blocks(imu):
         live.push(block)

@@ -86,7 +86,9 @@ class PlannedMotion:
 
 
 def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> TrajectoryPoints:
-    """Return the points of consecutive segments, a point at every joint between them."""
+    """Return the points of consecutive segments, a point at every joint between them; no points where nothing moves."""
+    if not segments:
+        return TrajectoryPoints.stop(joint_names)
     edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
     times = np.concatenate([np.linspace(a, b, max(int(np.ceil((b - a) / STEP)), 1) + 1)[1:]
                             for a, b in zip(edges, edges[1:], strict=False)])

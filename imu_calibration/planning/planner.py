@@ -99,7 +99,7 @@ class Plan:
         """The whole plan as one trajectory."""
         everything = tuple(segment for one in self.segments for segment in one)
         names = tuple(self.model.joint_names)
-        return trajectory(names, everything) if everything else TrajectoryPoints.stop(names)
+        return trajectory(names, everything)
 
 
 

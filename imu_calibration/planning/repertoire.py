@@ -163,8 +163,8 @@ class Repertoire:
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
         reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
                  np.array([LARGEST_SWING[bool(turning)] for turning in self.limits.turns])]
-        amplitude = 0.99 * unit * np.minimum.reduce(reach)
-        away = amplitude * most[0]
+        largest = unit * np.minimum.reduce(reach)
+        away, amplitude = largest * most[0], 0.99 * largest   # the largest values are between the moments that were looked at
         middle = np.where(self.limits.endless, place, np.clip(place, self.limits.lower + away, self.limits.upper - away))
         builder = self._builder(middle)
         builder.swing(amplitude, frequency, seconds)
