@@ -25,6 +25,7 @@ from imu_calibration.compensation.stops import StopDetector  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
 from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 from imu_calibration.reference.reference_motion import Reference  # noqa: E402
+from imu_calibration.reference.rotations import align  # noqa: E402
 from imu_calibration.samples import ImuSamples  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
@@ -85,9 +86,7 @@ class DeadReckoning:
         if self.attitude is None:
             if stop is not None:
                 up = stop.mean[:3] / np.linalg.norm(stop.mean[:3])
-                across = np.cross(up, [0, 0, 1])   # the heading is that of the start, the robot stands nearly level
-                sine = np.linalg.norm(across)
-                self.attitude = Rotation.from_rotvec(across / max(sine, 1e-12) * np.arctan2(sine, up[2]))
+                self.attitude = Rotation.from_matrix(align(up))   # the heading is that of the start
         else:
             seconds = now - self._before
             self.attitude = self.attitude * Rotation.from_rotvec(np.array(rate) * seconds)
@@ -140,10 +139,11 @@ def navigate(bag, calibration, domain_id):
         rclpy.init()
         try:
             navigators, executor = [Navigator(*names) for names in TOPICS.items()], SingleThreadedExecutor()
+            corrected = navigators[-1]
             for navigator in navigators:
                 executor.add_node(navigator.node)
             end = time.monotonic() + PATIENCE
-            while not all(each.input.node.count_publishers(each.input.topic_name) for each in navigators[1:]):
+            while not corrected.node.count_publishers(corrected.input.topic_name):
                 if time.monotonic() > end:
                     raise SystemExit('the compensator did not begin in time; is the machine very busy?')
                 executor.spin_once(timeout_sec=0.1)   # who hears of the first rest late begins at the second

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.by_hand.advice import WEIGHTS, _rollout, foretold
-from imu_calibration.by_hand.hand_step import shortest_turn
+from imu_calibration.by_hand.hand_step import HandStep, shortest_turn
 from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.by_hand.next_pose import hand_coverage, knowledge_of
 from imu_calibration.by_hand.options import HandOptions
@@ -38,7 +38,7 @@ def knowing(*ups, factor=1.0):
     knowledge = knowledge_of(NOTHING, None, OPTIONS)
     for up in ups:
         up = np.array(up, float) / np.linalg.norm(up)
-        knowledge = replace(knowledge, information=knowledge.after(up[None])[0], up=up)
+        knowledge = knowledge.then(HandStep(up))
     return replace(knowledge, information=factor * knowledge.information)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
@@ -19,8 +20,9 @@ from imu_calibration.reference.earth import EARTH_RATE
 from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.segmentation.static_detector import find_still
 
-from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth, turned_up
+from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
 from worlds.physics_hand import clipped, drifting, hold_and_turn, warmed_up, with_slow_turn, with_stamp_jitter, with_wrong_full_scale
+from worlds.physics_table import stand_up
 
 ANGULAR = np.random.default_rng(0).normal(0, 1, (300, 3))
 
@@ -205,7 +207,7 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
 
 
 def six_faces(seed=1):
-    return hold_and_turn(seed, n_poses=6, attitudes=[turned_up(up) for up in FACES], still=4.0)
+    return hold_and_turn(seed, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in FACES], still=4.0)
 
 
 def test_six_faces_give_what_they_determine():

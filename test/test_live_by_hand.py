@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_by_hand import GRAVITY, load, simulate
 
 from imu_calibration.by_hand.live import LiveByHand
@@ -14,7 +15,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
 
-from worlds.hand_sessions import turned_up
+from worlds.physics_table import stand_up
 
 
 def blocks(imu, seed=0, mean=20):
@@ -119,7 +120,7 @@ def test_before_any_motion_it_asks_for_attitudes():
 def test_the_direction_that_is_missing_is_named():
     """Faces up one after the other: those that have not been up are named beside the step of the picture."""
     ups = [FACES[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
-    imu = simulate(5, n_poses=6, attitudes=[turned_up(up) for up in ups])[0]
+    imu = simulate(5, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in ups])[0]
     live, asked = make_live(), {}
     for block in blocks(imu):
         live.push(block)

@@ -58,23 +58,23 @@ class HandKnowledge:
     up: np.ndarray | None
     """What is up now, shape (3,); None: nobody knows."""
 
-    def after(self, ups: np.ndarray, turns: Sequence[np.ndarray] | np.ndarray | None = None) -> np.ndarray:
-        """Return the information after going to each of some directions, by turns with these rows, and a rest there, shape (k, n, n)."""
+    def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """Return the information after going to each of some directions, by turns with these `turn_rows` (k, 2, 9), and a rest."""
         bias, matrix, *_ = unpack(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time as at the reference point: one more pose there says nothing of thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
         norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
-        rows = self.rows(norms, [turn_rows(self.up, to) for to in ups] if turns is None else turns)
+        rows = self.rows(norms, turns)
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
-    def rows(self, norms: np.ndarray, turns: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """Return what poses say of the parameters, in sd, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
         rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
-        rows[:, 4:6, GYRO_MATRIX] = np.array(turns) / self.turn_sd
+        rows[:, 4:6, GYRO_MATRIX] = turns / self.turn_sd
         return rows
 
     def sd(self, information: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ class HandKnowledge:
 
     def then(self, step: HandStep) -> HandKnowledge:
         """Return what is known after a step."""
-        return replace(self, information=self.after(step.up[None])[0], up=step.up)
+        return replace(self, information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0], up=step.up)
 
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
@@ -179,8 +179,8 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
     if poses is None:
         return knowledge
     ups = ups_of(poses)
-    turns = [turn_rows(start, end) for start, end in zip(ups[:-1], ups[1:], strict=True)]
-    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], [np.zeros((2, 9)), *turns])   # nothing leads to the first pose
+    turns = np.array([turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)])   # nothing leads to the first pose
+    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
     return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 
 

@@ -47,7 +47,6 @@ class HandEvidence(Evidence):
     def __init__(self, blocks: Sequence[Block], space: HandSpace, smooth: Sequence[int], *, baseline: Sequence[int]):
         super().__init__(space.prior_sd, np.zeros(space.size))
         self.blocks, self.space = blocks, space
-        self._heldout: dict[tuple[int, ...], float] = {}
         self._noise = [_noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))]) for block in blocks]
         poses = np.unique(np.concatenate([block.pose for block in blocks]))
         self.n_folds = len(poses) if len(poses) <= ONE_BY_ONE else FOLDS
@@ -88,12 +87,13 @@ class HandEvidence(Evidence):
 
     def heldout(self, used: Sequence[int]) -> float:
         """Return the loss of all poses when each is held out in turn; a search asks of the same choice beside each effect."""
-        key = tuple(sorted(used))
-        if key not in self._heldout:
+        ordered = tuple(sorted(used))
+        key = ('held out', *ordered)
+        if key not in self._losses:
             squares = [r**2 / (variance + sum(process.sd**2 for process in processes))
-                       for r, (variance, processes) in zip(self.heldout_residuals(key), self._noise)]
-            self._heldout[key] = float(sum(s.size * np.log(s.mean()) for s in squares))
-        return self._heldout[key]
+                       for r, (variance, processes) in zip(self.heldout_residuals(ordered), self._noise)]
+            self._losses[key] = float(sum(s.size * np.log(s.mean()) for s in squares))
+        return self._losses[key]
 
     def loss(self, used: Sequence[int]) -> float:
         """Return the loss of the best fit to all poses."""

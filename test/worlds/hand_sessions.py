@@ -14,13 +14,6 @@ NOMINAL, PARAM_NAMES, SENSITIVITY = FULL.nominal, FULL.param_names, slice(21, 30
 FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 
 
-def turned_up(up):
-    """Return the attitude, by the shortest turn from level, in which a direction of the sensor points up."""
-    across = np.cross(up, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(across)
-    return Rotation.from_rotvec(np.arctan2(sine, up[2]) * (across / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])))
-
-
 def random_truth(rng, sensitivity=0.0):
     truth = NOMINAL.copy()
     truth[0:3] += rng.normal(0, 0.2, 3)

@@ -73,7 +73,7 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
     axes = _true_axes(mapping, axis_errors)
     mount = mapping.get('mount') or {}
     count = len(time)
-    attitude = _stand_up(mapping['up'])
+    attitude = stand_up(mapping['up'])
     mats = np.broadcast_to(attitude, (count, 3, 3))
     lean = Rotation.from_rotvec([tilt[0], tilt[1], 0.0])
     earth_n = lean.apply(earth_vector(mapping))
@@ -126,7 +126,7 @@ def earth_vector(mapping):
     if mapping.get('latitude') is None or mapping.get('azimuth_deg') is None:
         return np.zeros(3)
     latitude, azimuth = np.radians(mapping['latitude']), np.radians(mapping['azimuth_deg'])
-    x, y, _ = _stand_up(mapping['up'])[:, 0]
+    x, y, _ = stand_up(mapping['up'])[:, 0]
     azimuth = azimuth + np.arctan2(y, x)
     north = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     return EARTH_RATE * (np.cos(latitude) * north + np.sin(latitude) * np.array([0.0, 0.0, 1.0]))
@@ -144,7 +144,7 @@ def _swing(rate, alpha, arm):
     return np.cross(alpha, arm) + np.cross(rate, np.cross(rate, arm))
 
 
-def _stand_up(up):
+def stand_up(up):
     """Return the smallest rotation that makes `up` the z axis."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     axis = np.cross(up, [0.0, 0.0, 1.0])
