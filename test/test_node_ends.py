@@ -31,6 +31,25 @@ sys.exit(run_node(lambda: rclpy.create_node('early'), [], spin=spin))
 '''
 
 
+UNWOKEN = '''
+import os, sys, threading, time
+import rclpy
+from imu_calibration.nodes.lifecycle import run_node
+def end():
+    time.sleep(1.0)
+    print('alive for 1 s', flush=True)
+    context = rclpy.get_default_context().handle
+    with context:
+        context.shutdown()
+    time.sleep(20.0)
+    os._exit(3)
+def make():
+    threading.Thread(target=end, daemon=True).start()
+    return rclpy.create_node('idle')
+sys.exit(run_node(make, []))
+'''
+
+
 def environment(*folders):
     """The environment of a process that imports from here."""
     path = os.pathsep.join([*map(str, folders), str(ROOT), os.environ.get('PYTHONPATH', '')])
@@ -89,6 +108,13 @@ def test_interrupted_while_ros_starts():
     pytest.importorskip('rclpy')
     done = subprocess.run([sys.executable, '-c', EARLY], env=environment(), capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_a_node_without_work_ends_although_nothing_wakes_it():
+    """The second half of what rclpy does at a signal, after an executor that had woken in the first half waits again."""
+    pytest.importorskip('rclpy')
+    done = subprocess.run([sys.executable, '-c', UNWOKEN], env=environment(), capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'alive for 1 s\n', '')
 
 
 def test_other_programs_keep_their_interrupt(monkeypatch):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -18,6 +19,8 @@ from imu_calibration.nodes.parameters import unknown_parameters
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
 """Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
+LOOK_AGAIN = 0.5
+"""Seconds after which a node that waits without work looks whether it was asked to end."""
 
 
 def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, *, spin: Callable[[Any], None] | None = None,
@@ -70,6 +73,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         node = make_node()
         for line in unknown_parameters(node):
             node.get_logger().warning(line)
+        _look_again(node)
         if not asked_to_end:   # an executor cannot be made any more
             (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
@@ -84,6 +88,16 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     finally:
         _end(node)
     return int(getattr(node, 'failed', False))
+
+
+def _look_again(node: Any) -> None:
+    """
+    Let the executor wake from time to time.
+
+    At a signal rclpy wakes the executor first and ends the context second: who finds the context still alive in between waits again, and
+    nothing would wake it any more.
+    """
+    node.create_timer(LOOK_AGAIN, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def _failed(line: str) -> int:

@@ -223,6 +223,7 @@ SIGNS = _of(
 LIVE = _of(
     'imu_calibration',
     ('a swing goes beyond the end of its joint', 'planning/repertoire.py', 'away, amplitude = largest * most[0],', 'away, amplitude = 0.99 * largest * most[0],', 'test_planning_motions.py'),
+    ('a node without work is not woken to end', 'nodes/lifecycle.py', '_look_again(node)\n        if', 'if', 'test_node_ends.py'),
     ('its own work taken for silence of the sensor', 'nodes/calibration_worker.py', 'self._watch.state(self._looked)', 'self._watch.state(time.monotonic())', 'test_calibration_worker.py'),
     ('its own work taken for the end of the motion', 'nodes/calibration_worker.py', 'not self._closed and self._looked -', 'not self._closed and time.monotonic() -', 'test_calibration_worker.py'),
     ('an open window counts twice', 'calibration/live.py', 'gathered, store = collector.snapshot(pending)',
