@@ -75,7 +75,10 @@ class Bench:
             self.table.follow(self.now, TrajectoryPoints.stop(self.driver.joint_names))
 
     def move(self, points):
-        """Begin a motion."""
+        """Begin a motion, once the joints rest."""
+        for _ in range(200):
+            if not self.driver.rests:
+                self.look()
         self.sent.append(self.driver.begin(points, 'a motion', self.now))
         self.table.follow(self.now, self.sent[-1])
 
@@ -123,6 +126,35 @@ def test_nothing_moves_before_joint_states_and_after_a_stop():
     bench.move(points)
     with pytest.raises(InputError, match='the state is moving'):   # one motion at a time
         bench.move(points)
+
+
+def test_a_motion_begins_only_where_the_joints_rest():
+    bench = Bench()
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 3, kind='spin'))
+    for _ in range(300):
+        bench.look()
+    bench.driver.stop('stopped by hand')   # and started anew before anybody has seen the joints slow down
+    bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))
+    bench.driver.start()
+    began = bench.now
+    while not bench.driver.rests:
+        with pytest.raises(InputError, match='must rest before a motion begins, they have just moved'):
+            bench.driver.begin(motion_points(LIMITS, 2), 'a motion', bench.now)
+        bench.look()
+    assert bench.now - began >= 0.5 and not bench.table.at(np.array([bench.now])).rate.any()
+    bench.move(motion_points(LIMITS, 2, start=bench.driver.position))
+    assert bench.until_it_rests() is DriveState.MEASURING, bench.driver.reason
+    driver = Driver(NAMES, LIMITS)   # a clock that is set back begins to count anew
+    for time in (100.0, 101.0):
+        driver.observe(time, np.zeros(2), np.zeros(2), now=time)
+    assert driver.rests
+    driver.observe(5.0, np.zeros(2), np.zeros(2), now=102.0)
+    assert not driver.rests
+    driver.observe(6.0, np.zeros(2), np.zeros(2), now=103.0)
+    assert driver.rests
+    driver.start()   # what has just begun to move may not be seen yet
+    assert not driver.rests
 
 
 @pytest.mark.parametrize('moment', np.linspace(0.0, 9.0, 7))
@@ -209,12 +241,13 @@ def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
     start = np.clip(np.zeros(len(limits)), limits.lower, limits.upper)
     driver = Driver(names, limits)
     driver.start()
-    driver.observe(0.0, start, np.zeros(len(limits)), now=0.0)
+    for time in (0.0, 1.0):
+        driver.observe(time, start, np.zeros(len(limits)), now=time)
     points = motion_points(limits, seed, names=names, start=start)
     # What a planner does wrong: it is in a hurry. `hurry` above the slow first motion's 1 / 0.3 is too fast where the motion is at its limits.
     asked = TrajectoryPoints(names, points.time / hurry, points.position, points.rate * hurry, points.acceleration * hurry**2)
     try:
-        sent = driver.begin(asked, 'a motion', 0.0)
+        sent = driver.begin(asked, 'a motion', 1.0)
     except InputError as error:
         assert 'within the limits of the joints' in str(error) and driver.state is DriveState.IDLE and hurry > 1.0
         return

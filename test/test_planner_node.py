@@ -1,6 +1,8 @@
 """planner_node over DDS, its ways to command joints, and what goes wrong with a table."""
 
 import sys
+import threading
+import time
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -13,10 +15,12 @@ from imu_calibration.reference.trajectory_points import TrajectoryPoints
 pytest.importorskip('rclpy')
 from imu_calibration.diagnosis.live import FOUND  # noqa: E402
 from imu_calibration.driving.campaign import Suspect  # noqa: E402
+from imu_calibration.driving.driver import DriverSettings, DriveState  # noqa: E402
 from imu_calibration.nodes import joint_commands  # noqa: E402
-from imu_calibration.nodes.planner_worker import findings_from  # noqa: E402
+from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from  # noqa: E402
 
 from ros.live_station import TABLE, Station  # noqa: E402
+from ros.one_process import OneProcess  # noqa: E402
 
 NAMES = ('outer', 'inner')
 POINTS = TrajectoryPoints(NAMES, np.array([1.0]), np.array([[0.1, 0.2]]), np.zeros((1, 2)), np.zeros((1, 2)))
@@ -130,6 +134,87 @@ def test_an_action_without_control_msgs_is_refused_and_auto_takes_the_topic(monk
     assert isinstance(joint_commands.make_command(node, 'auto', print), joint_commands.TopicCommand)
     with pytest.raises(InputError, match="'command' must be one of topic, action, auto"):
         joint_commands.make_command(node, 'telepathy', print)
+
+
+class Table:
+    """Stands for the driver: joints that rest when the test says so."""
+
+    def __init__(self, patience):
+        self.settings, self.state, self.rests, self.is_driving, self.reason = DriverSettings(settling_patience=patience), DriveState.IDLE, False, False, ''
+        self.position, self.motions, self.began = np.zeros(2), 0, []
+
+    def start(self):
+        self.state = DriveState.IDLE
+
+    def begin(self, points, words, now):
+        self.began.append(words)
+        self.is_driving = True
+        return points
+
+    def stop(self, why):
+        self.state, self.reason = DriveState.STOPPED, why
+
+
+def working(patience):
+    """A worker that is asked for a motion, its driver, and what it tells people."""
+    said, driver = [], Table(patience)
+    motion = SimpleNamespace(words='turn', points=lambda position: POINTS)
+    campaign = SimpleNamespace(decide=lambda position, elapsed: SimpleNamespace(diagnose=False, motion=motion, why='it helps'), worst=('', 0.0),
+                               planner=SimpleNamespace(excess={}))
+    worker = PlannerWorker(driver, lambda: campaign, lock=threading.RLock(),
+                           peers=Peers(None, None, None, said.append, lambda: said.append('stop'), lambda level, line: said.append(line)))
+    worker.go(-1)
+    worker.start()
+    return worker, driver, said
+
+
+def until(condition, seconds=20.0):
+    """Wait for a thread."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
+    worker, driver, said = working(60.0)
+    until(lambda: worker.doing == 'waiting until the joints rest')
+    assert not driver.began and not said
+    driver.rests = True
+    until(lambda: said[1:])
+    worker.end()
+    assert driver.began == ['turn'] and said[0] is POINTS and said[1].endswith('turn; it helps')
+    worker, driver, said = working(0.5)
+    until(lambda: said[1:])
+    worker.end()
+    assert not driver.began and said == ['stop', 'the joints must rest before a motion begins, they have not within 0.5 s; see what moves them']
+    worker, driver, said = working(60.0)
+    until(lambda: worker.doing == 'waiting until the joints rest')
+    worker.halt('stopped by hand')   # while it waits
+    driver.rests = True
+    time.sleep(0.2)
+    worker.end()
+    assert not driver.began and said == ['stop']
+
+
+@pytest.mark.dds
+def test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once(monkeypatch):
+    from sensor_msgs.msg import JointState
+
+    from imu_calibration.nodes.planner_node import PlannerNode
+    from imu_calibration.nodes.qos import output_qos
+    bench = OneProcess(monkeypatch)
+    try:
+        planner = bench.start(PlannerNode, {'table_file': str(TABLE)})
+        publisher = bench.node.create_publisher(JointState, 'joint_states', output_qos())
+        bench.until(lambda: publisher.get_subscription_count() == 1, 'the connection')
+        for k in range(300):
+            publisher.publish(JointState(name=['inner', 'middle', 'outer'], position=[0.001 * k, 0.0, 0.0]))
+        time.sleep(1.0)   # as while it plans
+        bench.until(lambda: planner.driver.position is not None, 'joint states')
+        np.testing.assert_allclose(planner.driver.position, [0.0, 0.0, 0.299])
+    finally:
+        bench.close()
 
 
 class Loop(Station):

@@ -19,6 +19,8 @@ MARGIN = 1e-6
 """What a trajectory may lie beyond a limit by rounding, relative to it."""
 OVERSPEED = 1.25
 """Measured speed in units of the limit from which the joints are stopped; rates from encoders are noisy."""
+STILL = 0.1
+"""Tolerances by which joints that rest may move: encoders are noisy, arms sag."""
 
 
 class DriveState(StrEnum):
@@ -78,7 +80,8 @@ class Driver:
         """Where the joints were seen last."""
         self._time, self._heard = 0.0, -np.inf
         self._watch: PathWatch | None = None
-        self._rested_at, self._rested_since, self._settling_since = np.zeros(len(joint_names)), 0.0, 0.0
+        self._rested_at: np.ndarray | None = None
+        self._rested_since = self._settling_since = 0.0
         self._slow = True
 
     @property
@@ -91,9 +94,14 @@ class Driver:
         """How far along its path the motion is, s of the path's own time; 0 without one."""
         return 0.0 if self._watch is None else self._watch.progress
 
+    @property
+    def rests(self) -> bool:
+        """Whether the joints have rested for the settling time where they are: after a stop they need a while."""
+        return self._rested_at is not None and self._time - self._rested_since >= self.settings.settling_time
+
     def start(self) -> None:
-        """Allow motions; the first one will be slow."""
-        self._slow = True
+        """Allow motions, once the joints rest; the first one will be slow."""
+        self._slow, self._rested_at = True, None
         self._become(DriveState.IDLE, 'started')
 
     def begin(self, points: TrajectoryPoints, words: str, now: float) -> TrajectoryPoints:
@@ -119,6 +127,8 @@ class Driver:
                              'start anew')
         if self.position is None or now - self._heard > self.settings.silence:
             raise InputError('joint states must come before anything moves, none came; publish them')
+        if not self.rests:
+            raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
         self._watch, self._slow = PathWatch(self.position, points, self.tolerance), False
@@ -153,6 +163,7 @@ class Driver:
 
         """
         self._time, self._heard, self.position = time, now, np.asarray(position, float)
+        self._note_rest()
         if self._watch is None or not self.is_driving:
             return False
         if trouble := self._beyond(position, rate):
@@ -226,11 +237,15 @@ class Driver:
         return (f'joint {self.joint_names[watch.suspect()]} has not come further for {watch.waited:.1f} s: stopped; '
                 'see whether something holds it')
 
+    def _note_rest(self):
+        """Begin to count anew where the joints have moved, or their clock was set back."""
+        if (self._rested_at is None or self._time < self._rested_since
+                or np.any(np.abs(self.position - self._rested_at) > STILL * self.tolerance)):
+            self._rested_at, self._rested_since = self.position, self._time
+
     def _settle(self):
         """Wait for rest; return whether everything has to be stopped."""
-        if np.any(np.abs(self.position - self._rested_at) > 0.1 * self.tolerance):
-            self._rested_at, self._rested_since = self.position, self._time
-        if self._time - self._rested_since >= self.settings.settling_time:
+        if self.rests:
             self._watch = None
             self._become(DriveState.MEASURING, self.reason)
         elif self._time - self._settling_since > self.settings.settling_patience:

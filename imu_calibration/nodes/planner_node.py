@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -35,7 +36,7 @@ from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.inputs import MatchedInput, watch_inputs
+from imu_calibration.nodes.inputs import BatchInput, MatchedInput, watch_inputs
 from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
@@ -86,7 +87,8 @@ class PlannerNode(Node):
                                     peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say),
                                     lock=self._lock)
         self.worker.stamp = lambda: self._stamp
-        self._joints = MatchedInput(self, JointState, 'joint_states', callback=self._joint_state, single=False, raw=False)
+        # All that wait at once: one by one they would wait in line while a plan is made, and the motion begin where the joints were before.
+        self._joints = BatchInput(self, JointState, 'joint_states', add=self._joint_state, single=False)
         self._calibrations = MatchedInput(self, String, 'imu/calibration', callback=self._document, raw=False, latched=True)
         watch_inputs(self, [self._joints, self._calibrations])
         self.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostic, 100)
@@ -134,9 +136,9 @@ class PlannerNode(Node):
 
     # What arrives.
 
-    def _joint_state(self, message: JointState) -> None:
+    def _joint_state(self, serialized: bytes, _: int) -> None:
         try:
-            stamp_ns, position, rate = joint_row(message, self._names)
+            stamp_ns, position, rate = joint_row(deserialize_message(serialized, JointState), self._names)
         except UnusableMessage as error:
             self._complaints.event(f'joint_states: {error}; it is left out')
             return

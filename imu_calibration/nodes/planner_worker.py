@@ -15,7 +15,7 @@ from typing import Any
 from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
 from imu_calibration.driving.campaign import Campaign, Suspect
 from imu_calibration.driving.driver import Driver, DriveState
-from imu_calibration.errors import ImuCalibrationError, shortened
+from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO
 
 PERIOD = 0.05
@@ -135,6 +135,7 @@ class PlannerWorker(threading.Thread):
         if self.campaign is None:
             self.doing = 'planning'
             self.campaign = self._make_campaign()
+        self._wait_for_rest()
         if self.driver.state is DriveState.MEASURING:
             self._measure()
         decision = self._decide()
@@ -149,6 +150,17 @@ class PlannerWorker(threading.Thread):
             decision = self._decide()
         if decision is not None:
             self._carry_out(decision)
+
+    def _wait_for_rest(self):
+        """A motion is planned from where the joints rest: after a stop they need a while, and a person may turn them."""
+        patience = self.driver.settings.settling_patience
+        end = time.monotonic() + patience
+        while self._wanted and not self._ending and not self.driver.rests:
+            self.doing = 'waiting until the joints rest'
+            if time.monotonic() > end:
+                raise InputError(f'the joints must rest before a motion begins, they have not within {patience:g} s; see what moves them')
+            self._wake.wait(PERIOD)
+            self._wake.clear()
 
     def _measure(self):
         self.doing = 'waiting for the calibration'
@@ -177,8 +189,9 @@ class PlannerWorker(threading.Thread):
                 self.driver.finish(decision.why)
             self._peers.say(INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
+        self._wait_for_rest()   # somebody may have turned the joints while the plan was made
         with self._lock:
-            if not self._wanted:   # stopped while the plan was made
+            if not self._wanted:   # stopped meanwhile
                 return
             points = self.driver.begin(decision.motion.points(self.driver.position), decision.motion.words, time.monotonic())
             self.motion, self.seconds = decision.motion, points.duration

@@ -223,6 +223,11 @@ SIGNS = _of(
 LIVE = _of(
     'imu_calibration',
     ('a swing goes beyond the end of its joint', 'planning/repertoire.py', 'away, amplitude = largest * most[0],', 'away, amplitude = 0.99 * largest * most[0],', 'test_planning_motions.py'),
+    ('a motion begins while the joints move', 'driving/driver.py', 'if not self.rests:\n            raise', 'if False:\n            raise', 'test_driving.py'),
+    ('joints rest as soon as they are started', 'driving/driver.py', 'self._slow, self._rested_at = True, None', 'self._slow = True', 'test_driving.py'),
+    ('a clock set back counts as rest for ever', 'driving/driver.py', 'or self._time < self._rested_since\n', '\n', 'test_driving.py'),
+    ('nobody waits until the joints rest', 'nodes/planner_worker.py', 'and not self.driver.rests:', 'and False:', 'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
+    ('joint states wait in line', 'nodes/inputs.py', 'if self.drain():\n', 'if False:\n', 'test_planner_node.py::test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once'),
     ('a node without work is not woken to end', 'nodes/lifecycle.py', '_look_again(node)\n        if', 'if', 'test_node_ends.py'),
     ('its own work taken for silence of the sensor', 'nodes/calibration_worker.py', 'self._watch.state(self._looked)', 'self._watch.state(time.monotonic())', 'test_calibration_worker.py'),
     ('its own work taken for the end of the motion', 'nodes/calibration_worker.py', 'not self._closed and self._looked -', 'not self._closed and time.monotonic() -', 'test_calibration_worker.py'),
