@@ -1,6 +1,6 @@
 # Two commands do all set-up on a machine that has Python 3.11 or later, its venv module and make:
 #   make demo    a simulated recording, its calibration, a compensated bag and a report
-#   make test    every test
+#   make test    every test but the three dozen longest, which make test-long runs
 # With a ROS 2 Jazzy sourced its rclpy is used, otherwise rclpy comes from PyPI; all versions are pinned in constraints/.
 
 PYTHON ?= python3
@@ -35,11 +35,11 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 # Three processes on two cores: tests over DDS mostly wait. conftest.py says which files begin first.
 PYTEST = $(PY) -m pytest $(PLUGINS) -n 3 --dist loadfile
 
-.PHONY: help setup demo live-demo test test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
+.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, noise-coverage, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, noise-coverage, hide-and-seek, clean'
 
 setup: $(STAMP)
 
@@ -62,11 +62,15 @@ live-demo: $(STAMP)
 	@$(PY) examples/live_demo.py --output $(OUTPUT)
 
 test: $(STAMP)
-	$(PYTEST) $(TEST_OPTIONS)
+	$(PYTEST) -m 'not long' $(TEST_OPTIONS)
+
+# The longest tests, which take as long as half of the others together.
+test-long: $(STAMP)
+	$(PYTEST) -m long $(TEST_OPTIONS)
 
 # Everything but what is long or needs DDS.
 test-fast: $(STAMP)
-	$(PYTEST) -m 'not slow and not dds' $(TEST_OPTIONS)
+	$(PYTEST) -m 'not slow and not long and not dds' $(TEST_OPTIONS)
 
 # Libraries that some tests compare with; without them these tests are skipped.
 oracles: $(STAMP)
@@ -84,7 +88,7 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
 test-oldest:
-	$(MAKE) test VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
+	$(MAKE) test test-long VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
 
 # Each declared line of the guards broken, one at a time (test/mutants/declared.py): which faults does no test notice?
 mutants: $(STAMP)

@@ -31,7 +31,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
-    long = Counter(item.path for item in items if item.get_closest_marker('slow') or item.get_closest_marker('dds'))
+    long = Counter(item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'dds'))))
     items.sort(key=lambda item: -long[item.path])
 
 

@@ -41,7 +41,7 @@ def test_a_page_is_written_with_what_its_commands_print(tmp_path):
         answers.run('rm -r /')
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_commands_still_print_what_the_pages_say(tmp_path):
     """`make answers` writes the pages anew."""
     with answers.inside(tmp_path):

@@ -26,7 +26,7 @@ def world():
     return make_arm_world(100, joint_error=3e-4, place_error=3e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_imu_is_calibrated_on_an_arm_with_wrong_joints(world):
     errors, calibration = deviations(world)
     assert np.abs(list(errors.values())).max() < 4.5 and np.mean(np.square(list(errors.values()))) < 2.0

@@ -169,7 +169,7 @@ def test_a_cause_of_the_table_that_spoils_the_other_sensor_is_no_cause(monkeypat
     assert not search.shows_alike([question], question) and not found.named
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(tmp_path, capsys):
     session = physics.make_session(5, None, 'white', cause=Beyond('scale_under_load', 5))
     physics.write_bag(session, tmp_path / 'bag')
@@ -196,7 +196,7 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
     assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(extended), '--anyway', '--output', str(tmp_path / 'bag3')]) in (0, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_there_stays():
     """Three quarters of a cube look like its base, and a scale that settles while it warms up like a thermal one; what is there stays, alone or beside another cause."""
     for kind in ('force_cubed_in_gyro', 'gyro_scale_settling'):

@@ -158,6 +158,7 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late):
     assert mates[0] == found.attempt.questions[0].name
 
 
+@pytest.mark.long
 def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(late, monkeypatch):
     monkeypatch.setattr(investigation, '_that_help', lambda *_: [])
     found = investigated(late)
@@ -226,6 +227,7 @@ def test_what_a_rest_may_move_biases_by():
     assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [{'gyroscope.bias.z': 0.0}]
 
 
+@pytest.mark.long
 def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
     session = make_session(7, {'knock_step': 0.05}, 'realistic')
     result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))

@@ -54,6 +54,7 @@ def test_diagnose_hands_over_what_calibrate_does(bent, asked):
     assert (value, sd) == (asked.calibration.values[place], asked.calibration.sd[place])
 
 
+@pytest.mark.long
 def test_live_it_is_in_the_model_as_well(bent, asked):
     live = make_live()
     run(live, bent[0])

@@ -139,6 +139,7 @@ def values_of(station, name):
     return {pair.key: pair.value for pair in status.values} if status else {}
 
 
+@pytest.mark.long
 def test_a_hidden_effect_is_named_live(tmp_path):
     """Quadratic terms that the model lacks: diagnostics say so, as the verb does of the same bag, and the calibration is the verb's."""
     session = physics.make_session(3, {'accel_quadratic': None})
@@ -174,12 +175,14 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     assert status.level == b'\1' and first.explanation in status.message
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_a_recording_by_hand_through_the_node_is_the_recording_offline(recordings, tmp_path):
     """No table, no joint states: poses are counted, the direction that is missing is named, the document is that of the offline tool."""
     check_by_hand(recordings / 'mpu9150_0', tmp_path, rate=8.0)
 
 
+@pytest.mark.long
 def test_poses_by_hand_through_the_node(tmp_path):
     """The same with a made-up recording."""
     imu, _, _ = simulate(1)

@@ -103,7 +103,7 @@ def test_noise_free_session_gives_the_truth(session):
     np.testing.assert_allclose(solution.values, truth, atol=2e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reported_standard_deviations_match_the_scatter(session):
     """
     A hundred and twenty sessions with white noise and wandering biases: normalised errors, coverage, sd ratios, and efficiency.

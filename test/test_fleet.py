@@ -115,7 +115,7 @@ def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     assert_same_files(tmp_path, result[1])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_gives_the_same_bytes(recordings, result, tmp_path):
     """A scheduler with two workers does the same work."""
     distributed = pytest.importorskip('dask.distributed', reason='the extra dask is not installed')

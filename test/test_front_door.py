@@ -219,7 +219,7 @@ def test_the_notebook_runs_cell_by_cell_and_shows_its_plots():
     assert max(map(abs, names['error'].values())) < 4.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_notebook_is_a_script_too(tmp_path):
     done = subprocess.run([sys.executable, '-W', 'error', str(ROOT / 'examples/notebook.py')], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -90,7 +90,7 @@ def test_biases_that_agree_stay_one(motion):
             assert np.all(solution.sd[MODEL.slices[sensor, 'bias']] < 0.95 * sds[sensor])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_standard_deviations_hold_when_biases_differ(motion):
     """
     Errors against the mean of all possible recordings, in reported sd, over 40 sets of four recordings.
@@ -110,7 +110,7 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     assert 0.85 < np.delete(square, biases, axis=1).mean() < 1.15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_a_smaller_recording_shows_is_taken_in():
     """Long rests show no delay; two minutes of motion with the same IMU and a driver that is 12 ms late do."""
     pair = make_pair('driver_lag', 31)

@@ -13,7 +13,7 @@ WORSE = 1.05
 """No kind of motion may get worse by more."""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(('cause', 'world'), [
     ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}), ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
     ('flexible_mount', {}), ('backlash', {}), ('stamp_bursts', {}),

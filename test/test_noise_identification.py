@@ -228,7 +228,7 @@ def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
     assert np.sqrt(taken.coefficients[-1]) == pytest.approx(truth.figures['gauss_markov'], rel=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_hold_the_truth_in_95_of_100_and_errors_are_close_to_the_bound():
     """Forty records of ten minutes; the whole measurement is benchmarks/noise_records.py. Binomial sd 3.4 %."""
     figures = {'white_noise': 1.0, 'random_walk': 0.05}

@@ -250,7 +250,7 @@ class Loop(Station):
 
 
 @pytest.mark.dds
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_path):
     with Loop(tmp_path / 'out.txt') as loop:
         loop.begin(tmp_path)
@@ -269,6 +269,7 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
     assert 'motion 1, ' in said and 'asking what the model gets wrong' in said and 'Traceback' not in said
 
 
+@pytest.mark.long
 @pytest.mark.dds
 @pytest.mark.parametrize('fault, words', [
     ({'refuse_after': 0}, 'the controller refused it or does not listen'), ({'stall_joint': 'middle', 'stall_time': 0.0}, '')])
@@ -284,6 +285,7 @@ def test_a_table_that_refuses_or_stalls_ends_everything_with_one_sentence(tmp_pa
         assert loop.value('state') == 'stopped'   # and nothing goes on
 
 
+@pytest.mark.long
 @pytest.mark.dds
 def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_moving(tmp_path):
     from sensor_msgs.msg import JointState
@@ -311,7 +313,7 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
 
 
 @pytest.mark.dds
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_leaves_nothing_moving(tmp_path):
     from sensor_msgs.msg import JointState
     from visualization_msgs.msg import MarkerArray

@@ -161,7 +161,7 @@ BOARD_MM = {1: (-9.45, 9.45, 1.0), 3: (-9.45, -9.45, 1.0), 5: (9.45, 9.45, 1.0),
 PAIRS = ((1, 3), (1, 7), (3, 5), (3, 7))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.real_data
 def test_boards_of_four_imus(recordings):
     """

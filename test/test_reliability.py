@@ -79,6 +79,7 @@ def answer_of(station, folder):
     return calibration_from_text((folder / 'calibration.yaml').read_text())
 
 
+@pytest.mark.long
 def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, session, tmp_path):
     imu, joints, values, model = session
     rng = np.random.default_rng(5)
@@ -140,6 +141,7 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
 
 
+@pytest.mark.long
 def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, tmp_path):
     imu, joints, values, model = beginning(session, 110.0)
     half = imu.stamp_ns[0] + int(60e9)
@@ -181,6 +183,7 @@ def test_signals_in_mid_session_leave_whole_files_and_exit_code_zero(station, se
     assert station.processes.end(compensator, signal.SIGTERM) == 0
 
 
+@pytest.mark.long
 def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp_path):
     sessions = {'left': beginning(session), 'right': beginning(make_session(4, 50.0))}
     sent, documents = {}, {}
@@ -202,6 +205,7 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
         assert np.max(np.abs(errors)) < SIGMA < 0.1 * np.max(np.abs(others))
 
 
+@pytest.mark.long
 def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
     imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=29.0)
     write_session(tmp_path / 'fast', imu, joints)
@@ -214,6 +218,7 @@ def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(stat
     assert station.processes.end(node) == 0
 
 
+@pytest.mark.long
 def test_ten_minutes_of_data_leave_no_memory_behind(tmp_path):
     found = soak(600.0, 20.0, tmp_path, 100.0, 50.0)
     for name, (middle, last, n_imu) in found.items():

@@ -47,7 +47,7 @@ def test_example_runs_and_reports(name, lines):
     assert findings.count('\n') >= 12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.dds
 def test_a_navigation_node_is_better_off_with_corrected_readings(tmp_path):
     """Over DDS from a bag: the corrected path ends near the true one, the other one does not."""

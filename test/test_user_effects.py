@@ -45,7 +45,7 @@ def reference(n=50):
     return Reference(np.linspace(0.0, 400.0, n), np.broadcast_to(np.eye(3), (n, 3, 3)), *vectors, 9.8, np.full(n, 30.0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(mine, tmp_path, capsys):
     bag, out = tmp_path / 'bag', tmp_path / 'out'
     assert main(['simulate', '--effects', str(mine), '--effect', 'gyro_warm_force', '--size', '0.5', '--profile', 'quick', '--seed', '5',

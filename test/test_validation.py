@@ -142,7 +142,7 @@ def test_the_truth_of_python_ins_is_recovered():
     assert len(rows) >= 24 and largest < 4 and 0.5 < spread < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.dds
 @pytest.mark.real_data
 def test_one_imu_predicts_another_live(recordings):

@@ -55,7 +55,7 @@ def test_before_anything_came_the_screen_is_short():
     assert shown({'streams': NodeStatus(2, 'no Imu messages come')}, '').strip().splitlines() == ['calibration_node', 'streams  no Imu messages come']
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.dds
 def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     pytest.importorskip('rclpy')

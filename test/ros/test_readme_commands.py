@@ -154,6 +154,7 @@ def answered(terminals, command):
     raise AssertionError(f'{command}\nis not answered, asked three times:\n{asked.shown()}')
 
 
+@pytest.mark.long
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
     calibrator.wait('Imu messages come on /imu/data_raw from /simulator_node', 'JointState messages come', 'first window gathered')

@@ -97,6 +97,7 @@ def test_output_and_exit_code_are_those_of_the_plain_command(place, line):
     assert written == {path: path.read_bytes() for path in written}
 
 
+@pytest.mark.long
 def test_the_doctor_names_what_is_wrong_with_imu_topics_and_leaves_a_good_one_in_peace(place):
     folder, shell, environment = place
     with subprocess.Popen([sys.executable, '-c', FAULTY], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as driver:
