@@ -38,7 +38,7 @@ def test_an_imu_is_calibrated_on_an_arm_with_wrong_joints(world):
     assert any({'reference.encoder_zero.lift', 'reference.encoder_zero.elbow'} <= set(parameters) for parameters in mixed)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_joints_taken_at_their_word_spoil_the_calibration(world):
     """The quiet counterpart: without the joints' errors in the model the matrices are ten times less exact, and their standard deviations say so."""
     true = {name: value for name, value in truth(world).items() if '.matrix.' in name}

@@ -79,6 +79,7 @@ def test_what_only_one_half_shows_is_left_out_and_widens():
     assert grown.min() >= 1.0 and grown.max() > 1.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('seed', range(4))
 def test_a_warm_up_is_not_sold_as_an_answer_to_gravity(seed):
     samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0, still=3.0)

@@ -129,7 +129,7 @@ def test_noise_free_recording_gives_the_truth():
     assert np.max(np.abs(error[9:])) < 1e-6  # the integration's error at 5 ms
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize('seeds, sensitivity', [(60, 0.0), (25, 5e-4)])
 def test_reported_sd_are_honest(seeds, sensitivity):
     """

@@ -92,6 +92,7 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     assert 0.8 < diagnosis.solution.chi2_per_dof['accelerometer']['means'] < 1.3
 
 
+@pytest.mark.long
 def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wander_is_noise():
     """Fifteen mm/s^2 over eight kelvins beside a wander of three times the data sheet's size in 15 s, which learnt from the drift itself hid it; the wander alone."""
     for hidden, names in (({'accel_thermal_bias': np.array([2.0e-3, -1.5e-3, 1.2e-3])}, {'accel_thermal_bias'}), (None, set())):

@@ -55,6 +55,7 @@ def responding():
     return diagnosed(31, HIDDEN['gyro_g_sensitivity'])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('name', sorted(HIDDEN))
 def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name])).diagnosis
@@ -176,6 +177,7 @@ def test_too_few_poses_are_refused_with_their_number():
         diagnose_by_hand(gather_by_hand(imu, ranges), HandOptions(GRAVITY))
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_xsens_counts_tells_no_stories(recordings):
     """The accelerometer scatters beyond its noise and no effect claims it; the gyroscope's answer to gravity is found and predicts."""

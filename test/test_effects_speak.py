@@ -189,7 +189,7 @@ def test_diagnosis_finds_and_names_it(name):
     assert ADDED[name]['text'] in found.report
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize('name', INVERTED)
 def test_by_hand_it_is_found_too(name):
     made = session(name)

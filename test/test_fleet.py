@@ -108,7 +108,7 @@ def test_a_unit_has_the_word_of_each_sensor(result):
     assert 'bad (accelerometer bad, gyroscope good)' in page and '<span class="tag bad">' in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     """Two units at a time write what one after the other writes."""
     assert run_fleet(recordings[0], tmp_path, '--jobs', '2') == result[0]

@@ -71,6 +71,7 @@ def test_the_page_of_contents_lists_every_package():
     assert packages <= listed and [name for name in listed - packages if not (ROOT / f'imu_calibration/{name}.py').exists()] == []
 
 
+@pytest.mark.long
 def test_two_lines_give_what_the_command_line_writes(found, tmp_path):
     found.save(tmp_path / 'notebook')
     assert main(['calibrate', str(SESSION), '--table', str(TABLE), '--output', str(tmp_path / 'verb')]) == found.exit_code == 0
@@ -203,7 +204,7 @@ def cells(path):
     return [code for head, code in zip(parts[1::2], parts[2::2], strict=True) if 'markdown' not in head]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_notebook_runs_cell_by_cell_and_shows_its_plots():
     """As a notebook does it: each cell is run, and its last expression is shown."""
     names, shown = {}, []

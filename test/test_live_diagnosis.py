@@ -89,6 +89,7 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
     assert_same(live.solve(pending=True).calibration, expected.calibration)
 
 
+@pytest.mark.long
 def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
     live = LiveCalibration(Table.from_mapping(hidden.table))
     every = list(blocks(hidden.imu, hidden.joints))

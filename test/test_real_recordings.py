@@ -46,6 +46,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
     print(f'{name}: gyroscope scale along the shaft {found:.4f} (known {scale}), lag {lag * 1e3:.1f} ms (known 12-14)')
 
 
+@pytest.mark.long
 def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
     """Found as an offset of the clocks (or a lag of the gyroscope, the same to first order), with its gain on held-out windows, and no story beside it. `make validate` asks of both shafts."""
     folder = recordings / name

@@ -166,6 +166,7 @@ def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, t
     assert station.processes.end(second) == 0
 
 
+@pytest.mark.long
 def test_signals_in_mid_session_leave_whole_files_and_exit_code_zero(station, session, tmp_path):
     imu, joints, _, _ = session
     topics = {'imu/data_raw': '/imu/data_raw', 'joint_states': '/joint_states'}

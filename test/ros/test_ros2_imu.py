@@ -77,6 +77,7 @@ def test_every_verb_of_the_plain_command_is_offered(place):
     assert shell('ros2 imu').returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('line', [
     f'inspect {ROOT}/bags/sample_session',
     f'inspect {ROOT}/bags/sample_session --table {TABLE}',
