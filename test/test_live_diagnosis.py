@@ -1,7 +1,6 @@
 """The live diagnosis says what the verb says of the same recording; what it finds joins the model; it never holds up the rest. No ROS here."""
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +24,8 @@ from worlds.misfit_worlds import make_pair
 
 pytest.importorskip('rclpy')
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
+
+from ros.threads import until  # noqa: E402
 
 
 class Station:
@@ -207,14 +208,6 @@ class Slow:
         return other is self
 
 
-def until(condition):
-    """Wait a little."""
-    deadline = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
     monkeypatch.setattr('imu_calibration.nodes.diagnosis_thread.SHARE', 1.0)   # a busy machine makes the first answer long, and the pause after it
     thread, question = DiagnosisThread(3600.0), Slow('first')
@@ -226,9 +219,9 @@ def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
     thread.ask_when_due(question, True)
     assert question.asked == 1 and thread.is_running
     question.go.set()
-    until(lambda: not thread.is_running)
+    until(lambda: not thread.is_running, 'the answer', 10.0)
     assert thread.state.message == 'first' and thread.n_answers == 1
-    until(lambda: thread.ask_when_due(question, False) or thread.n_answers == 2)   # it was wanted while the first was being answered
+    until(lambda: thread.ask_when_due(question, False) or thread.n_answers == 2, 'the second question', 10.0)   # it was wanted while the first was being answered
 
 
 def test_a_session_started_anew_forgets_the_question_and_an_ending_one_stops_it():
@@ -238,7 +231,7 @@ def test_a_session_started_anew_forgets_the_question_and_an_ending_one_stops_it(
         thread.ask_when_due(question, True)
         assert thread.is_running
         ending()
-        until(lambda: not thread.is_running)
+        until(lambda: not thread.is_running, 'the answer', 10.0)
         assert thread.state.word == 'waiting' and thread.n_answers == 0
 
 
@@ -249,7 +242,7 @@ def test_a_failure_is_a_status_and_zero_is_off():
     thread = DiagnosisThread(3600.0)
     thread.want()
     thread.ask_when_due(Broken, True)
-    until(lambda: not thread.is_running)
+    until(lambda: not thread.is_running, 'the answer', 10.0)
     assert thread.state.word == 'failed' and 'broken' in thread.state.message
     off = DiagnosisThread(0.0)
     off.want()

@@ -20,17 +20,10 @@ pytest.importorskip('tornado', reason='tornado is not installed')
 from imu_calibration.use_cases.foxglove_server import AGAIN, FoxgloveServer  # noqa: E402
 
 from ros.foxglove_client import FoxgloveClient  # noqa: E402
+from ros.threads import until  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 SESSION, TABLE = str(ROOT / 'bags/sample_session'), str(ROOT / 'bags/sample_session/table.yaml')
-
-
-def until(condition, what, patience=20.0):
-    """Wait for something that other threads do."""
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end, f'waited in vain for {what}'
-        time.sleep(0.01)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_
 
 from ros.live_station import TABLE, Station  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
+from ros.threads import until  # noqa: E402
 
 NAMES = ('outer', 'inner')
 POINTS = TrajectoryPoints(NAMES, np.array([1.0]), np.array([[0.1, 0.2]]), np.zeros((1, 2)), np.zeros((1, 2)))
@@ -168,28 +169,20 @@ def working(patience):
     return worker, driver, said
 
 
-def until(condition, seconds=20.0):
-    """Wait for a thread."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
     worker, driver, said = working(60.0)
-    until(lambda: worker.doing == 'waiting until the joints rest')
+    until(lambda: worker.doing == 'waiting until the joints rest', 'the wait')
     assert not driver.began and not said
     driver.rests = True
-    until(lambda: said[1:])
+    until(lambda: said[1:], 'what it says')
     worker.end()
     assert driver.began == ['turn'] and said[0] is POINTS and said[1].endswith('turn; it helps')
     worker, driver, said = working(0.5)
-    until(lambda: said[1:])
+    until(lambda: said[1:], 'what it says')
     worker.end()
     assert not driver.began and said == ['stop', 'the joints must rest before a motion begins, they have not within 0.5 s; see what moves them']
     worker, driver, said = working(60.0)
-    until(lambda: worker.doing == 'waiting until the joints rest')
+    until(lambda: worker.doing == 'waiting until the joints rest', 'the wait')
     worker.halt('stopped by hand')   # while it waits
     driver.rests = True
     time.sleep(0.2)

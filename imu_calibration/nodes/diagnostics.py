@@ -9,11 +9,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from imu_calibration.errors import shortened
+from imu_calibration.nodes.timers import every
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PERIOD = 1.0
@@ -52,7 +51,7 @@ class DiagnosticsPublisher:
     def __init__(self, node: Node, collect: Callable[[], list]):
         self._node, self._collect = node, collect
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = node.create_timer(PERIOD, self.publish_now, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = every(node, PERIOD, self.publish_now)
 
     def publish_now(self) -> None:
         """Publish the present state; when it cannot be told, that is told."""

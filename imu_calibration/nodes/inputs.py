@@ -6,14 +6,13 @@ from difflib import get_close_matches
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from imu_calibration.nodes.qos import DEPTH, input_qos, latched_qos
+from imu_calibration.nodes.timers import every
 
 PERIOD = 0.25
 """Seconds between two looks at the publishers of the inputs."""
@@ -175,4 +174,4 @@ def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
     def look() -> None:
         for each in inputs:
             each.look()
-    node.create_timer(PERIOD, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    every(node, PERIOD, look)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -15,6 +14,7 @@ from rclpy.utilities import remove_ros_args
 from imu_calibration.errors import ImuCalibrationError, shortened
 from imu_calibration.nodes.help import help_text
 from imu_calibration.nodes.parameters import unknown_parameters
+from imu_calibration.nodes.timers import every
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
@@ -97,7 +97,7 @@ def _look_again(node: Any) -> None:
     At a signal rclpy wakes the executor first and ends the context second: who finds the context still alive in between waits again, and
     nothing would wake it any more.
     """
-    node.create_timer(LOOK_AGAIN, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    every(node, LOOK_AGAIN, lambda: None)
 
 
 def _failed(line: str) -> int:

@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -44,6 +42,7 @@ from imu_calibration.nodes.planner_settings import PlannerNodeSettings
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
+from imu_calibration.nodes.timers import every
 from imu_calibration.planning.noise import expected_noise, require_grade
 from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
@@ -95,7 +94,7 @@ class PlannerNode(Node):
         self._calibrator = {what: self.create_client(Trigger, f'{settings.calibration_node}/{what}') for what in ('solve', 'diagnose')}
         for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
-        self.create_timer(PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        every(self, PERIOD, self._tick)
         self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
