@@ -157,6 +157,42 @@ def test_a_motion_begins_only_where_the_joints_rest():
     assert not driver.rests
 
 
+@pytest.mark.parametrize('clock', [1.0, 4.0, 0.25])
+def test_a_motion_that_was_stopped_before_the_controller_took_it_is_waited_for(clock):
+    # Joints that rest say nothing as long as the controller may still have both before it: the motion and the stop of it.
+    bench = Bench(lag=1.0)
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 3, kind='spin'))
+    sent, began = bench.now, bench.driver.position
+    bench.look()
+    bench.driver.stop('stopped by hand')
+    bench.driver.start()   # at once, before anything has moved
+    bench.table.follow(bench.now + 0.8, TrajectoryPoints.stop(NAMES))
+    steady, steps = bench.now, 0
+    while not bench.driver.rests:
+        assert bench.driver.awaits_stop or steps > 0.5 / STEP
+        bench.now += STEP
+        steps += 1
+        motion = bench.table.at(np.array([bench.now]))
+        bench.driver.observe(bench.now, motion.position[0], motion.rate[0], now=steady + steps * STEP / clock)
+    waited = bench.now - sent
+    assert np.max(np.abs(bench.driver.position - began)) > 0.01 and not bench.table.at(np.array([bench.now + 5.0])).rate.any()
+    assert waited == pytest.approx(3.0 * max(clock, 1.0), abs=0.1)   # by the joints' clock and by ours
+    bench.driver.stop('once more')   # nothing was in motion: nothing is waited for
+    assert bench.driver.rests and not bench.driver.awaits_stop
+
+
+def test_after_a_stop_a_clock_that_is_set_back_is_waited_for_from_where_it_is():
+    bench = Bench()
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 3, kind='spin'))
+    bench.driver.stop('stopped by hand')
+    for time, awaits in ((-50.0, True), (-48.0, True), (-46.9, False)):
+        bench.driver.observe(time, np.zeros(2), np.zeros(2), now=bench.now + 51.0 + time)
+        assert bench.driver.awaits_stop is awaits
+    assert bench.driver.is_silent(bench.now + 5.2) and not bench.driver.is_silent(bench.now + 5.0)
+
+
 @pytest.mark.parametrize('moment', np.linspace(0.0, 9.0, 7))
 def test_stop_is_safe_at_any_moment(moment):
     bench = Bench()

@@ -142,10 +142,13 @@ class Table:
 
     def __init__(self, patience):
         self.settings, self.state, self.rests, self.is_driving, self.reason = DriverSettings(settling_patience=patience), DriveState.IDLE, False, False, ''
-        self.position, self.motions, self.began = np.zeros(2), 0, []
+        self.position, self.motions, self.began, self.awaits_stop, self.silent = np.zeros(2), 0, [], False, False
 
     def start(self):
         self.state = DriveState.IDLE
+
+    def is_silent(self, now):
+        return self.silent
 
     def begin(self, points, words, now):
         self.began.append(words)
@@ -181,6 +184,15 @@ def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
     until(lambda: said[1:], 'what it says')
     worker.end()
     assert not driver.began and said == ['stop', 'the joints must rest before a motion begins, they have not within 0.5 s; see what moves them']
+    worker, driver, said = working(0.5)
+    driver.awaits_stop = True   # nobody moves the joints: the controller may be late, which is not complained of
+    until(lambda: worker.doing == 'waiting until the controller must have taken the stop', 'the wait for the stop')
+    time.sleep(1.0)
+    assert not said and not driver.began
+    driver.silent = True   # but no joint states at all are
+    until(lambda: said[1:], 'what it says')
+    worker.end()
+    assert said[1].startswith('the joints must rest') and not driver.began
     worker, driver, said = working(60.0)
     until(lambda: worker.doing == 'waiting until the joints rest', 'the wait')
     worker.halt('stopped by hand')   # while it waits
@@ -289,7 +301,8 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
         table['joints'] = [joint | slow for joint in table['joints']]
         path = tmp_path / 'slow.yaml'
         path.write_text(yaml.safe_dump(table))
-        loop.begin(tmp_path, {'table_file': path}, table_file=path)
+        # Late enough that joints which rest after the stop have begun neither the motion nor the stop of it.
+        loop.begin(tmp_path, {'table_file': path, 'stall_patience': 6.0}, table_file=path, lag=0.8)
         places = []
         loop.node.create_subscription(JointState, 'joint_states', lambda m: places.append(list(m.position)), 1000)
         loop.ask('start')

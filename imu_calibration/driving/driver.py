@@ -47,7 +47,8 @@ class DriverSettings:
     following_tolerance: float = setting(0.05, 'rad', 'a joint that turns stops everything when it is further from its path, however late '
                                          'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late')
     following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above')
-    stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long have stalled, or the trajectory was refused',
+    stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long have stalled, or the trajectory was refused; '
+                                    'after a stop in mid-motion the next one waits for so long, since the stop may be as late',
                                     (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing')
     silence: float = setting(1.0, 's', 'without joint states for so long everything is stopped', (0.1, 60.0),
                              'too small: stops when the machine is busy')
@@ -82,6 +83,7 @@ class Driver:
         self._watch: PathWatch | None = None
         self._rested_at: np.ndarray | None = None
         self._rested_since = self._settling_since = 0.0
+        self._stopped: tuple[float, float] | None = None
         self._slow = True
 
     @property
@@ -96,8 +98,25 @@ class Driver:
 
     @property
     def rests(self) -> bool:
-        """Whether the joints have rested for the settling time where they are: after a stop they need a while."""
-        return self._rested_at is not None and self._time - self._rested_since >= self.settings.settling_time
+        """Whether the joints have rested for the settling time where they are, and nothing that was sent is still to come."""
+        return (self._rested_at is not None and self._time - self._rested_since >= self.settings.settling_time
+                and not self.awaits_stop)
+
+    @property
+    def awaits_stop(self) -> bool:
+        """
+        Whether a motion that was stopped may still begin, or go on after a rest.
+
+        A controller may take `stall_patience` to do what it is told, by its clock and by ours: joints that rest before that
+        say nothing.
+        """
+        if self._stopped is None:
+            return False
+        return min(self._time - self._stopped[0], self._heard - self._stopped[1]) < self.settings.stall_patience
+
+    def is_silent(self, now: float) -> bool:
+        """Whether nothing was heard of the joints for too long, by a steady clock."""
+        return now - self._heard > self.settings.silence
 
     def start(self) -> None:
         """Allow motions, once the joints rest; the first one will be slow."""
@@ -125,7 +144,7 @@ class Driver:
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
             raise InputError(f'a motion may begin where the joints rest and nothing is wrong, the state is {self.state}: {self.reason}; '
                              'start anew')
-        if self.position is None or now - self._heard > self.settings.silence:
+        if self.position is None or self.is_silent(now):
             raise InputError('joint states must come before anything moves, none came; publish them')
         if not self.rests:
             raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest')
@@ -162,6 +181,8 @@ class Driver:
             Seconds of a steady clock.
 
         """
+        if self._stopped is not None and time < self._time:   # where the clock is set back the wait begins anew
+            self._stopped = time, now
         self._time, self._heard, self.position = time, now, np.asarray(position, float)
         self._note_rest()
         if self._watch is None or not self.is_driving:
@@ -180,7 +201,7 @@ class Driver:
 
     def tick(self, now: float) -> bool:
         """Look at the clock; return whether everything has to be stopped."""
-        if self.is_driving and now - self._heard > self.settings.silence:
+        if self.is_driving and self.is_silent(now):
             return self.stop(f'nothing was heard of the joints for {now - self._heard:.1f} s: stopped; see that joint states are published')
         return False
 
@@ -190,6 +211,8 @@ class Driver:
 
     def stop(self, why: str) -> bool:
         """Stop for a reason, from any state; return True."""
+        if self.state is DriveState.MOVING:
+            self._stopped = self._time, self._heard
         self._watch = None
         self._become(DriveState.STOPPED, why)
         return True

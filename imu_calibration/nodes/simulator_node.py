@@ -46,7 +46,8 @@ from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, r
 from msg_adapters.joint_trajectory import trajectory_from_message
 
 STRETCH = 0.1
-"""Seconds of simulated time that are computed together, times the time factor; a trajectory takes effect that much later."""
+"""Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a
+trajectory takes effect about half a second later."""
 
 
 @dataclass(frozen=True)
