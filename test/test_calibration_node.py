@@ -165,6 +165,7 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         station.until(lambda: 'accel_quadratic' in documents[-1], 'a calibration with it')
         assert station.call('/calibration_node/save').success
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
+        station.until(lambda: 'calibration_node: accelerometer accel_quadratic' in station.status, 'its diagnostics')
         group = station.status['calibration_node: accelerometer accel_quadratic']
     assert_same(live, calibration_from_text(calibration_to_text(offline.calibration)))   # the document has the common arm last
     assert live.statistics['added'] == offline.calibration.statistics['added'] and group.message.startswith('determined')
@@ -228,7 +229,7 @@ def check_the_poses(station, expected):
         figures = values_of(station, 'poses')
         return (int(figures['poses']), int(figures['turns'])) == (windows['static'], windows['turns'])
     station.until(counted, 'the poses and turns of the recording')
-    assert station.status['calibration_node: accelerometer bias'].level == b'\0'
+    station.until(lambda: station.status['calibration_node: accelerometer bias'].level == b'\0', 'a bias that is determined')
     print(f'by hand, live: {messages[0]} ... {messages[-1]}')
 
 
