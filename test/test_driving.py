@@ -56,20 +56,25 @@ def motion_points(limits, seed, names=NAMES, start=None, kind=None):
 
 
 class Bench:
-    """A driver and a simulated table, joint states every `STEP`, with the noise of an encoder."""
+    """A driver and a simulated table, joint states every `STEP`, with the noise of an encoder; its clock may run ahead of ours."""
 
-    def __init__(self, limits=LIMITS, names=NAMES, driver=DriverSettings(), **controller):
+    def __init__(self, limits=LIMITS, names=NAMES, driver=DriverSettings(), clock=1.0, **controller):
         self.table = TableController(None, names, limits=limits, settings=ControllerSettings(**controller))
         self.driver, self.now, self.rng, self.silent = Driver(names, limits, driver), 0.0, np.random.default_rng(1), False
-        self.sent, self.stops = [], 0
+        self.sent, self.stops, self.clock = [], 0, clock
         self.look()
+
+    @property
+    def steady(self):
+        """The time by our own clock."""
+        return self.now / self.clock
 
     def look(self):
         """Go on by a step; a stop is obeyed at once."""
         self.now += STEP
         motion = self.table.at(np.array([self.now]))
         told = motion.position[0] + self.rng.normal(0, 1e-4, len(self.driver.joint_names))
-        must_stop = self.driver.tick(self.now) if self.silent else self.driver.observe(self.now, told, motion.rate[0], now=self.now)
+        must_stop = self.driver.tick(self.steady) if self.silent else self.driver.observe(self.now, told, motion.rate[0], now=self.steady)
         if must_stop:
             self.stops += 1
             self.table.follow(self.now, TrajectoryPoints.stop(self.driver.joint_names))
@@ -79,7 +84,7 @@ class Bench:
         for _ in range(200):
             if not self.driver.rests:
                 self.look()
-        self.sent.append(self.driver.begin(points, 'a motion', self.now))
+        self.sent.append(self.driver.begin(points, 'a motion', self.steady))
         self.table.follow(self.now, self.sent[-1])
 
     def until_it_rests(self, seconds=120.0):
@@ -160,7 +165,7 @@ def test_a_motion_begins_only_where_the_joints_rest():
 @pytest.mark.parametrize('clock', [1.0, 4.0, 0.25])
 def test_a_motion_that_was_stopped_before_the_controller_took_it_is_waited_for(clock):
     # Joints that rest say nothing as long as the controller may still have both before it: the motion and the stop of it.
-    bench = Bench(lag=1.0)
+    bench = Bench(clock=clock, lag=1.0)
     bench.driver.start()
     bench.move(motion_points(LIMITS, 3, kind='spin'))
     sent, began = bench.now, bench.driver.position
@@ -168,13 +173,9 @@ def test_a_motion_that_was_stopped_before_the_controller_took_it_is_waited_for(c
     bench.driver.stop('stopped by hand')
     bench.driver.start()   # at once, before anything has moved
     bench.table.follow(bench.now + 0.8, TrajectoryPoints.stop(NAMES))
-    steady, steps = bench.now, 0
     while not bench.driver.rests:
-        assert bench.driver.awaits_stop or steps > 0.5 / STEP
-        bench.now += STEP
-        steps += 1
-        motion = bench.table.at(np.array([bench.now]))
-        bench.driver.observe(bench.now, motion.position[0], motion.rate[0], now=steady + steps * STEP / clock)
+        assert bench.driver.awaits_stop or bench.now - sent > 0.5
+        bench.look()
     waited = bench.now - sent
     assert np.max(np.abs(bench.driver.position - began)) > 0.01 and not bench.table.at(np.array([bench.now + 5.0])).rate.any()
     assert waited == pytest.approx(3.0 * max(clock, 1.0), abs=0.1)   # by the joints' clock and by ours
@@ -222,6 +223,30 @@ def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_
     assert bench.until_it_rests() is DriveState.STOPPED and bench.stops == 1
     assert re.match(sentence, bench.driver.reason), bench.driver.reason
     assert '\n' not in bench.driver.reason and bench.now < 25.0
+
+
+@pytest.mark.parametrize('clock', [1.0, 4.0, 0.25])
+def test_a_controller_has_its_patience_by_the_clock_of_the_joints_and_by_ours(clock):
+    patience = 3.0 * max(clock, 1.0)
+    bench = Bench(clock=clock, lag=0.9 * patience)   # it begins late, and not at all too late
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 2, kind='rest'))
+    assert bench.until_it_rests() is DriveState.MEASURING, bench.driver.reason
+    bench = Bench(clock=clock, lag=60.0)
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 2, kind='rest'))
+    sent = bench.now
+    assert bench.until_it_rests() is DriveState.STOPPED and bench.driver.reason.startswith('nothing moved for')
+    assert 0.0 <= bench.now - sent - patience < 1.0   # what lies within the tolerance of where it was counts as come further
+    bench = Bench(clock=clock)
+    bench.driver.start()
+    bench.move(motion_points(LIMITS, 2, kind='rest'))
+    while np.ptp([bench.driver.position, bench.sent[0].position[-1]], axis=0).max() > 0.3 and bench.driver.is_driving:
+        bench.look()
+    bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))   # somebody else stops it, long after it was sent
+    stopped = bench.now
+    assert bench.until_it_rests() is DriveState.STOPPED and 'has not come further for' in bench.driver.reason
+    assert 0.0 <= bench.now - stopped - patience < 1.0
 
 
 def test_a_joint_that_is_pushed_off_its_path_beyond_its_range_or_too_fast_stops_everything():

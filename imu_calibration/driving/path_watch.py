@@ -87,11 +87,6 @@ class PathWatch:
         """Share of the path's speed at which the joints have come along it."""
         return float(np.clip(self._came / self._took, SLOWEST, 1.0)) if self._took > 0 else 1.0
 
-    @property
-    def has_stalled_for(self) -> float:
-        """Seconds that the joints have not come further, as they would count at the path's own speed."""
-        return self.waited * self.pace
-
     def observe(self, time: float, position: np.ndarray) -> None:
         """Take where the joints are at `time`, s of their own clock."""
         elapsed = 0.0 if self._last is None else max(time - self._last, 0.0)

@@ -227,6 +227,8 @@ LIVE = _of(
     ('joints rest as soon as they are started', 'driving/driver.py', 'self._slow, self._rested_at = True, None', 'self._slow = True', 'test_driving.py'),
     ('a motion begins while the stopped one may still come', 'driving/driver.py', 'if self.state is DriveState.MOVING:\n            self._stopped', 'if False:\n            self._stopped', 'test_driving.py'),
     ('a stop is taken by one clock alone', 'driving/driver.py', 'return min(self._time - self._stopped[0], self._heard - self._stopped[1])', 'return (self._time - self._stopped[0])', 'test_driving.py'),
+    ('a stall is told by one clock alone', 'driving/driver.py', 'min(watch.waited, self._heard - self._further)', 'watch.waited', 'test_driving.py'),
+    ('a stall is counted from where nothing had moved', 'driving/driver.py', 'if self._watch.waited == 0.0:', 'if False:', 'test_driving.py'),
     ('a stop is awaited by a clock that was set back', 'driving/driver.py', 'self._stopped = time, now', 'pass', 'test_driving.py'),
     ('a late controller is called restless', 'nodes/planner_worker.py', 'if self.driver.awaits_stop and', 'if False and', 'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
     ('silent joints are waited for without end', 'nodes/planner_worker.py', 'and not self.driver.is_silent(time.monotonic()):', ':', 'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
