@@ -181,6 +181,9 @@ HAND = _of(
 )
 TRUST = _of(
     'imu_calibration',
+    ('white noise lost behind a vibration', 'allan/terms.py', 'if not count or (seen and', 'if not count or (True and', 'test_noise_identification.py::test_a_vibration_does_not_hide_the_white_noise'),
+    ('forms told apart by what none explains', 'allan/forms.py', 'return float(rest @ rest) / excess +', 'return float(rest @ rest) +',
+     'test_noise_identification.py::test_forms_of_a_curve_that_none_explains_are_told_apart_less'),
     ('bad verdicts are used', 'calibration/trust.py', 'if word == BAD else []', 'if False else []', 'test_trust.py'),
     ('disproven calibrations are used', 'calibration/trust.py', '*disproved(proof)]', ']', 'test_trust.py'),
     ('a calibration for another sensor is taken', 'nodes/adoption.py', 'calibration.frame_id != known:', 'False:', 'test_adoption.py'),
