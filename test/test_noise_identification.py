@@ -188,10 +188,15 @@ def test_what_the_sensor_filters_is_left_out_at_short_averaging_times():
     assert unfiltered.shortest == pytest.approx(PERIOD)
 
 
+def shaken(seed, *hum, n=20_000):
+    """Moments of white noise of 1 beside sines, pairs of amplitude and Hz, that make humps which no model explains."""
+    rng, time = np.random.default_rng(seed), np.arange(n) * PERIOD
+    sines = sum(amplitude * np.sin(2 * np.pi * frequency * time + frequency) for amplitude, frequency in hum)
+    return moments_from(rng.standard_normal(n) / np.sqrt(PERIOD) + sines)
+
+
 def test_a_vibration_is_named_with_its_frequency_and_widens_the_intervals():
-    rng, n = np.random.default_rng(5), 180_000
-    time = np.arange(n) * PERIOD
-    found = identify_axis(moments_from(rng.standard_normal(n) / np.sqrt(PERIOD) + np.sin(2 * np.pi * 0.05 * time)))
+    found = identify_axis(shaken(5, (1.0, 0.05), n=180_000))
     assert found.excess > 2
     frequency, amplitude = found.oscillation
     assert frequency == pytest.approx(0.05, rel=0.3) and amplitude == pytest.approx(1.0, rel=0.3)
@@ -203,18 +208,10 @@ def test_quantisation_is_taken_in_where_it_shows_only():
     assert 'quantisation' in with_steps.best.fit.names and 'quantisation' not in without.best.fit.names
 
 
-def shaken(seed, hum):
-    """Moments of white noise of 1 beside sines, pairs of amplitude and Hz, that make humps which no model explains."""
-    rng, n = np.random.default_rng(seed), 20_000
-    time = np.arange(n) * PERIOD
-    sines = sum(amplitude * np.sin(2 * np.pi * frequency * time + frequency) for amplitude, frequency in hum)
-    return moments_from(rng.standard_normal(n) / np.sqrt(PERIOD) + sines)
-
-
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_a_vibration_does_not_hide_the_white_noise(seed):
     """N is read where it shows, instead of leaving out until nothing of it is seen."""
-    found = identify_axis(shaken(seed, ((2.0, 0.4), (4.0, 7.0))))
+    found = identify_axis(shaken(seed, (2.0, 0.4), (4.0, 7.0)))
     term = found.terms['white_noise']
     assert found.excess > 2 and term.value == pytest.approx(1.0, rel=0.15) and 0.8 < term.interval[0] < 1.0 < term.interval[1]
 
@@ -222,7 +219,7 @@ def test_a_vibration_does_not_hide_the_white_noise(seed):
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_forms_of_a_curve_that_none_explains_are_told_apart_less(seed):
     """What a curve departs from every form by is no evidence between them: intervals average over more of them."""
-    moments = without_finest(shaken(seed, ((3.5, 0.25), (6.0, 7.0))), 4)
+    moments = without_finest(shaken(seed, (3.5, 0.25), (6.0, 7.0)), 4)
     counted = [len(choose_form(moments, excess).having('white_noise')[1]) for excess in (90.0, 1.0)]
     assert counted[0] > counted[1]
 

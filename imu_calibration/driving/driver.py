@@ -48,8 +48,8 @@ class DriverSettings:
                                          'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late')
     following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above')
     stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long, by their clock and by ours, have stalled, or '
-                                    'the trajectory was refused; '
-                                    'after a stop in mid-motion the next one waits for so long, since the stop may be as late',
+                                    'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
+                                    'stop may be as late',
                                     (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing')
     silence: float = setting(1.0, 's', 'without joint states for so long everything is stopped', (0.1, 60.0),
                              'too small: stops when the machine is busy')
@@ -82,7 +82,6 @@ class Driver:
         """Where the joints were seen last."""
         self._time, self._heard = 0.0, -np.inf
         self._watch: PathWatch | None = None
-        self._further = 0.0
         self._rested_at: np.ndarray | None = None
         self._rested_since = self._settling_since = 0.0
         self._stopped: tuple[float, float] | None = None
@@ -152,7 +151,7 @@ class Driver:
             raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
-        self._watch, self._further, self._slow = PathWatch(self.position, points, self.tolerance), now, False
+        self._watch, self._slow = PathWatch(self.position, points, self.tolerance), False
         self.motions += 1
         self._become(DriveState.MOVING, words)
         return points
@@ -192,9 +191,7 @@ class Driver:
         if trouble := self._beyond(position, rate):
             return self.stop(trouble)
         if self.state is DriveState.MOVING:
-            self._watch.observe(time, self.position)
-            if self._watch.waited == 0.0:
-                self._further = now
+            self._watch.observe(time, self.position, now=now)
             if trouble := self._straying():
                 return self.stop(trouble)
             if self._watch.at_end:
@@ -256,8 +253,7 @@ class Driver:
             return (f'joint {self._told(joint, self.position)} does not follow: the joints are '
                     f'{self._amount(joint, watch.deviation.max() * self.tolerance[joint])} from their path: stopped; '
                     'see whether something holds it')
-        # A simulated clock that runs ahead of ours gives the controller less time than it says.
-        if min(watch.waited, self._heard - self._further) * watch.pace <= self.settings.stall_patience:
+        if watch.has_stalled_for <= self.settings.stall_patience:
             return ''
         if not watch.has_begun:
             return (f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '

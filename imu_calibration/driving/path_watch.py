@@ -63,12 +63,13 @@ class PathWatch:
         self._rest_end = edge[np.searchsorted(edge, np.arange(len(self._time)))]
         self._at, self._start = 0, np.asarray(start, float) / tolerance
         self._last: float | None = None
+        self._now = self._further = 0.0
         self._came = self._took = self._remainder = 0.0
         self._recent: deque = deque([(0.0, self._start)])
         self.has_begun = False
         """Whether the joints have left where they were."""
         self.waited = 0.0
-        """Seconds since the joints last came further along a path that goes on."""
+        """Seconds of their clock since the joints last came further along a path that goes on."""
         self.deviation = np.zeros(len(start))
         """Distance of each joint from the path, in tolerances."""
 
@@ -87,8 +88,17 @@ class PathWatch:
         """Share of the path's speed at which the joints have come along it."""
         return float(np.clip(self._came / self._took, SLOWEST, 1.0)) if self._took > 0 else 1.0
 
-    def observe(self, time: float, position: np.ndarray) -> None:
-        """Take where the joints are at `time`, s of their own clock."""
+    @property
+    def has_stalled_for(self) -> float:
+        """
+        Seconds that the joints have not come further, by their clock and by ours, as they would count at the path's own speed.
+
+        A simulated clock that runs ahead of ours gives the controller less time than it says.
+        """
+        return min(self.waited, self._now - self._further) * self.pace
+
+    def observe(self, time: float, position: np.ndarray, *, now: float) -> None:
+        """Take where the joints are at `time`, s of their own clock, and `now`, s of a steady one."""
         elapsed = 0.0 if self._last is None else max(time - self._last, 0.0)
         self._last, place = time, position / self.tolerance
         self._remember(time, place)
@@ -106,7 +116,9 @@ class PathWatch:
         further = self._at > before or self.at_end
         if further and not rests and self.has_begun:
             self._came, self._took = self._came + float(self._time[self._at] - self._time[before]), self._took + elapsed + self.waited
-        self.waited = 0.0 if further else self.waited + elapsed
+        self.waited, self._now = 0.0 if further else self.waited + elapsed, now
+        if self.waited == 0.0:
+            self._further = now
 
     def _remember(self, time, place):
         self.has_begun = self.has_begun or bool(np.max(np.abs(place - self._start)) > MOVED)

@@ -179,11 +179,14 @@ HAND = _of(
     ('spikes stay', 'segmentation/spike_filter.py', 'LARGE = 8.0', 'LARGE = 8e9', 'test_spike_filter.py'),
     ('fast motion passes for spikes', 'segmentation/spike_filter.py', 'np.maximum(1.4 * limit, ROUGH * rough)', '1.4 * limit', 'test_spike_filter.py'),
 )
+ALLAN = _of(
+    'imu_calibration/allan',
+    ('white noise lost behind a vibration', 'terms.py', 'if not count or (seen and', 'if not count or (True and', 'test_noise_identification.py::test_a_vibration_does_not_hide_the_white_noise'),
+    ('forms told apart by what none explains', 'forms.py', 'return float(rest @ rest) / excess +', 'return float(rest @ rest) +',
+     'test_noise_identification.py::test_forms_of_a_curve_that_none_explains_are_told_apart_less'),
+)
 TRUST = _of(
     'imu_calibration',
-    ('white noise lost behind a vibration', 'allan/terms.py', 'if not count or (seen and', 'if not count or (True and', 'test_noise_identification.py::test_a_vibration_does_not_hide_the_white_noise'),
-    ('forms told apart by what none explains', 'allan/forms.py', 'return float(rest @ rest) / excess +', 'return float(rest @ rest) +',
-     'test_noise_identification.py::test_forms_of_a_curve_that_none_explains_are_told_apart_less'),
     ('bad verdicts are used', 'calibration/trust.py', 'if word == BAD else []', 'if False else []', 'test_trust.py'),
     ('disproven calibrations are used', 'calibration/trust.py', '*disproved(proof)]', ']', 'test_trust.py'),
     ('a calibration for another sensor is taken', 'nodes/adoption.py', 'calibration.frame_id != known:', 'False:', 'test_adoption.py'),
@@ -230,8 +233,8 @@ LIVE = _of(
     ('joints rest as soon as they are started', 'driving/driver.py', 'self._slow, self._rested_at = True, None', 'self._slow = True', 'test_driving.py'),
     ('a motion begins while the stopped one may still come', 'driving/driver.py', 'if self.state is DriveState.MOVING:\n            self._stopped', 'if False:\n            self._stopped', 'test_driving.py'),
     ('a stop is taken by one clock alone', 'driving/driver.py', 'return min(self._time - self._stopped[0], self._heard - self._stopped[1])', 'return (self._time - self._stopped[0])', 'test_driving.py'),
-    ('a stall is told by one clock alone', 'driving/driver.py', 'min(watch.waited, self._heard - self._further)', 'watch.waited', 'test_driving.py'),
-    ('a stall is counted from where nothing had moved', 'driving/driver.py', 'if self._watch.waited == 0.0:', 'if False:', 'test_driving.py'),
+    ('a stall is told by one clock alone', 'driving/path_watch.py', 'min(self.waited, self._now - self._further)', 'self.waited', 'test_driving.py'),
+    ('a stall is counted from where nothing had moved', 'driving/path_watch.py', 'if self.waited == 0.0:', 'if self._further == 0.0:', 'test_driving.py'),
     ('a stop is awaited by a clock that was set back', 'driving/driver.py', 'self._stopped = time, now', 'pass', 'test_driving.py'),
     ('a late controller is called restless', 'nodes/planner_worker.py', 'if self.driver.awaits_stop and', 'if False and', 'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
     ('silent joints are waited for without end', 'nodes/planner_worker.py', 'and not self.driver.is_silent(time.monotonic()):', ':', 'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
@@ -273,4 +276,4 @@ BY_SENSOR = _of(
     ('who corrects takes the refused sensor too', 'nodes/adoption.py', 'if settings.anyway else trust.usable(calibration)', 'if True else trust.usable(calibration)',
      'test_adoption.py'),
 )
-MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *BEYOND, *HAND, *TRUST, *FILES, *SIGNS, *LIVE, *BY_SENSOR)
+MUTANTS = (*NOISE, *COVARIANCE, *SEARCH, *BEYOND, *HAND, *ALLAN, *TRUST, *FILES, *SIGNS, *LIVE, *BY_SENSOR)
