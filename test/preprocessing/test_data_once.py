@@ -1,0 +1,113 @@
+"""Data go through once: a sample is cleaned once, whoever looks at it, and a recording is read no oftener than its answer needs."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imu_calibration import files
+from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration import live_collector, verdict
+from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.estimation import observability
+from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.use_cases.inspect import inspect
+from imu_calibration.use_cases.recordings import Topics, source_of
+from msg_adapters.bag import Recording
+
+BAG = Path(__file__).resolve().parents[2] / 'bags' / 'sample_session'
+PLAIN = CalibrationOptions(reference_model='none')
+"""Nothing is linearised anew, which would take another pass."""
+
+
+@pytest.fixture
+def table():
+    return files.read_table(BAG / 'table.yaml')
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """Return counters: passes over the bag, its Imu samples, and samples that were cleaned."""
+    found, blocks, push = Counter(), Recording.blocks, StreamCheck.push
+
+    def counted_blocks(self, *arguments, **options):
+        found['passes'] += 1
+        for block in blocks(self, *arguments, **options):
+            found['samples'] += 0 if block.imu is None else len(block.imu)
+            yield block
+
+    def counted_push(self, samples):
+        found['cleaned'] += len(samples) if isinstance(samples, ImuSamples) else 0
+        return push(self, samples)
+    monkeypatch.setattr(Recording, 'blocks', counted_blocks)
+    monkeypatch.setattr(StreamCheck, 'push', counted_push)
+    return found
+
+
+def test_calibration_cleans_each_sample_once_for_windows_and_checks(table, seen):
+    calibrate([source_of(BAG, Topics(), table.joint_names)], table, PLAIN)
+    assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
+
+
+def test_calibration_by_hand_cleans_each_sample_once(seen):
+    try:
+        calibrate_without_table([source_of(BAG, Topics())])
+    except ImuCalibrationError:
+        pass   # what matters here was read
+    assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
+
+
+@pytest.mark.parametrize('with_table', [True, False], ids=['table', 'no table'])
+def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, seen, with_table):
+    (look,) = inspect(BAG, [Topics()], table if with_table else None, options=PLAIN)
+    assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
+    assert (look.calibrated is not None) == with_table and (look.by_hand is not None) != with_table
+
+
+def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):
+    def enough(windows, *arguments, **options):
+        raise ImuCalibrationError(f'{len(windows)} windows')
+    monkeypatch.setattr('imu_calibration.calibration.by_evidence.inquire', enough)
+    with pytest.raises(ImuCalibrationError, match=r'^\d\d+ windows'):
+        diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
+    assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
+
+
+def counting(monkeypatch, module, name):
+    """Count the calls of a function of a module."""
+    calls, function = [], getattr(module, name)
+
+    def counted(*arguments, **options):
+        calls.append(arguments)
+        return function(*arguments, **options)
+    monkeypatch.setattr(module, name, counted)
+    return calls
+
+
+def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monkeypatch):
+    judged, needed = counting(monkeypatch, verdict, 'judge'), counting(monkeypatch, observability, 'needed_motions')
+    result = calibrate([source_of(BAG, Topics(), table.joint_names)], table, CalibrationOptions(reference_model='table_tilt'))
+    assert result.verdict.lines() and result.needed is not None
+    assert len(judged) == len(needed) == 1
+
+
+def test_columns_of_a_window_are_computed_once_for_its_statistics_and_its_residuals(table, monkeypatch):
+    (block,) = list(source_of(BAG, Topics(), table.joint_names)())
+    half = block.imu.stamp_ns[len(block.imu) // 2]
+    first, second = (SampleBlock(*(s.select((s.stamp_ns < half) == early) for s in (block.imu, block.joints))) for early in (True, False))
+    live = LiveCalibration(table, PLAIN)
+    live.push(first)
+    live.solve()
+    calls = counting(monkeypatch, live_collector, 'columns')
+    windows = live.push(second)
+    told = live.residuals(windows)
+    assert len(told) > len(windows) > 10 and len(calls) == 2 * len(windows)
+    live._designs = {}
+    np.testing.assert_allclose(live.residuals(windows).force_s, told.force_s, atol=1e-12)
+    assert len(calls) == 4 * len(windows), 'without the columns at hand they are computed again'

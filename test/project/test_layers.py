@@ -1,0 +1,170 @@
+"""Imports run one way: nodes and cli, then msg_adapters, then the core, which needs numpy and scipy only."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
+"""Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports nothing by itself."""
+EDGE = {'cli', 'nodes', 'ros2', 'resources', 'use_cases', '__main__'}
+ROS = {'rclpy', 'ros2cli', 'ros2doctor', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
+LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
+LATE_OF_SCIPY = ('scipy.optimize', 'scipy.signal', 'scipy.stats')
+"""They would take half of the time in which a command or a node starts."""
+
+BLOCKED_IMPORTS = '''
+import importlib, sys
+
+class OnlyNumpyAndScipy:
+    def find_spec(self, name, path=None, target=None):
+        head = name.partition('.')[0]
+        if head not in {'numpy', 'scipy', 'imu_calibration', *sys.stdlib_module_names} and not head.startswith('_sysconfigdata'):
+            raise ModuleNotFoundError(f'{name} may not be imported here', name=name)
+
+sys.meta_path.insert(0, OnlyNumpyAndScipy())
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        print(f'{name}: {error}')
+'''
+
+
+def module_name(path):
+    """Dotted name of the module in `path`."""
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def modules(package):
+    """Every module file of `package`."""
+    return sorted((ROOT / package).rglob('*.py'))
+
+
+def core_modules():
+    """Modules of imu_calibration below the command line, the nodes and the installed files."""
+    return [path for path in modules('imu_calibration') if path.relative_to(ROOT).with_suffix('').parts[1] not in EDGE]
+
+
+@lru_cache(maxsize=None)
+def parsed(path):
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
+def imports(path, top_level_only=False):
+    """Absolute names of what `path` imports, at any depth or at import time only."""
+    tree = parsed(path)
+    package = module_name(path).split('.')
+    if path.name != '__init__.py':
+        package = package[:-1]
+    found = set()
+    for node in _at_import_time(tree) if top_level_only else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[:len(package) - node.level + 1] if node.level else []
+            name = '.'.join([*base, *([node.module] if node.module else [])])
+            found |= {name, *(f'{name}.{alias.name}' for alias in node.names)}
+    return found
+
+
+def _at_import_time(node):
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            yield child
+            yield from _at_import_time(child)
+
+
+def heads(names):
+    """First parts of dotted names."""
+    return {name.partition('.')[0] for name in names}
+
+
+def ros_packages(names):
+    """Those of `names` that belong to ROS or read its bags."""
+    return {name for name in heads(names) if name in ROS or name.endswith('_msgs')}
+
+
+def inside(names, *packages):
+    """Those of `names` that lie in one of `packages`."""
+    return {name for name in names if any(name == package or name.startswith(f'{package}.') for package in packages)}
+
+
+def test_the_core_imports_with_numpy_and_scipy_alone_and_without_a_screen():
+    environment = {k: v for k, v in os.environ.items() if k not in ('DISPLAY', 'WAYLAND_DISPLAY', 'PYTHONPATH')}
+    command = [sys.executable, '-c', BLOCKED_IMPORTS, *map(module_name, core_modules())]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, ''), done.stdout + done.stderr
+
+
+@pytest.mark.parametrize('path', [path for path in core_modules() if path != FRONT_DOOR], ids=module_name)
+def test_the_core_knows_nothing_of_ros_or_of_the_layers_above(path):
+    assert not ros_packages(imports(path))
+    assert not inside(imports(path), 'msg_adapters', *(f'imu_calibration.{name}' for name in EDGE))
+
+
+@pytest.mark.parametrize('path', core_modules(), ids=module_name)
+def test_heavy_libraries_are_imported_where_they_are_used(path):
+    names = imports(path, top_level_only=True)
+    assert not heads(names) & LATE and not inside(names, *LATE_OF_SCIPY)
+
+
+@pytest.mark.parametrize('path', modules('msg_adapters'), ids=module_name)
+def test_adapters_know_no_node_and_no_command_line(path):
+    assert 'rclpy' not in heads(imports(path, top_level_only=True))
+    assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes')
+
+
+ORDER = (('chances', 'constants', 'errors', 'samples'), ('settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
+         ('estimation', 'preflight', 'simulation', 'compensation'), ('selection', 'allan'), ('beyond',), ('calibration', 'papers'), ('planning',), ('driving',), ('by_hand', 'exports'), ('diagnosis',), ('report',),
+         ('files', 'resources'), ('use_cases',), ('cli', 'nodes'), ('ros2', '__main__'))
+"""Packages and root modules from the ground up: each may import what stands in an earlier row."""
+
+
+@pytest.mark.parametrize('path', [path for path in modules('imu_calibration') if path != FRONT_DOOR], ids=module_name)
+def test_each_package_imports_only_what_stands_below_it(path):
+    height = {name: row for row, names in enumerate(ORDER) for name in names}
+    own = path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
+    others = {name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name} & set(height) - {own}
+    assert all(height[name] < height[own] for name in others), (own, others)
+
+
+def test_every_package_has_its_place_in_the_order():
+    found = {path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0] for path in modules('imu_calibration')} - {'__init__'}
+    assert found == {name for names in ORDER for name in names}
+
+
+def test_the_page_of_contents_goes_from_the_ground_up():
+    height = {name: row for row, names in enumerate(ORDER) for name in names}
+    text = ast.get_docstring(ast.parse(FRONT_DOOR.read_text()))
+    listed = [name for line in text.partition('Contents')[2].splitlines() for name in re.findall(r'^`(\w+)`', line)]
+    assert len(listed) > 15 and listed == sorted(listed, key=height.get)
+
+
+def test_every_package_says_what_comes_in_what_goes_out_and_what_to_read_first():
+    for folder in (ROOT / 'imu_calibration').iterdir():
+        if folder.is_dir() and any(folder.glob('*.py')):
+            text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) or ''
+            assert 'In: ' in text and 'Out: ' in text and 'Read `' in text, folder.name
+
+
+def test_a_class_name_means_one_thing():
+    homes = {}
+    for path in [*modules('imu_calibration'), *modules('msg_adapters')]:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                homes.setdefault(node.name, []).append(module_name(path))
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
+
+
+def test_modules_of_all_layers_were_found():
+    names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
+    assert {'imu_calibration.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names

@@ -1,0 +1,239 @@
+"""The package's own papers agree: manifest, set-up, pinned environments, make targets, installed files."""
+
+import ast
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from catkin_pkg.package import parse_package
+
+import imu_calibration
+from imu_calibration import resources
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'}
+FOREIGN = {'ekf_node', 'ekf_filter_node'}
+"""Of robot_localization, started only where that is asked for."""
+ROSDEP_KEYS = {
+    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
+    'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
+    # installed with those that need them; compression is in the standard library from Python 3.14 on
+    'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
+}
+NOBLE = {
+    'python3-numpy': 'python3-numpy', 'python3-scipy': 'python3-scipy', 'python3-yaml': 'python3-yaml', 'python3-jinja2': 'python3-jinja2',
+    'python3-matplotlib': 'python3-matplotlib', 'python3-rich': 'python3-rich', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
+    'python3-pytest': 'python3-pytest', 'python3-pytest-xdist': 'python3-pytest-xdist', 'urdfdom_py': 'ros-jazzy-urdfdom-py', 'xacro': 'ros-jazzy-xacro',
+    'ament_index_python': 'ros-jazzy-ament-index-python', 'launch': 'ros-jazzy-launch', 'launch_ros': 'ros-jazzy-launch-ros', 'rclpy': 'ros-jazzy-rclpy',
+    'ros2cli': 'ros-jazzy-ros2cli', 'ros2doctor': 'ros-jazzy-ros2doctor', 'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
+    'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs', 'sensor_msgs': 'ros-jazzy-sensor-msgs', 'std_msgs': 'ros-jazzy-std-msgs', 'std_srvs': 'ros-jazzy-std-srvs',
+    'geometry_msgs': 'ros-jazzy-geometry-msgs', 'nav_msgs': 'ros-jazzy-nav-msgs', 'tf2_msgs': 'ros-jazzy-tf2-msgs',
+    'builtin_interfaces': 'ros-jazzy-builtin-interfaces', 'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
+}
+"""Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
+EXTRAS = {'dask', 'foxglove'}
+"""Installed by those who ask for the extra of that name; the code goes without."""
+READ_SETUP = '''
+import json, setuptools
+from distutils.core import run_setup
+found = run_setup('setup.py', stop_after='init')
+print(json.dumps({'name': found.get_name(), 'version': found.get_version(), 'packages': found.packages, 'requires': found.install_requires,
+                  'scripts': found.entry_points['console_scripts'], 'data': found.data_files, 'license': found.get_license()}))
+'''
+
+
+@pytest.fixture(scope='module')
+def installed():
+    """What setup.py declares."""
+    done = subprocess.run([sys.executable, '-c', READ_SETUP], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope='module')
+def manifest():
+    """What package.xml declares."""
+    warnings = []
+    package = parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    assert warnings == []
+    package.validate()
+    return package
+
+
+def third_party_imports(*folders):
+    """Top-level names that the code in `folders` imports from elsewhere."""
+    ours = {'imu_calibration', 'msg_adapters', *sys.stdlib_module_names}
+    found = set()
+    for path in (p for folder in folders for p in (ROOT / folder).rglob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.partition('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add(node.module.partition('.')[0])
+    return found - ours
+
+
+def pinned(name):
+    """Lines of a constraints file and of those it includes, without comments alone and blank lines."""
+    lines = []
+    for line in (ROOT / 'constraints' / name).read_text().splitlines():
+        if line.startswith('-r '):
+            lines += pinned(line.split()[1])
+        elif line.strip() and not line.startswith('#'):
+            lines.append(line)
+    return lines
+
+
+def distribution(requirement):
+    """Normal form of the name in a requirement."""
+    return re.sub(r'[-_.]+', '-', re.match(r'[A-Za-z0-9._-]+', requirement).group()).lower()
+
+
+def test_manifest_set_up_and_module_agree(manifest, installed):
+    assert manifest.name == installed['name'] == resources.PACKAGE
+    assert manifest.version == installed['version'] == imu_calibration.__version__
+    assert manifest.licenses[0] == installed['license'] == 'Apache-2.0'
+    assert (ROOT / manifest.licenses[0].file).is_file()
+    assert manifest.get_build_type() == 'ament_python'
+
+
+def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
+    """By the table, and by rosdep itself where it is installed and has its lists."""
+    keys = {dependency.name for dependency in (*manifest.exec_depends, *manifest.test_depends, *manifest.build_depends)}
+    assert keys <= set(NOBLE), keys - set(NOBLE)
+    rosdep = shutil.which('rosdep')
+    known = rosdep and subprocess.run([rosdep, 'resolve', 'python3-numpy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
+    if not known or known.returncode:
+        return
+    for key in sorted(keys):
+        done = subprocess.run([rosdep, 'resolve', key, '--rosdistro=jazzy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0 and NOBLE[key] in done.stdout.split(), (key, done.stdout, done.stderr)
+
+
+OPTIONAL = {'dask', 'distributed', 'foxglove'}
+"""Extras of setup.py that only their own option needs."""
+
+
+def test_the_manifest_declares_what_the_code_imports(manifest):
+    declared = {dependency.name for dependency in manifest.exec_depends}
+    imported = third_party_imports('imu_calibration', 'msg_adapters', 'launch') - OPTIONAL
+    assert {ROSDEP_KEYS.get(name, name) for name in imported - EXTRAS} <= declared
+
+
+def test_console_scripts_are_those_of_the_contract_and_exist(installed):
+    targets = dict(re.split(r'\s*=\s*', script) for script in installed['scripts'])
+    assert set(targets) == EXECUTABLES
+    for target in targets.values():
+        module, function = target.split(':')
+        path = ROOT.joinpath(*module.split('.'))
+        path = path / '__init__.py' if path.is_dir() else path.with_suffix('.py')
+        names = {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
+        assert function in names, target
+
+
+def test_every_python_package_and_data_file_is_installed(installed):
+    folders = {path.parent for package in ('imu_calibration', 'msg_adapters') for path in (ROOT / package).rglob('*.py')}
+    assert set(installed['packages']) == {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
+    listed = {name for _, names in installed['data'] for name in names}
+    present = {str(path.relative_to(ROOT)) for pattern in ('config/*', 'launch/*.launch.py') for path in ROOT.glob(pattern)}
+    assert present | {'package.xml', 'resource/imu_calibration'} == listed
+    others = {path for path in (ROOT / 'imu_calibration').rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
+    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/report/templates'}
+
+
+@pytest.mark.parametrize('name', ['pypi.txt', 'jazzy-ubuntu2404.txt', 'oldest.txt'])
+def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
+    lines = pinned(name)
+    for line in lines:
+        requirement, _, reason = line.partition('#')
+        assert re.fullmatch(r'[\w.-]+==[\w.]+(; python_version < "3\.\d+")?', requirement.strip()), line
+        assert len(reason.split()) >= 2, f'why is this needed? {line}'
+    names = [distribution(line) for line in lines]
+    assert len(names) == len(set(names))
+    assert {distribution(requirement) for requirement in installed['requires']} <= set(names)
+
+
+def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
+    oldest = {distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned('oldest.txt')}
+    for requirement in installed['requires']:
+        if '>=' in requirement:
+            name, least = requirement.split('>=')
+            assert oldest[distribution(name)].startswith(least), requirement
+
+
+def test_the_readme_opens_with_the_equation_and_the_two_commands():
+    opening = (ROOT / 'README.md').read_text().partition('\n## ')[0]
+    assert 'measured = bias + matrix @ (true + lever-arm terms) + further effects' in opening
+    assert re.search(r'^make demo\b', opening, re.M) and re.search(r'^make test\b', opening, re.M)
+
+
+def test_every_file_that_a_make_target_runs_exists():
+    makefile = (ROOT / 'Makefile').read_text()
+    scripts = set(re.findall(r'\$\(PY\) (\w+/\w+\.py)', makefile))
+    assert {'examples/demo.py', 'examples/live_demo.py', 'benchmarks/run.py'} <= scripts
+    assert {script for script in scripts if not (ROOT / script).is_file()} == set()
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name)
+def test_launch_files_name_executables_and_config_files_that_exist(path):
+    text = path.read_text()
+    ast.parse(text)
+    nodes = set(re.findall(r'\b(\w+_node)\b', text)) - FOREIGN
+    assert nodes and nodes <= EXECUTABLES
+    files = set(re.findall(r"CONFIG, '(\w+\.yaml)'", text)) | ({f'{node}.yaml' for node in nodes} if "{name}.yaml" in text else set())
+    assert files and all((ROOT / 'config' / name).is_file() for name in files)
+
+
+def test_node_parameter_files_hold_one_documented_set_for_any_node_name():
+    for path in (ROOT / 'config').glob('*_node.yaml'):
+        assert path.stem in EXECUTABLES
+        (name, group), = yaml.safe_load(path.read_text()).items()
+        assert name == '/**' and set(group) == {'ros__parameters'}
+        lines = path.read_text().splitlines()
+        for parameter in group['ros__parameters']:
+            row = next(i for i, line in enumerate(lines) if line.strip().startswith(f'{parameter}:'))
+            assert lines[row - 1].strip().startswith('#') or '#' in lines[row], f'{path.name}: {parameter} has no comment'
+
+
+def test_links_of_the_documents_lead_somewhere():
+    for document in [*ROOT.glob('*.md'), *ROOT.glob('docs/**/*.md')]:
+        for target in re.findall(r'\]\(([^)#:]+)\)', document.read_text()):
+            assert (document.parent / target).exists(), f'{document.name}: {target}'
+
+
+def test_config_files_are_found_in_the_checkout():
+    assert resources.share_folder() == ROOT
+    assert resources.config_file('tolerances.yaml') == ROOT / 'config' / 'tolerances.yaml'
+
+
+def test_an_unknown_config_file_is_refused_with_those_there_are():
+    with pytest.raises(InputError, match="'nothing.yaml' does not exist in .*; the files there are .*tolerances.yaml"):
+        resources.config_file('nothing.yaml')
+
+
+@pytest.mark.parametrize('layout', ['lib/python3.11/site-packages', 'local/lib/python3.12/dist-packages'])
+def test_an_installation_answers_for_itself(tmp_path, monkeypatch, layout):
+    def share(prefix):
+        (prefix / 'share' / resources.PACKAGE / 'config').mkdir(parents=True)
+        (prefix / 'share' / resources.PACKAGE / 'package.xml').touch()
+        return prefix / 'share' / resources.PACKAGE
+
+    own, other = share(tmp_path / 'own'), share(tmp_path / 'other')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'other'))
+    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'own' / layout / resources.PACKAGE / 'resources.py'))
+    assert resources.share_folder() == own
+    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'elsewhere' / resources.PACKAGE / 'resources.py'))
+    assert resources.share_folder() == other
+
+
+def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():
+    listed = yaml.safe_load((ROOT / 'config' / 'tolerances.yaml').read_text())
+    flat = {(sensor, name): value for sensor, group in listed.items() for name, value in group.items()}
+    declared = {(effect.sensor, effect.name): effect.tolerance for effect in CATALOGUE.effects().values()}
+    assert flat == pytest.approx(declared, rel=1e-5)
