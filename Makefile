@@ -77,10 +77,12 @@ oracles: $(STAMP)
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/oracles.txt
 	@$(PIP) --no-deps --requirement constraints/oracles-alone.txt
 
-# Unused names and arguments, line length, docstrings, annotations: seconds.
+# Unused names and arguments, line length, docstrings, annotations, size of the product, marker words: less than a minute.
 lint: $(STAMP)-lint
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
+	@$(PY) tools/weigh.py
+	@$(PY) tools/plain.py
 
 $(STAMP)-lint: $(STAMP) constraints/lint.txt
 	@$(PIP) --prefer-binary --requirement constraints/lint.txt

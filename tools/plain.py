@@ -1,0 +1,110 @@
+#!/usr/bin/env python3
+"""
+Count marker words in docstrings, comments, messages and pages: words that technical English rarely needs; fail above the limit.
+
+Usage: `plain.py [ROOT] [--folders] [--worst N]`; ROOT is a folder or one file. A marker is frequent in sentences with one of four habits:
+a clause in place of a noun ("what is left" for "the residual"), data that speak ("the windows say"), a common verb in place of the
+technical one ("goes with" for "correlates with"), and a vague pronoun. Good packages have 0.5 to 5 per 1,000 words.
+"""
+
+import argparse
+import ast
+import io
+import pathlib
+import re
+import sys
+import tokenize
+
+MOST = 49.7
+"""Markers per 1,000 words of the whole product; lower it whenever the rate has fallen, never raise it."""
+MARKERS = set("""
+what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone else others those
+say says said tell tells told ask asks asked speak speaks spoken answer answers answered know knows let lets
+beside behind apart far whole stay stays stayed come comes came go goes went gone stand stands stood leave leaves
+take takes took taken look looks looked word words people chance chances story say-so
+""".split())
+SENTENCE = re.compile(r'(?<=[.!?;:])\s+')
+CODE = re.compile(r'```.*?```|``[^`]*``|`[^`]*`|https?://\S+|<[^>]+>', re.S)
+
+
+def texts(path):
+    """Yield (kind, line, text) of one Python or Markdown file."""
+    source = path.read_text(encoding='utf8')
+    if path.suffix != '.py':
+        for number, line in enumerate(CODE.sub(lambda m: '\n' * m.group().count('\n'), source).splitlines(), 1):
+            if line.strip() and not line.lstrip().startswith('|'):
+                yield 'page', number, line
+        return
+    tree = ast.parse(source)
+    bare = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+    inside = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inside:
+            if id(node) in bare:
+                yield 'docstring', node.lineno, CODE.sub(' ', node.value)
+            elif len(node.value.split()) > 3:
+                yield 'message', node.lineno, CODE.sub(' ', node.value)
+        elif isinstance(node, ast.JoinedStr):
+            text = ''.join(v.value if isinstance(v, ast.Constant) else ' X ' for v in node.values)
+            if len(text.split()) > 3:
+                yield 'message', node.lineno, CODE.sub(' ', text)
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield 'comment', token.start[0], CODE.sub(' ', token.string.lstrip('#! '))
+
+
+def files(root):
+    """Return the product's Python files and the pages."""
+    if root.is_file():
+        return [root]
+    skip = {'test', 'build', 'install', 'validation', 'benchmarks', 'examples', 'tools'}
+    found = [path for path in root.rglob('*.py')
+             if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)]
+    found += [p for p in [root / 'README.md', root / 'CONTRIBUTING.md'] if p.exists()]
+    return sorted(found) + sorted((root / 'docs').rglob('*.md'))
+
+
+def main():
+    """Print the rate by folder and by kind of text."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('root', nargs='?', default='.', type=pathlib.Path)
+    parser.add_argument('--worst', type=int, default=0, help='print the N sentences with most markers')
+    parser.add_argument('--folders', action='store_true', help='print the rate of each folder')
+    arguments = parser.parse_args()
+    count, sentences = {}, []
+    for path in files(arguments.root):
+        place = '/'.join(path.relative_to(arguments.root).parts[:2]) if arguments.root.is_dir() else path.name
+        for kind, line, text in texts(path):
+            for sentence in SENTENCE.split(text):
+                words = re.findall(r"[A-Za-z][A-Za-z'-]*", sentence)
+                hits = [w for w in words if w.lower() in MARKERS]
+                for key in (('all', kind), ('place', place)):
+                    known = count.setdefault(key, [0, 0, 0])
+                    known[0] += len(words)
+                    known[1] += len(hits)
+                    known[2] += len(words) > 30
+                if len(hits) > 1:
+                    sentences.append((len(hits) / (len(words) + 8), f'{path}:{line}', ' '.join(sentence.split())))
+
+    def row(name, numbers):
+        words, hits, long = numbers
+        return f'{name:34s} {words:7d} words {1000 * hits / max(words, 1):6.1f} markers per 1,000  {long:4d} sentences above 30 words'
+
+    for (group, name), numbers in sorted(count.items(), key=lambda item: (item[0][0] != 'place', -item[1][1])):
+        if arguments.folders and group == 'place':
+            print(row(name, numbers))
+    for share, place, sentence in sorted(sentences, reverse=True)[:arguments.worst]:
+        print(f'  {place}: {sentence[:200]}')
+    total = [sum(n[k] for (g, _), n in count.items() if g == 'all') for k in range(3)]
+    for kind in ('docstring', 'comment', 'message', 'page'):
+        if ('all', kind) in count:
+            print(row(kind, count['all', kind]))
+    print(row('total', total))
+    rate = 1000 * total[1] / max(total[0], 1)
+    if arguments.root.is_dir() and rate > MOST:
+        sys.exit(f'At most {MOST} marker words per 1,000 are allowed, {rate:.2f} were found: '
+                 'rewrite the sentences that `tools/plain.py --worst 20` prints.')
+
+
+if __name__ == '__main__':
+    main()

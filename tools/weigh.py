@@ -1,0 +1,129 @@
+#!/usr/bin/env python3
+"""
+Count files, code lines, tokens, functions, classes and import cycles of imu_calibration and msg_adapters; fail above the limits.
+
+Usage: `weigh.py [ROOT] [--packages]`. A code line holds at least one token that is not a comment or a docstring (strings under fields
+and constants count as docstrings). Tokens are counted on the same lines, so that a packed line does not reduce the weight. A cycle is a
+set of modules that import each other by any import statement at any depth, under TYPE_CHECKING too.
+"""
+
+import argparse
+import ast
+import collections
+import io
+import pathlib
+import sys
+import tokenize
+
+MOST_LINES, MOST_TOKENS = 36_000, 460_000
+"""Limits of the product."""
+LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER, tokenize.ENCODING}
+
+
+def documented(tree):
+    """Return the lines of docstrings and of bare strings in module and class bodies."""
+    lines = set()
+    for node in ast.walk(tree):
+        body = getattr(node, 'body', None)
+        if not isinstance(body, list):
+            continue
+        texts = body if isinstance(node, (ast.Module, ast.ClassDef)) else body[:1]
+        for each in texts:
+            if isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant) and isinstance(each.value.value, str):
+                lines.update(range(each.lineno, each.end_lineno + 1))
+    return lines
+
+
+def weigh(path):
+    """Return (code lines, tokens, functions, classes, raw lines) of a file."""
+    text = path.read_text()
+    tree = ast.parse(text)
+    skip, lines, tokens = documented(tree), set(), 0
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type in LAYOUT or token.start[0] in skip:
+            continue
+        tokens += 1
+        lines.update(range(token.start[0], token.end[0] + 1))
+    kinds = collections.Counter(type(node).__name__ for node in ast.walk(tree))
+    return len(lines), tokens, kinds['FunctionDef'] + kinds['AsyncFunctionDef'], kinds['ClassDef'], text.count('\n')
+
+
+def imports(root, files):
+    """Return module -> modules of the product that it imports."""
+    names = {'.'.join(p.relative_to(root).with_suffix('').parts).removesuffix('.__init__'): p for p in files}
+    graph = {}
+    for name, path in names.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.update({node.module, *(f'{node.module}.{alias.name}' for alias in node.names)})
+        graph[name] = {each for each in found if each in names and each != name and names[each].name != '__init__.py'}
+    return graph
+
+
+def cycles(graph):
+    """Return the strongly connected sets of more than one module (Tarjan)."""
+    index, low, stack, on, found = {}, {}, [], set(), []
+    sys.setrecursionlimit(10000)
+
+    def visit(v):
+        index[v] = low[v] = len(index)
+        stack.append(v)
+        on.add(v)
+        for w in graph[v]:
+            if w not in index:
+                visit(w)
+                low[v] = min(low[v], low[w])
+            elif w in on:
+                low[v] = min(low[v], index[w])
+        if low[v] == index[v]:
+            part = []
+            while True:
+                w = stack.pop()
+                on.discard(w)
+                part.append(w)
+                if w == v:
+                    break
+            if len(part) > 1:
+                found.append(sorted(part))
+
+    for v in graph:
+        if v not in index:
+            visit(v)
+    return found
+
+
+def main():
+    """Print one line for each figure."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('root', nargs='?', default='.', type=pathlib.Path)
+    parser.add_argument('--packages', action='store_true', help='print each package and each cycle')
+    options = parser.parse_args()
+    root = options.root.resolve()
+    files = sorted(p for package in ('imu_calibration', 'msg_adapters') for p in (root / package).rglob('*.py'))
+    rows = {path: weigh(path) for path in files}
+    packages = collections.defaultdict(lambda: [0, 0])
+    for path, row in rows.items():
+        *folders, _ = path.relative_to(root).parts
+        package = packages['/'.join(folders[:2])]
+        package[0] += 1
+        package[1] += row[0]
+    total = [sum(row[k] for row in rows.values()) for k in range(4)]
+    loops = cycles(imports(root, files))
+    if options.packages:
+        for name, (count, lines) in sorted(packages.items(), key=lambda each: -each[1][1]):
+            print(f'  {name:34s} {count:4d} files {lines:6d} code lines')
+        for loop in loops:
+            print('  cycle: ' + ', '.join(loop))
+    print(f'files {len(files)}, code lines {total[0]}, tokens {total[1]}, functions {total[2]}, classes {total[3]}, '
+          f'files above 320 raw lines {sum(row[4] > 320 for row in rows.values())}, below 50 {sum(row[4] < 50 for row in rows.values())}, '
+          f'cycles {len(loops)}')
+    if total[0] > MOST_LINES or total[1] > MOST_TOKENS:
+        sys.exit(f'At most {MOST_LINES} code lines and {MOST_TOKENS} tokens are allowed, {total[0]} and {total[1]} were found: '
+                 'replace or generalise code.')
+
+
+if __name__ == '__main__':
+    main()
