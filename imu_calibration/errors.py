@@ -6,7 +6,8 @@ that is called there: an option of the command line, a parameter or topic of a n
 """
 
 KEYS = {
-    'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document', 'gravity': 'the local gravity',
+    'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document',
+    'columns': 'the columns of a text log', 'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
     'setting': 'how windows are found', 'table': 'the description of the table', 'target_frame': 'the frame to move readings to',

@@ -5,6 +5,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from imu_calibration.errors import InputError
+
+FIRST_NS = 1_000_000_000
+"""Stamp of the first sample where times do not count from an epoch: a stamp of zero means unset in ROS."""
+EPOCH = 1e8
+"""s; larger times count from 1970."""
+
 
 class _Columns:
     """Slicing and joining for dataclasses whose array fields share their first axis."""
@@ -85,6 +92,50 @@ class SampleBlock:
     """Messages that could not be turned into samples: reason -> count."""
     notes: dict | None = None
     """Messages that were used in another way than they came, such as those without a stamp: reason -> count."""
+
+    @classmethod
+    def from_arrays(cls, time: ArrayLike, force: ArrayLike, rate: ArrayLike, *, joints: dict[str, ArrayLike] | None = None,
+                    temperature_c: ArrayLike | None = None) -> 'SampleBlock':
+        """
+        Return a recording from arrays.
+
+        Parameters
+        ----------
+        time : array_like
+            Seconds, from an epoch or relative, shape (n,).
+        force : array_like
+            Specific force in the sensor frame, m/s^2; at rest, z up, +g about z; shape (n, 3).
+        rate : array_like
+            Angular rate in the sensor frame, rad/s, shape (n, 3).
+        joints : dict, optional
+            Joint name -> angles at the same times, rad, shape (n,).
+        temperature_c : array_like, optional
+            Degrees Celsius, shape (n,).
+
+        Raises
+        ------
+        InputError
+            When shapes differ or a time is not finite.
+
+        """
+        time, force, rate = (np.asarray(values, float) for values in (time, force, rate))
+        angles = {name: np.asarray(values, float) for name, values in (joints or {}).items()}
+        heat = None if temperature_c is None else np.asarray(temperature_c, float)
+        n = len(time) if time.ndim == 1 else -1
+        given = {'time': time, 'force': force, 'rate': rate, **angles, **({} if heat is None else {'temperature_c': heat})}
+        for name, values in given.items():
+            wanted = (n, 3) if name in ('force', 'rate') else (n,)
+            if values.shape != wanted or n < 2:
+                raise InputError(f'{name} must have shape {str(wanted).replace("-1", "n")} with at least 2 rows, got {values.shape}; '
+                                 'correct the array')
+        if not np.isfinite(time).all():
+            raise InputError(f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows')
+        start = round(time[0] * 1e9) if time[0] > EPOCH else FIRST_NS
+        stamp_ns = start + np.round((time - time[0]) * 1e9).astype(np.int64)
+        position = np.column_stack(list(angles.values())) if angles else None
+        return cls(ImuSamples(stamp_ns, force, rate, 'imu_link'),
+                   None if position is None else JointSamples(stamp_ns, position, np.full(position.shape, np.nan), tuple(angles)),
+                   None if heat is None else TemperatureSamples(stamp_ns, heat))
 
 
 @dataclass(frozen=True)

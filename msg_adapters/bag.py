@@ -7,8 +7,10 @@ from pathlib import Path
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from msg_adapters.csv_bag import CsvBag
+from msg_adapters.csv_log import SUFFIXES, is_csv
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
-from msg_adapters.definitions import deserializer, is_standard
+from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.ros1_file import Ros1File
@@ -16,7 +18,6 @@ from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storages import BagSource, suffixes
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
-DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
 KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
 """What an error calls the choice of a topic."""
 
@@ -45,7 +46,7 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
     Parameters
     ----------
     path : path-like
-        A rosbag2 folder, a bare .db3 or .mcap file, or a ROS 1 .bag file.
+        A rosbag2 folder, a bare .db3 or .mcap file, a ROS 1 .bag file, or a text log (.csv) whose columns and units are unambiguous.
     imu_topic, joint_topic, temperature_topic : str, optional
         Names of topics.
     want_joints : bool or 'optional'
@@ -188,14 +189,19 @@ def _block(parts, decoders):
 
 def _open_source(path):
     if not path.exists():
-        raise InputError(f'a recording must be a rosbag2 folder, a {", ".join(suffixes())} or .bag file, got {path}, which does not exist; '
-                         'check the path')
+        raise InputError(f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file, got {path}, which does not '
+                         'exist; check the path')
     try:
+        if is_csv(path):
+            return CsvBag(path)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
+    except InputError:
+        raise
     except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
         came = ' '.join(str(error).split())
-        raise InputError(f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file), got: {came}; '
-                         'check the path, or record again') from error
+        raise InputError(f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file) or a text log '
+                         f'({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or write the data as CSV and use the verb '
+                         'convert') from error
 
 
 def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:

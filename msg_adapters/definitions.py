@@ -9,6 +9,7 @@ from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 SEPARATOR = '=' * 80
+DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
 
 _PARTS = {
     'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',

@@ -35,7 +35,8 @@ class Rosbag2:
     ros1 = False
 
     def __init__(self, path: str | PathLike[str]):
-        self.path, self.folder = Path(path), None
+        self.path = Path(path)
+        self.folder: str | None = None
         self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
         self._lost, self.files = {}, []
         by_message = str(self.metadata.get('compression_mode', '')).lower() == 'message'

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from msg_adapters.bag import DEFAULT_TOPICS
 from msg_adapters.bag_writer import BagWriter
-from msg_adapters.definitions import standard_definition
+from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.encode import UNKNOWN, encode_imu, encode_joints, encode_temperature, rows
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE

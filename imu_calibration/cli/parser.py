@@ -7,8 +7,8 @@ from typing import NoReturn
 
 import imu_calibration
 
-VERBS = ('inspect', 'calibrate', 'compensate', 'check', 'diagnose', 'simulate', 'compare', 'arm', 'fleet', 'noise', 'plan', 'export',
-         'import', 'watch', 'view')
+VERBS = ('inspect', 'calibrate', 'compensate', 'check', 'diagnose', 'simulate', 'compare', 'arm', 'fleet', 'noise', 'plan', 'convert',
+         'export', 'import', 'watch', 'view')
 """Each is a module of this package with NAME, HELP, `add_arguments` and `run`."""
 
 

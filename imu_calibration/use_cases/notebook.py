@@ -1,23 +1,29 @@
 """The names that a notebook needs, with errors that speak of their arguments; `imu_calibration` offers them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from inspect import signature
 from os import PathLike
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
+
+from numpy.typing import ArrayLike
 
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.samples import SampleBlock
+from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.calibrate import calibrate as _calibrate
 from imu_calibration.use_cases.check import check as _check
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.compensate import compensate as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
 from imu_calibration.use_cases.simulate import simulate as _simulate
+from imu_calibration.use_cases.stand import Stand
 
 Arguments = ParamSpec('Arguments')
 Result = TypeVar('Result')
+Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBlock]
 
 
 def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -48,7 +54,36 @@ def load(path: str | PathLike) -> Calibration:
     return files.read_calibration(path)
 
 
-calibrate = _for_notebooks(_calibrate)
+@_for_notebooks
+def calibrate(recordings: Recordings | None = None, table: Stand | None = None, *, time: ArrayLike | None = None,
+              force: ArrayLike | None = None, rate: ArrayLike | None = None, joints: dict[str, ArrayLike] | None = None,
+              temperature_c: ArrayLike | None = None, **choices: Any) -> Calibrated:
+    """
+    Calibrate from recordings, or from arrays: ``calibrate(time=t, force=f, rate=w)``.
+
+    Parameters
+    ----------
+    recordings : path-like, SampleBlock, or a sequence of them
+        Bags, text logs, or samples in memory; absent where arrays are given.
+    table : path-like, Table or Arm, optional
+        The reference; without one gravity at rest.
+    time, force, rate, joints, temperature_c
+        See `SampleBlock.from_arrays`.
+    choices
+        As for `use_cases.calibrate.calibrate`.
+
+    """
+    given = [values is not None for values in (recordings, time, force, rate)]
+    if given not in ([True, False, False, False], [False, True, True, True]):
+        names = [name for name, there in zip(('recordings', 'time', 'force', 'rate'), given, strict=True) if there]
+        raise InputError(f'calibrate must have either recordings, or the arrays time, force and rate, got {", ".join(names) or "none"}; '
+                         'give one or the other')
+    if recordings is None:
+        recordings = SampleBlock.from_arrays(cast(ArrayLike, time), cast(ArrayLike, force), cast(ArrayLike, rate),
+                                             joints=joints, temperature_c=temperature_c)
+    return _calibrate(recordings, table, **choices)
+
+
 check = _for_notebooks(_check)
 compensate = _for_notebooks(_compensate)
 diagnose = _for_notebooks(_diagnose)

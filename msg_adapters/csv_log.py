@@ -1,0 +1,360 @@
+"""Text logs (CSV) as recordings: columns and units are found from the header and, where the header has none, from the physics."""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.errors import InputError, shortened
+from imu_calibration.preflight.chunks import ChunkSeries
+from imu_calibration.preflight.turning import relate_turns
+from imu_calibration.samples import EPOCH, FIRST_NS, ImuSamples, JointSamples, TemperatureSamples
+
+SUFFIXES = ('.csv', '.tsv', '.txt')
+HEAD_BYTES = 1 << 16
+"""Bytes in which header, delimiter and first rows are found."""
+UNITS = {
+    'time': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9},
+    'force': {'m/s^2': 1.0, 'g': STANDARD_GRAVITY, 'mg': 1e-3 * STANDARD_GRAVITY},
+    'rate': {'rad/s': 1.0, 'deg/s': DEG, 'mdeg/s': 1e-3 * DEG},
+    'temperature': {'C': 1.0},
+    'joint': {'rad': 1.0, 'deg': DEG},
+}
+"""Quantity -> unit -> size of the unit in SI (degrees Celsius for temperatures)."""
+SPELLINGS = {
+    'time': {'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'msec': 'ms', 'millis': 'ms', 'µs': 'us', 'μs': 'us', 'usec': 'us',
+             'micros': 'us', 'nsec': 'ns', 'nanos': 'ns'},
+    'force': {'m/s2': 'm/s^2', 'm/s²': 'm/s^2', 'm/s/s': 'm/s^2', 'm/sec^2': 'm/s^2', 'ms^-2': 'm/s^2', 'mps2': 'm/s^2', 'ms2': 'm/s^2'},
+    'rate': {'rads': 'rad/s', 'rps': 'rad/s', 'rad/sec': 'rad/s', 'rads^-1': 'rad/s', 'dps': 'deg/s', '°/s': 'deg/s', 'deg/sec': 'deg/s',
+             'degs': 'deg/s', 'mdps': 'mdeg/s'},
+    'temperature': {'c': 'C', '°c': 'C', 'degc': 'C', 'celsius': 'C'},
+    'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
+}
+"""Quantity -> spelling in headers -> unit."""
+NAMES = (
+    ('time', r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|(.* )?stamp|.*elapsed'),
+    ('force', r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
+     r'(.* )?linear acceleration)'),
+    ('rate', r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
+     r'(.* )?angular velocity)'),
+    ('temperature', r'temp|temperature|(imu|sensor|chip|die) temp(erature)?'),
+)
+"""Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force and rate."""
+PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
+"""Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within the usual rates."""
+GRAVITY_BAND = 1.15
+"""The median of the specific force may differ from gravity by this factor."""
+RATE_BAND = 1.6
+"""The rate that turns gravity may differ from the measured one by this factor."""
+REMEDY = 'convert it with the columns stated: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT [temperature=NAME:C] [joint.JOINT=NAME:UNIT]'
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of one quantity."""
+
+    quantity: str
+    """A key of `UNITS`."""
+    names: tuple[str, ...]
+    """Column names; three for force and rate. A leading minus reverses the sign."""
+    unit: str | None = None
+    """A unit of the quantity; None: found from the values."""
+    joint: str = ''
+    """Name of the joint, for joint angles."""
+    origin: str = 'header'
+    """'header', 'values' or 'given': source of the unit."""
+
+    def __str__(self):
+        label = f'joint.{self.joint}' if self.joint else self.quantity
+        return f'{label}={",".join(self.names)}:{self.unit} (unit: {self.origin})'
+
+
+@dataclass(frozen=True, eq=False)
+class CsvLog:
+    """Content of a log."""
+
+    columns: tuple[Columns, ...]
+    """Columns used, with units."""
+    imu: ImuSamples
+    """Readings in SI."""
+    joints: JointSamples | None
+    """Joint angles."""
+    temperature: TemperatureSamples | None
+    """Temperatures."""
+    unused: tuple[str, ...]
+    """Other columns."""
+
+
+def is_csv(path: str | PathLike[str]) -> bool:
+    """Return whether a path has the suffix of a text log."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
+    """
+    Read a text log with a header line.
+
+    Parameters
+    ----------
+    path : path-like
+        Text with columns separated by comma, semicolon, tab or spaces.
+    columns : sequence of str
+        Assignments ``quantity=NAME[,NAME,NAME][:UNIT]`` that replace the guess; the quantity is time, force, rate, temperature or
+        joint.JOINT. A name may be the number of a column (1 is the first).
+
+    Raises
+    ------
+    InputError
+        When a needed column or unit is neither given, nor in the header, nor determined by the values.
+
+    """
+    path = Path(path)
+    status = path.stat() if path.is_file() else None
+    if status is None:
+        raise InputError(f'a text log must be a regular file, got {path}; check the path')
+    return _read(path, tuple(columns), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=1)
+def _read(path, columns, *_):
+    table = _Table(path)
+    found = [_parse(text) for text in columns]
+    given = {(each.quantity, each.joint) for each in found}
+    found += [each for each in _guess(table) if (each.quantity, each.joint) not in given]
+    by_quantity = {each.quantity: each for each in found}
+    for quantity in ('time', 'force', 'rate'):
+        if quantity not in by_quantity:
+            raise InputError(f'{path} must have a column of {quantity}{"" if quantity == "time" else " per axis"}, got the columns '
+                             f'{shortened(", ".join(table.names), 300)}; {REMEDY}', key='columns')
+    table.load([name for each in found for name in each.names])
+    time = _with_unit(by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path)
+    stamp_ns = table.stamps(time)
+    force = _with_unit(by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path)
+    force_s = table.values(force.names) * UNITS['force'][force.unit]
+    rate = _with_unit(by_quantity['rate'], lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)), path)
+    used, temperature, joints = [time, force, rate], None, []
+    for each in found:
+        if each.quantity == 'temperature':
+            used.append(_with_unit(each, lambda: 'C', path))
+            temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
+        elif each.quantity == 'joint':
+            joints.append(_with_unit(each, lambda: None, path))
+    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * UNITS['rate'][rate.unit], 'imu_link')
+    used += joints
+    taken = {name.removeprefix('-') for each in used for name in each.names}
+    return CsvLog(tuple(used), imu, _joints(table, stamp_ns, joints), temperature, tuple(name for name in table.names if name not in taken))
+
+
+def _joints(table, stamp_ns, joints):
+    if not joints:
+        return None
+    position = np.column_stack([table.values(each.names)[:, 0] * UNITS['joint'][each.unit] for each in joints])
+    return JointSamples(stamp_ns, position, np.full(position.shape, np.nan), tuple(each.joint for each in joints))
+
+
+def _with_unit(columns, guess, path):
+    """Return Columns with a unit, by `guess` where neither the user nor the header states one."""
+    if columns.unit is not None:
+        return columns
+    unit = guess()
+    if unit is None:
+        raise InputError(f'the unit of {columns.quantity} in {path} must be stated by the header or follow from the values, got columns '
+                         f'{", ".join(columns.names)} without one; {REMEDY}', key='columns')
+    return replace(columns, unit=unit, origin='values')
+
+
+def _parse(text):
+    """Return the Columns of one assignment of `columns`."""
+    label, _, rest = text.partition('=')
+    quantity, _, joint = label.partition('.')
+    names, colon, unit = rest.rpartition(':')
+    if not colon:
+        names, unit = rest, ''
+    units = UNITS.get(quantity, {})
+    unit = SPELLINGS.get(quantity, {}).get(unit.lower(), unit) if unit else None
+    names = tuple(name.strip() for name in names.split(',') if name.strip())
+    if not units or (quantity == 'joint') != bool(joint) or len(names) != (3 if quantity in ('force', 'rate') else 1):
+        raise InputError(f'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and rate, got {text!r}; '
+                         f'{REMEDY}', key='columns')
+    if unit is not None and unit not in units:
+        raise InputError(f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct {text!r}')
+    return Columns(quantity, names, unit, joint, 'given')
+
+
+class _Table:
+    """Header and columns of a text log."""
+
+    def __init__(self, path):
+        self.path = path
+        with path.open(encoding='utf-8-sig', errors='replace', newline='') as file:
+            head = file.read(HEAD_BYTES)
+        lines = head.splitlines()
+        if not lines or '\0' in head:
+            raise InputError(f'{path} must be a text log, got {"an empty file" if not lines else "binary data"}; check the path')
+        self.delimiter = _delimiter(lines)
+        rows = [self._cells(line) for line in lines[:None if len(head) < HEAD_BYTES else -1]]
+        first = next((k for k, row in enumerate(rows) if len(row) > 1 and sum(map(_numeric, row)) >= min(4, len(row))), None)
+        if first is None:
+            raise InputError(f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces, got none; check the file')
+        self.first, self.decimal_comma = first, any(re.fullmatch(r'\s*-?\d+,\d+\s*', cell) for cell in rows[first])
+        width = len(rows[first])
+        header = [row for row in rows[:first] if len(row) == width][-2:]
+        self.names = [re.sub(r'\s+', ' ', ''.join(c if c.isprintable() else ' ' for c in name)).strip()
+                      for name in (header[0] if header else [str(k + 1) for k in range(width)])]
+        if len(header) == 2:   # a second row with units
+            units = [unit.strip(' ()[]') for unit in header[1]]
+            self.names = [f'{name} ({unit})' if unit else name for name, unit in zip(self.names, units, strict=True)]
+        counts = Counter(self.names)
+        self.names = [name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(self.names)]
+        self.dates = {k for k, cell in enumerate(rows[first]) if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)}
+        self._values = {}
+
+    def _cells(self, line):
+        line = line.lstrip('# ')
+        return line.split() if self.delimiter is None else next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+
+    def column(self, name):
+        """Return the index of a column by name or number."""
+        name = name if name in self.names else name.removeprefix('-')
+        if name in self.names:
+            return self.names.index(name)
+        if name.isdigit() and 1 <= int(name) <= len(self.names):
+            return int(name) - 1
+        raise InputError(f'a column must be in {self.path}, got {name!r}; it has {shortened(", ".join(self.names), 300)}')
+
+    def load(self, names):
+        """Read the columns; cells without a number become NaN."""
+        wanted = sorted({self.column(name) for name in names})
+        numbers = [k for k in wanted if k not in self.dates]
+        options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
+        with self.path.open(encoding='utf-8-sig', errors='replace') as file:
+            lines = file.read().splitlines()[self.first:]
+        if self.decimal_comma and self.delimiter != ',':
+            lines = [line.replace(',', '.') for line in lines]
+        try:
+            data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
+        except ValueError:   # empty cells, words such as "nan" in other languages, rows that are cut off
+            data = np.genfromtxt(lines, usecols=numbers, invalid_raise=False, **options).reshape(-1, len(numbers))
+        self._values = dict(zip(numbers, data.T, strict=True))
+        for k in set(wanted) & self.dates:
+            cells = [self._cells(line) for line in lines if line.strip()]
+            dates = [re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T') if k < len(row) else 'NaT' for row in cells]
+            self._values[k] = np.array(dates, 'datetime64[ns]')
+        if min(map(len, self._values.values())) < 2:
+            raise InputError(f'{self.path} must have at least two rows of numbers, got fewer; check the file')
+
+    def values(self, names):
+        """Return columns, shape (n, len(names))."""
+        return np.column_stack([(1.0 if name in self.names or not name.startswith('-') else -1.0) * self._values[self.column(name)]
+                                for name in names])
+
+    def raw(self, name):
+        """Return one column as read, float or datetime64."""
+        return self._values[self.column(name)]
+
+    def stamps(self, time):
+        """Return stamps in ns of the Columns of time, int64, shape (n,)."""
+        values = self.raw(time.names[0])
+        if values.dtype.kind == 'M':
+            return values.astype(np.int64)
+        if not np.isfinite(values).all():
+            raise InputError(f'the time of every row of {self.path} must be a number, got {np.count_nonzero(~np.isfinite(values))} without '
+                             'one; remove these rows')
+        size = UNITS['time'][time.unit]
+        start = values[0]
+        offset = round(start * size * 1e9) if start * size > EPOCH else FIRST_NS
+        return offset + np.round((values - start) * (size * 1e9)).astype(np.int64)
+
+
+def _delimiter(lines):
+    """Return the delimiter that gives the same number of columns, at least four, in most lines; None for white space."""
+    def agreement(delimiter):
+        counts = Counter(len(line.split(delimiter)) for line in lines[:50] if line.strip())
+        width, number = counts.most_common(1)[0]
+        return number if width >= 4 else 0
+    return max((';', '\t', ',', None), key=agreement)
+
+
+def _numeric(cell):
+    return re.fullmatch(r'\s*[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
+
+
+def _guess(table):
+    """Return the Columns that the header names."""
+    axes, found = {'force': {}, 'rate': {}}, []
+    for name in table.names:
+        words, unit_text = _words(name)
+        joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
+        axis = re.fullmatch(r'(.*?) ?([xyz])', words)
+        for quantity, pattern in NAMES:
+            if quantity in axes:
+                if axis and re.fullmatch(pattern, axis.group(1)):
+                    axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[axis.group(2)] = (name, _unit(quantity, unit_text))
+            elif re.fullmatch(pattern, words) and quantity not in {each.quantity for each in found}:
+                found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
+        if joint:
+            found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+    for quantity, groups in axes.items():
+        complete = [group for group in groups.values() if set(group) == set('xyz')]
+        if len(complete) > 1:
+            raise InputError(f'{table.path} must have one column of {quantity} per axis, got {len(complete)} sets: '
+                             f'{"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)}; {REMEDY}', key='columns')
+        if complete:
+            units = {group[axis][1] for group in complete for axis in 'xyz'}
+            found.append(Columns(quantity, tuple(complete[0][axis][0] for axis in 'xyz'), units.pop() if len(units) == 1 else None))
+    return found
+
+
+def _words(name):
+    """Return (name in lower case with spaces, without unit; text of the unit)."""
+    bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
+    unit = bracket.group(1) if bracket else ''
+    text = name[:bracket.start()] if bracket else name
+    if not unit:
+        suffix = re.search(r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|ms|us|ns|deg|rad|c|s)$', text, re.IGNORECASE)
+        if suffix:
+            unit, text = suffix.group(1), text[:suffix.start()]
+    text = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', text)
+    unit = unit.lower().replace('m_s2', 'm/s2').replace('m_s_2', 'm/s2').replace('_s', '/s')
+    return re.sub(r'[\s_./-]+', ' ', text).strip().lower(), unit
+
+
+def _unit(quantity, text):
+    """Return the unit of a quantity by its spelling in a header, or None."""
+    text = text.strip().replace(' ', '')
+    known = {unit.lower(): unit for unit in UNITS[quantity]} | SPELLINGS[quantity]
+    return known.get(text)
+
+
+def _time_unit(values):
+    """Return the unit in which the median step is that of an IMU."""
+    if values.dtype.kind == 'M':
+        return 'ns'
+    step = np.diff(values)
+    step = float(np.median(step[step > 0])) if (step > 0).any() else np.nan
+    return next((unit for unit, low, high in PERIODS if low <= step <= high), None)
+
+
+def _force_unit(force):
+    """Return the unit in which the median length is that of gravity."""
+    length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
+    return next((unit for unit, size in UNITS['force'].items()
+                 if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND), None)
+
+
+def _rate_unit(stamp_ns, force_s, rate):
+    """Return the unit in which the rates turn gravity as the accelerometer measures it."""
+    series = ChunkSeries()
+    good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
+    series.push(stamp_ns[good], np.concatenate([force_s[good].T, rate[good].T]))
+    turning = relate_turns(series.chunks())
+    if turning is None:
+        return None
+    return next((unit for unit, size in UNITS['rate'].items() if 1 / RATE_BAND < turning.factor / size < RATE_BAND), None)
