@@ -62,7 +62,7 @@ def run(options: Namespace) -> int:
                     with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
                     diagnosis=options.diagnosis, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report, storage=options.storage)
-    _show(made.plan, folder)
+    _show(made, folder)
     return made.exit_code
 
 
@@ -88,11 +88,12 @@ def _stand(options):
     return stand
 
 
-def _show(made, folder):
+def _show(planned, folder):
+    made = planned.plan
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:SHOWN]:
         print(fill(f'until {end:6.1f} s  {motion.words}', 96, subsequent_indent=' ' * 16))
     if len(made.motions) > SHOWN:
         print(f'... and {len(made.motions) - SHOWN} more, in plan.yaml')
-    for line in summary(made):
+    for line in [*summary(made), *planned.notes]:
         print(fill(line, 96, subsequent_indent='    '))
     print(f'written: plan.yaml and the trajectory in {folder}')

@@ -79,12 +79,15 @@ class Campaign:
     settings : CampaignSettings
     make_separator : callable, optional
         Returns a planner of the motions that tell a Suspect from its mates, or raises an ImuCalibrationError when there are none.
+    unwind : callable, optional
+        Returns the motion that turns wound joints back from a position, None if none is needed; driven before the campaign ends.
 
     """
 
     def __init__(self, planner: MotionPlanner, settings: CampaignSettings = CampaignSettings(),
-                 make_separator: Callable[[Suspect], MotionPlanner] | None = None):
-        self.planner, self.settings, self._make_separator = planner, settings, make_separator
+                 make_separator: Callable[[Suspect], MotionPlanner] | None = None, *,
+                 unwind: Callable[[np.ndarray], Any] = lambda position: None):
+        self.planner, self.settings, self._make_separator, self._unwind = planner, settings, make_separator, unwind
         self._separator: MotionPlanner | None = None
         self.findings: list[Suspect] | None = None
         """What the last diagnosis named, the strongest first; None before the first."""
@@ -138,6 +141,12 @@ class Campaign:
             Seconds since the first motion began.
 
         """
+        decision = self._decide(position, elapsed)
+        if decision.motion is None and not decision.diagnose and (motion := self._unwind(position)) is not None:
+            return Decision(motion, why=f'{decision.why}; before the end, endless joints are unwound')
+        return decision
+
+    def _decide(self, position, elapsed):
         if elapsed >= self.settings.time_limit:
             return Decision(why=f'{TIME_OVER}{self._outside()}')
         step = None if self._separator is None else self._separator.next_motion(position)

@@ -14,6 +14,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.separation import make_separator
+from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.reference.table import Table
 
 LONGEST = 180.0
@@ -21,7 +22,7 @@ LONGEST = 180.0
 
 
 def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,
-                 options: CalibrationOptions = CalibrationOptions()) -> Planner:
+                 options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None) -> Planner:
     """
     Return the planner of the motion that tells a suspect from its mates.
 
@@ -37,6 +38,8 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
         Samples of the IMU per second.
     options : CalibrationOptions
         Tolerances and catalogue.
+    limits : MotionLimits, optional
+        Default those of the table.
 
     Raises
     ------
@@ -50,7 +53,7 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
             raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has")
     causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
     planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
-                             sizes=suspect.sizes)
+                             sizes=suspect.sizes, limits=limits)
     planner.within(LONGEST)
     return planner
 

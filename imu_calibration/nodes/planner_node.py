@@ -46,7 +46,7 @@ from imu_calibration.nodes.timers import every
 from imu_calibration.planning.noise import expected_noise, require_grade
 from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
-from imu_calibration.reference.motion_limits import limits_of
+from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file
 from msg_adapters.joint_state import joint_row
@@ -80,7 +80,7 @@ class PlannerNode(Node):
         self._is_halted = False
         self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
         self._names = tuple(self._table.joint_names)
-        self.driver = Driver(self._names, limits_of(self._table), driver_settings)
+        self.driver, self._is_placed = Driver(self._names, limits_of(self._table), driver_settings), False
         self._command = make_command(self, settings.command, self._refused)
         self.worker = PlannerWorker(self.driver, self._make_campaign,
                                     peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say),
@@ -99,7 +99,9 @@ class PlannerNode(Node):
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-                               'nothing moves before ~/start')
+                               f'nothing moves before ~/start; limits: {self._limit_words()}')
+        for line in range_warnings(self._table):
+            self.get_logger().warning(line)
 
     def close(self) -> str:
         """Stop what moves; return what became of it."""
@@ -116,15 +118,15 @@ class PlannerNode(Node):
     def _make_campaign(self) -> Campaign:
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
         planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate,
-                               options=self._options,
-                               calibration=self._latest())
-        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise))
+                               options=self._options, limits=self.driver.limits, calibration=self._latest())
+        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise), unwind=planner.unwinding)
 
     def _make_separator(self, suspect: Suspect, noise: dict) -> MotionPlanner:
         calibration = self._latest()
         if calibration is None:
             raise InputError('a calibration must be known before causes are told apart, none came; publish imu/calibration')
-        return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options)
+        return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options,
+                            limits=self.driver.limits)
 
     def _send(self, points: TrajectoryPoints) -> None:
         self._command.send(points)
@@ -226,16 +228,23 @@ class PlannerNode(Node):
     def _go(self, motions: int) -> tuple[bool, str]:
         if self.driver.is_driving or self.worker.doing:
             return False, f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it'
+        if missing_ranges(self._table):
+            return False, range_warnings(self._table)[0]
         if self.driver.position is None:
             return False, self._joints.silence()
         if not self._command.is_heard:
             return False, f'nobody listens to {self._command.name}: start the controller, or remap joint_trajectory'
         if not self._calibrator['solve'].service_is_ready():
             return False, f'nobody takes the windows: {self._calibrator["solve"].srv_name} is not there; start calibration_node'
+        if not self._is_placed:
+            self.driver.limits, self._is_placed = self.driver.limits.wound(self.driver.position, self.settings.max_turns), True
         self.worker.go(motions)
-        if motions > 0:
-            return True, 'one motion, then it rests'
-        return True, 'plans and moves until every parameter is within its tolerance; the first motion is slow'
+        what = 'one motion, then it rests' if motions > 0 else \
+            'plans and moves until every parameter is within its tolerance; the first motion is slow'
+        return True, f'{what}; limits: {self._limit_words()}'
+
+    def _limit_words(self) -> str:
+        return '; '.join(limit_words(self._table, self.driver.limits))
 
     def _stop(self) -> tuple[bool, str]:
         self.worker.halt('stopped by ~/stop')

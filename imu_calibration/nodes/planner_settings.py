@@ -26,5 +26,8 @@ class PlannerNodeSettings:
                               'the predicted standard deviations are not those that are reached')
     command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
                            'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
+    max_turns: float = setting(1.0, '1', 'turns of an endless joint to either side of its position at the first start, unwound at the end; '
+                               '0: unlimited, for slip rings', (0.0, 1e4), 'too large: cables are wound up; too small: slow plans',
+                               fixed='the range of every joint is set at the first start')
     calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows',
                                     symptom='~/start says that nobody calibrates')

@@ -11,13 +11,17 @@ N_TRIED = 512
 """Positions that places are chosen from: a power of two, as the sequence wants it."""
 GRID = np.pi / 4
 """Joints of a table with few of them stand at multiples of this, so that faces, edges and corners are among the places."""
+UNBOUNDED = 1e9
+"""Finite stand-in for the ends of endless joints, rad."""
 HEADING = 0.4
 """Weight of the horizontal axes beside the vertical where attitudes are compared: headings show the tilt, attitudes all the rest."""
 
 
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends within which places are taken: one turn of endless joints."""
-    return np.where(limits.endless, -np.pi, limits.lower), np.where(limits.endless, np.pi, limits.upper)
+    """Return the ends within which places are chosen: of joints that turn, at most one turn about the middle of the range."""
+    wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
+    middle = 0.5 * (np.maximum(limits.lower, -UNBOUNDED) + np.minimum(limits.upper, UNBOUNDED))   # 0 without ends
+    return np.where(wide, middle - np.pi, limits.lower), np.where(wide, middle + np.pi, limits.upper)
 
 
 def rest_at(position: np.ndarray) -> JointMotion:
@@ -36,7 +40,7 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     from scipy.stats import qmc  # here, because it takes long to import
 
     lower, upper = reachable(limits)
-    home = np.clip(np.zeros(len(limits)), limits.lower, limits.upper)
+    home = np.clip(np.zeros(len(limits)), lower, upper)
     spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
     parts = [home[None], spread]
     if len(limits) <= 3:

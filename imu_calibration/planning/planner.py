@@ -148,6 +148,16 @@ class Planner:
         motion = self._named(number)
         return NextMotion(motion, f'it gains most per second for {", ".join(missing[:3])}', motion.seconds_from(position), missing)
 
+    def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
+        """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""
+        repertoire = self.situation.repertoire
+        limits, declared = repertoire.limits, limits_of(repertoire.table).endless
+        middle = np.where(declared & ~limits.endless, 0.5 * (limits.lower + limits.upper), position)
+        far = np.abs(position - middle) > np.pi
+        if not np.any(far):
+            return None
+        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.where(far, middle, position), (), 'the turns taken back', limits)
+
     def plan(self, position: np.ndarray | None = None, *, progress: Callable[[float], None] | None = None,
              with_bound: bool = True, longest: float = np.inf) -> Plan:
         """Return a whole plan from where the joints are (default: at home)."""

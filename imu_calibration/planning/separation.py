@@ -19,7 +19,7 @@ from imu_calibration.planning.goals import Cause, ToldApart
 from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.situation import Situation
-from imu_calibration.reference.motion_limits import limits_of
+from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
@@ -29,7 +29,7 @@ SESSION = 'quick'
 
 def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
                    rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(),
-                   sizes: Mapping[str, float] | None = None) -> Planner:
+                   sizes: Mapping[str, float] | None = None, limits: MotionLimits | None = None) -> Planner:
     """
     Return a planner whose goal is to tell causes apart.
 
@@ -49,6 +49,8 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     sizes : mapping, optional
         Parameter -> value, SI, of the others as the diagnosis would have them in the place of the first; where it does not say, as
         large as they must be to pass for it on a usual session.
+    limits : MotionLimits, optional
+        Default those of the table.
 
     Raises
     ------
@@ -68,7 +70,7 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
         _require_shown_by_motion(model, key)
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
-    situation = Situation(Repertoire(table, limits_of(table)), coordinates, dict(noise), rate=rate)
+    situation = Situation(Repertoire(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
     situation.goal = ToldApart(coordinates, suspected(situation, causes, table, sizes=sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}

@@ -10,5 +10,5 @@ SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
 
 def yaw_table(gravity: float | None = None) -> Table:
     """Return the table: one vertical joint without end, whose angle is known from odometry or marks on the floor."""
-    joint = Joint('yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION))
+    joint = Joint('yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION, endless=True))
     return Table((joint,), gravity=STANDARD_GRAVITY if gravity is None else gravity, mount_xyz=(0.0, 0.0, 0.0))

@@ -15,7 +15,7 @@ TYPES = ('revolute', 'prismatic')
 
 @dataclass(frozen=True)
 class JointLimits:
-    """How far and how fast a joint may go: rad, rad/s, rad/s^2, or m, m/s, m/s^2 of one that slides; None: not known, or no end."""
+    """Range, speed and acceleration of a joint: rad, rad/s, rad/s^2, or m, m/s, m/s^2 of a sliding joint; None: not given."""
 
     lower: float | None = None
     """Smallest position."""
@@ -25,6 +25,10 @@ class JointLimits:
     """Largest speed."""
     acceleration: float | None = None
     """Largest acceleration."""
+    endless: bool = False
+    """Whether the joint is declared to turn without end."""
+    described: frozenset[str] = field(default=frozenset(), compare=False)
+    """Names of the fields that come from a robot description (URDF); the others come from a table file."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +150,8 @@ def place_names(turning: Sequence[str]) -> tuple[str, ...]:
     return tuple(f'{name}_{letter}' for name in turning[1:] for letter in 'uv')
 
 
-LIMIT_KEYS = {'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2'), 'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2')}
+LIMIT_KEYS = {'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2', 'endless'),
+              'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2')}
 """Keys of the limits in a table description, by type."""
 _KEYS = ('name', 'axis', 'xyz', 'rpy_deg', 'type', 'mimic')
 
@@ -167,19 +172,25 @@ def joint_from_mapping(item: Any) -> Joint:
 def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
     """Return the limits in an entry of a table description."""
     what = f"of joint '{item.get('name')}'"
-    range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])
+    range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])[:3]
     unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
-    ends = (None,
-            None) if item.get(range_key) is None else (unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
-    return JointLimits(*ends, *(None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, high=None,
+    lower, upper = (None, None) if item.get(range_key) is None else (
+        unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
+    endless = item.get('endless') or False
+    if not isinstance(endless, bool):
+        raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it')
+    speed, acceleration = (None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, high=None,
                                                                                         advice='give a number')
-                                for key in others))
+                           for key in others)
+    return JointLimits(lower, upper, speed, acceleration, endless)
 
 
 def _require_limits(limits: JointLimits, what: str) -> None:
     lower, upper = limits.lower, limits.upper
     if (lower is None) != (upper is None) or (lower is not None and upper is not None and lower > upper):
         raise InputError(f'table: the range of {what} must go from a smaller to a larger number, got [{lower}, {upper}]; correct it')
+    if limits.endless and lower is not None:
+        raise InputError(f'table: {what} must have a range or be endless, got both; leave one out')
     for name in ('speed', 'acceleration'):
         value = getattr(limits, name)
         if value is not None and not value > 0:
@@ -206,7 +217,9 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
         item['mimic'] = {'joint': joint.mimic.joint, 'multiplier': joint.mimic.multiplier, 'offset': joint.mimic.offset}
     limits, unit = joint.limits, np.radians(1.0) if joint.turns else 1.0
     ends = None if limits.lower is None else [limits.lower, limits.upper]
-    for key, value in zip(LIMIT_KEYS[joint.type], (ends, limits.speed, limits.acceleration), strict=True):
+    if limits.endless:
+        item['endless'] = True
+    for key, value in zip(LIMIT_KEYS[joint.type][:3], (ends, limits.speed, limits.acceleration), strict=True):
         if value is not None:
             # Twelve digits of a degree's fraction, so that what was read comes back as it was written.
             item[key] = np.round(np.asarray(value) / unit, 10).tolist()

@@ -152,13 +152,12 @@ def _mimic(robot, joint):
 
 
 def _limits(joint):
-    """Return the limits that the description gives: no ends for a continuous joint, and placeholders of zero left out."""
-    limit = joint.limit
-    if limit is None:
-        return JointLimits()
-    ends = (limit.lower or 0.0, limit.upper or 0.0)
-    ends = (None, None) if joint.type == 'continuous' or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
-    return JointLimits(*ends, limit.velocity if limit.velocity and math.isfinite(limit.velocity) else None)
+    """Return the limits in the description: a continuous joint is endless, placeholders (zero, infinite) count as not given."""
+    limit, endless = joint.limit, joint.type == 'continuous'
+    ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
+    ends = (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
+    speed = limit.velocity if limit is not None and limit.velocity and math.isfinite(limit.velocity) else None
+    return JointLimits(*ends, speed, endless=endless, described=frozenset(('lower', 'upper', 'speed', 'endless')))
 
 
 def _with_limits(joints, entries, link):
@@ -171,7 +170,10 @@ def _with_limits(joints, entries, link):
         known = by_name[name]
         require_keys(entry, ('name', *LIMIT_KEYS[known.type]), f"limits of joint '{name}'")
         given = limits_from_mapping(entry, known.type)
-        better = {key: value for key, value in vars(given).items() if value is not None}
+        better = {key: value for key, value in vars(given).items() if key != 'described' and value is not None and value is not False}
+        if given.endless or given.lower is not None:   # a range and endless exclude each other
+            better = {'lower': None, 'upper': None, 'endless': False} | better
+        better['described'] = known.limits.described - set(better)
         by_name[name] = replace(known, limits=replace(known.limits, **better))
     return tuple(by_name.values())
 

@@ -25,6 +25,7 @@ from imu_calibration.planning.document import plan_to_mapping, trajectory_to_map
 from imu_calibration.planning.noise import expected_noise
 from imu_calibration.planning.planner import Plan, make_planner
 from imu_calibration.planning.separation import make_separator
+from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.drawing import Drawing
@@ -34,6 +35,8 @@ LONGEST_SEPARATION = 180.0
 """Time that a plan takes at most to tell effects apart, s."""
 ACCUMULATOR = '.npz'
 """Ending of what a live session saves beside its calibration."""
+NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
+"""Stated wherever a plan is printed, saved or driven."""
 START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
@@ -51,8 +54,13 @@ class Planned:
 
     @property
     def exit_code(self) -> int:
-        """0 when every parameter comes within its tolerance, else 3."""
-        return 3 if self.plan.missing else 0
+        """0 when every parameter comes within its tolerance and every joint has a range or is declared endless, else 3."""
+        return 3 if self.plan.missing or missing_ranges(self.table) else 0
+
+    @property
+    def notes(self) -> list[str]:
+        """What was checked and what is doubtful about the limits, a line each."""
+        return [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
 
     @property
     def seconds(self) -> float:
@@ -96,7 +104,7 @@ class Planned:
                 for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]
 
     def __str__(self):
-        return '\n'.join(summary(self.plan))
+        return '\n'.join(summary(self.plan) + self.notes)
 
 
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
@@ -149,6 +157,9 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
     provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                   'known': Path(calibration).name if isinstance(calibration, (str, PathLike)) else 'a calibration' if known else 'nothing'}
+    provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits_of(table)))}
+    if warnings := range_warnings(table):
+        provenance['warnings'] = '; '.join(warnings)
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
     return Planned(planner.plan(progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)

@@ -98,7 +98,7 @@ def test_limits_come_from_the_description_and_the_site():
     limits = {j.name: j.limits for j in table_from_urdf(SIX_AXES, 'imu_link', site).joints}
     assert limits['pan'] == JointLimits(-2.9, 2.9, 3.0)
     assert limits['lift'] == JointLimits(np.radians(-90), np.radians(30), 3.0, np.radians(180.0))
-    assert limits['wrist_3'] == JointLimits(speed=np.radians(90.0))
+    assert limits['wrist_3'] == JointLimits(speed=np.radians(90.0), endless=True)
     assert table_from_urdf(GANTRY, 'imu_link', SITE).joints[0].limits == JointLimits(-0.1, 0.9, 1.5)
 
 

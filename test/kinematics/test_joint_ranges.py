@@ -1,0 +1,106 @@
+"""Range limits of driven joints: declared, endless or missing; doubtful units; restricted turns and the way back."""
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration.cli.main import main
+from imu_calibration.driving.campaign import Campaign, CampaignSettings
+from imu_calibration.driving.path_watch import at_rest
+from imu_calibration.errors import InputError
+from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.planning.planner import NextMotion, make_planner
+from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.reference.table import Table
+from imu_calibration.reference.urdf import table_from_urdf
+from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
+from imu_calibration.simulation.sensor_noise import GRADES
+
+from worlds.arms import SIX_AXES
+
+NOISE = noise_of_grade(GRADES['industrial'].noise, 100.0)
+
+
+def table(**limits):
+    """Two joints with these keys each."""
+    axes = {"outer": [0, 0, 1], "inner": [1, 0, 0]}
+    return Table.from_mapping({'joints': [{'name': name, 'axis': axes[name], **keys} for name, keys in limits.items()], 'gravity': 9.81})
+
+
+def test_a_joint_has_a_range_or_is_endless_or_is_listed():
+    assert missing_ranges(table(outer={'endless': True}, inner={'range_deg': [-90, 90]})) == ()
+    assert missing_ranges(table(outer={}, inner={'speed_deg_s': 10.0})) == ('outer', 'inner')
+    slide = {'joints': [{'name': 'x', 'axis': [1, 0, 0], 'type': 'prismatic'}], 'gravity': 9.81}
+    assert missing_ranges(Table.from_mapping(slide)) == ('x',)
+    arm = table_from_urdf(SIX_AXES, 'imu_link')
+    assert missing_ranges(arm) == () and limits_of(arm).endless.tolist() == [False] * 5 + [True]
+    degrees = SIX_AXES.replace('lower="-2.9" upper="2.9"', 'lower="-166" upper="166"', 1)   # not radians as URDF wants
+    assert missing_ranges(table_from_urdf(degrees, 'imu_link')) == ('pan',)
+    unlimited = SIX_AXES.replace('lower="-2.9" upper="2.9"', '', 1)
+    assert missing_ranges(table_from_urdf(unlimited, 'imu_link')) == ('pan',)
+
+
+def test_a_site_overrides_what_a_robot_description_says_of_the_range():
+    site = {'gravity': 9.81, 'joints': [{'name': 'wrist_3', 'range_deg': [-170, 0]}, {'name': 'pan', 'endless': True}]}
+    joints = {joint.name: joint.limits for joint in table_from_urdf(SIX_AXES, 'imu_link', site).joints}
+    assert joints['pan'].endless and joints['pan'].lower is None
+    assert not joints['wrist_3'].endless and joints['wrist_3'].upper == 0.0
+    with pytest.raises(InputError, match="joint 'outer' must have a range or be endless, got both"):
+        table(outer={'endless': True, 'range_deg': [0, 1]}, inner={})
+    with pytest.raises(InputError, match="endless of joint 'outer' must be true or false, got 1"):
+        table(outer={'endless': 1}, inner={})
+    again = table(outer={'endless': True}, inner={'range_deg': [-90, 90]})
+    assert Table.from_mapping(again.to_mapping()) == again
+
+
+def test_each_limit_is_printed_with_its_origin():
+    site = {'gravity': 9.81, 'joints': [{'name': 'pan', 'speed_deg_s': 60.0}]}
+    arm = table_from_urdf(SIX_AXES, 'imu_link', site)
+    words = limit_words(arm, limits_of(arm).wound(np.zeros(6), 1.0))
+    assert words[0] == 'pan: -166.2 to 166.2 deg (robot description), 60 deg/s (table file), 300 deg/s^2 (default)'
+    assert words[5] == 'wrist_3: endless, here -360 to 360 deg (robot description), 150 deg/s (default), 300 deg/s^2 (default)'
+    bare = table(outer={}, inner={'range_deg': [-90, 90]})
+    assert limit_words(bare, limits_of(bare))[0].startswith('outer: no range, 150 deg/s (default)')
+
+
+def test_a_range_in_radians_is_questioned():
+    lines = range_warnings(table(outer={'range_deg': [-1.57, 1.57]}, inner={'range_deg': [-90, 90]}))
+    assert len(lines) == 1 and "'outer'" in lines[0] and '[-90.0, 90.0]' in lines[0]
+
+
+@pytest.mark.parametrize('start', [0.0, 1000.0])
+def test_an_endless_joint_keeps_to_its_turns_and_is_unwound_at_the_end(start):
+    turntable = table(outer={'endless': True}, inner={'range_deg': [-90, 90]})
+    position = np.array([start, 0.0])
+    limits = limits_of(turntable).wound(position, 1.0)
+    assert limits_of(turntable).wound(position, 0.0).endless[0]
+    planner = make_planner(turntable, noise=NOISE, limits=limits)
+    reached, at = [], position
+    for number in np.random.default_rng(1).permutation(len(planner.situation.motions))[:60]:
+        points = planner.situation.motions[number].points(at)
+        if len(points):
+            assert excess(trajectory_from(at_rest(at), points), limits)[0] <= 1e-9, planner.situation.motions[number].words
+            reached.append(points.position[:, 0])
+            at = points.position[-1]
+    assert np.ptp(np.concatenate(reached)) > 2 * np.pi and np.abs(np.concatenate(reached) - start).max() <= 2 * np.pi
+    planner.next_motion = lambda position: NextMotion(None, 'done')
+    campaign = Campaign(planner, CampaignSettings(separations=0), unwind=planner.unwinding)
+    wound = np.array([start + 6.0, 0.3])
+    decision = campaign.decide(wound, 0.0)
+    np.testing.assert_allclose(decision.motion.points(wound).position[-1], [start, 0.3])
+    assert campaign.decide(wound, 1e9).motion is not None   # also when the time is over
+    assert campaign.decide(np.array([start, 0.3]), 0.0).motion is None
+
+
+def test_a_plan_without_limits_warns_and_exits_with_3(tmp_path, capsys):
+    description = {'joints': [{'name': name, 'axis': axis} for name, axis in (('outer', [0, 1, 0]), ('inner', [0, 0, 1]))], 'gravity': 9.81}
+    codes, texts = [], []
+    for k, keys in enumerate(({}, {'endless': True})):
+        for joint in description['joints']:
+            joint.update(keys)
+        (tmp_path / 'table.yaml').write_text(yaml.safe_dump(description))
+        codes.append(main(['plan', '--table', str(tmp_path / 'table.yaml'), '--output', str(tmp_path / str(k)), '--no-bound', '--no-report']))
+        texts.append(capsys.readouterr().out)
+        assert 'not collisions' in texts[-1] and 'not collisions' in (tmp_path / str(k) / 'plan.yaml').read_text()
+    assert codes == [3, 0]
+    assert 'outer, inner' in texts[0] and 'every joint must have a range' in texts[0] and 'every joint must' not in texts[1]
