@@ -205,6 +205,61 @@ class StampedDerivative:
         self._refresh()
 
 
+class TimedDerivative:
+    """
+    Slope of a straight line through the last samples of a vector by least squares over their stamps, for irregular sampling.
+
+    ``slope = sum((t_k - mean t) v_k) / Sxx``, ``Sxx = sum((t_k - mean t)^2)``. The window is the shortest with at least the Sxx of
+    `derivative` at equal steps: its noise does not exceed that of `derivative`, and the mean delay is about the same. A sample whose stamp
+    is earlier than the newest stamp is not used. A step of more than two windows and 16 periods restarts the window, as does a clock set
+    back by more than a second; the derivative is zero until Sxx equals that of half a window.
+
+    Parameters
+    ----------
+    derivative : differentiation.CausalDerivative
+        Window at equal steps, and the mean period.
+
+    """
+
+    def __init__(self, derivative: CausalDerivative):
+        self.taps, self.period = derivative.taps, derivative.period
+        self._enough = self.taps * (self.taps**2 - 1) / 12 * self.period**2 * 1e18
+        self._stamps: deque[int] = deque()
+        self._values: deque[tuple] = deque()
+        self.alpha = (0.0, 0.0, 0.0)
+
+    def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """Return the derivative (x, y, z) after one more sample, per second."""
+        if self._stamps:
+            step_ns = stamp_ns - self._stamps[-1]
+            if -RESET_NS < step_ns <= 0:
+                return self.alpha
+            if not 0 < step_ns <= 2e9 * max(self.taps, 8) * self.period:
+                self._stamps.clear()
+                self._values.clear()
+        self._stamps.append(stamp_ns)
+        self._values.append((x, y, z))
+        past = np.array([stamp_ns - other for other in reversed(self._stamps)], float)
+        spread = np.cumsum(past**2) - np.cumsum(past)**2 / np.arange(1, len(past) + 1)
+        n = min(int(np.searchsorted(spread, self._enough)) + 1, len(past))
+        for _ in range(len(past) - n):
+            self._stamps.popleft()
+            self._values.popleft()
+        if 8 * spread[n - 1] < self._enough:
+            self.alpha = (0.0, 0.0, 0.0)
+        else:
+            values = np.array(self._values)[::-1]
+            self.alpha = tuple((-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist())
+        return self.alpha
+
+    def rebase(self, stamp_ns: int) -> None:
+        """Keep the window as it is: its times are the stamps."""
+
+    def seed(self, other: 'TimedDerivative') -> None:
+        """Take over the past of another derivative of the same stream."""
+        self._stamps, self._values, self.alpha = other._stamps.copy(), other._values.copy(), other.alpha
+
+
 def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float | None:
     """Return the median of the steps ahead between stamps, s; None without one."""
     steps = np.diff(np.asarray(stamp_ns, np.int64))

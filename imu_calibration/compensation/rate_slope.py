@@ -1,4 +1,4 @@
-"""The derivative of the measured rate, whatever the stamps are: by the stamps, by counting, or not at all; and how far it may be off."""
+"""The derivative of the measured rate for stamps of any kind, by equal steps or by least squares over the stamps, and its error."""
 
 from collections import deque
 from collections.abc import Callable
@@ -6,22 +6,26 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import EARLY, LATE, CausalDerivative, StampedDerivative
+from imu_calibration.compensation.angular_acceleration import EARLY, LATE, RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
 from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
 
 BLOCK = LAG
 """The stamps are looked at again after so many samples."""
 HISTORY = 4 * LAG + 1
 """Stamps from which counted and irregular ones are told apart."""
-CHANGED = {REGULAR: 0.02, COUNTED: 0.05}
-"""A period that differs by more than this share is another one; counting tells it less well."""
+CHANGED = {REGULAR: 0.02, COUNTED: 0.05, IRREGULAR: 0.25}
+"""A period that differs by more than this share is a new one; the scatter of the stamps limits the resolution of the latter two."""
+FASTEST_NS = 10_000.0
+"""Irregular stamps with a shorter mean step stand still: they contain no time for a derivative."""
+AGREE = 4
+"""Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps only."""
 RECENT = 1.0, 64, 2048
 """Seconds, least and most samples from whose motion the error of the derivative is taken."""
 ROUGH = 0.02
 """Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
 NO_SLOPE = (0.0, 0.0, 0.0)
-WITHOUT = ': the angular acceleration cannot be told, the effect of the lever arm stays uncorrected and the covariance has its size'
-"""Behind how the stamps are, where nothing can be made of them."""
+WITHOUT = ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes its size'
+"""Consequence of stamps that stand still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +47,9 @@ class RateSlope:
     """
     Derivative of the rate of a stream, one sample or one block at a time; the outcome does not depend on how the stream is cut.
 
-    Regular stamps say where samples are missing. Where they follow a clock only loosely (packets, times of arrival, whole milliseconds) the
-    samples are counted, and a pause longer than their scatter starts the window anew. Where they follow none there is no derivative: it is
-    zero and `error` has the size of what is left out. The stamps are looked at again every `BLOCK` samples.
+    Regular stamps show where samples are missing. Where stamps scatter about a clock (packets, times of arrival, jitter, in any order) the
+    samples are counted: `_count_on`. Irregular stamps are used as they are: least squares over the stamped times. Where stamps stand still
+    the derivative is zero and `error` returns its size. The kind of the stamps is reviewed every `BLOCK` samples.
 
     Parameters
     ----------
@@ -62,17 +66,19 @@ class RateSlope:
         """How the stamps are; None while they are too few to tell."""
         self.derivative: CausalDerivative | None = None
         """What is in use; None: nothing."""
-        self._tracker: StampedDerivative | None = None
+        self._tracker: StampedDerivative | TimedDerivative | None = None
         self._stamps: deque[int] = deque(maxlen=HISTORY)
         self._due = LEAST + 1
         self._newest: int | None = None
         self._reading: tuple = NO_SLOPE
         self._slope: tuple = NO_SLOPE
         self._count, self._longest_ns, self._young = 0, 0.0, True
+        self._agreeing, self._ahead_ns = 0, 0
+        self._doubtful: list[tuple] = []
         self._recent: deque[tuple] = deque(maxlen=RECENT[1])
         self._all_of_it: SlopeError | None = None
         self.n_without = 0
-        """Samples without a derivative because their stamps follow no clock."""
+        """Samples without a derivative because their stamps stand still."""
 
     @property
     def period(self) -> float | None:
@@ -82,7 +88,7 @@ class RateSlope:
     @property
     def doubt(self) -> str:
         """Why there is no derivative; '' when there is one, or that is not known yet."""
-        return f'{self.line}{WITHOUT}' if self.line is not None and self.line.word == IRREGULAR else ''
+        return f'{self.line}{WITHOUT}' if self.line is not None and self._tracker is None else ''
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
         """Return the derivative (x, y, z) after one more sample, per second."""
@@ -99,8 +105,10 @@ class RateSlope:
             self._recent.append((x, y, z))
             return NO_SLOPE
         if self._longest_ns:
-            stamp_ns = self._counted(self._tracker, step_ns)
-        self._slope = slope = self._tracker.push(stamp_ns, x, y, z)
+            slope = self._count_on(self._tracker, step_ns, (x, y, z))
+        else:
+            slope = self._tracker.push(stamp_ns, x, y, z)
+        self._slope = slope
         self._recent.append(slope)
         return slope
 
@@ -110,7 +118,7 @@ class RateSlope:
         while start < len(values):
             stop = self._usual_until(stamp_ns, values, start)
             if stop > start:
-                assert self._tracker is not None, 'regular stamps have a derivative'
+                assert isinstance(self._tracker, StampedDerivative), 'regular stamps have equal steps'
                 out[start:stop] = self._tracker.push_block(stamp_ns[start:stop], values[start:stop])
                 self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop])
             if stop < len(values):
@@ -119,26 +127,26 @@ class RateSlope:
         return out
 
     def settle(self, line: StampLine) -> None:
-        """Use from now on what suits stamps of that kind; while the period stays, so does what the window holds."""
-        self.line = line
+        """Use the derivative for stamps of that kind; the window is kept while the period is unchanged."""
+        self.line, self._doubtful, self._agreeing = line, [], 0
         self._longest_ns = line.high_ns - line.low_ns + LATE * line.period_ns if line.word == COUNTED else 0.0
-        if self._tracker is not None and self._suits(line):
+        if isinstance(self._tracker, StampedDerivative) and self._suits(line):
             self._tracker.rebase(round(self._count * 1e9 * self._tracker.period) if self._longest_ns else self._stamps[-2])
             return
         self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
         self.derivative = self._tracker = None
-        if line.word != IRREGULAR:
+        if not _stand_still(line):
             self.derivative = self._choose(line.period_ns * 1e-9)
-            self._tracker = StampedDerivative(self.derivative)
+            self._tracker = (TimedDerivative if line.word == IRREGULAR else StampedDerivative)(self.derivative)
         seconds, least, most = RECENT
         self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope, self._young = NO_SLOPE, True
         self._changed()
 
     def _suits(self, line: StampLine) -> bool:
-        """Return whether what is in use suits stamps of that kind."""
-        if self._tracker is None or line.word == IRREGULAR:
-            return self._tracker is None and line.word == IRREGULAR
+        """Return whether the derivative in use suits stamps of that kind."""
+        if self._tracker is None or isinstance(self._tracker, TimedDerivative) != (line.word == IRREGULAR):
+            return self._tracker is None and _stand_still(line)
         return abs(1e-9 * line.period_ns / self._tracker.period - 1) <= CHANGED[line.word]
 
     def prepare(self, before: 'RateSlope') -> None:
@@ -151,8 +159,9 @@ class RateSlope:
         """Go on where another one stops, after `prepare`."""
         self._stamps, self._due, self._count = before._stamps, before._due, before._count
         self._newest, self._reading = before._newest, before._reading
-        if self._tracker is not None and before._tracker is not None:
-            self._tracker.seed(before._tracker)
+        self._agreeing, self._ahead_ns, self._doubtful = before._agreeing, before._ahead_ns, before._doubtful
+        if self._tracker is not None and isinstance(before._tracker, type(self._tracker)):
+            self._tracker.seed(before._tracker)   # type: ignore[arg-type]
 
     def error(self) -> SlopeError:
         """
@@ -185,13 +194,30 @@ class RateSlope:
         lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
         return SlopeError(_moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period)**2)
 
-    def _counted(self, tracker: StampedDerivative, step_ns: int) -> int:
-        """Return the time of the newest sample by counting; behind a pause that hides how many were lost the window starts anew."""
-        self._count += 1 if 0 <= step_ns <= self._longest_ns else tracker.taps + 1
-        return round(self._count * 1e9 * tracker.period)
+    def _count_on(self, tracker: StampedDerivative | TimedDerivative, step_ns: int, reading: tuple) -> tuple:
+        """
+        Return the derivative after a sample that is counted.
+
+        Behind a step longer than the scatter of the stamps samples may be lost, or one stamp was late. The derivative is kept until a later
+        stamp decides; the window is restarted when half a window of samples has not decided, or at once where the step exceeds a window.
+        """
+        self._ahead_ns = step_ns + (self._ahead_ns if self._doubtful else 0)
+        self._doubtful.append(reading)
+        usual_ns = self._longest_ns + 1e9 * tracker.period * (len(self._doubtful) - 1)
+        in_order = -RESET_NS < step_ns and self._ahead_ns <= usual_ns
+        may_return = step_ns > 0 and self._ahead_ns <= usual_ns + 1e9 * tracker.period * tracker.taps
+        if not in_order and may_return and 2 * len(self._doubtful) <= tracker.taps:
+            return self._slope
+        self._count += 0 if in_order else tracker.taps
+        slope = self._slope
+        for x, y, z in self._doubtful:
+            self._count += 1
+            slope = tracker.push(round(self._count * 1e9 * tracker.period), x, y, z)
+        self._doubtful = []
+        return slope
 
     def _review(self) -> None:
-        """Look at the latest stamps again; after the first motion by new ones, say how far the derivative is off."""
+        """Classify the latest stamps again; after the first block behind a change, update the error of the derivative."""
         if self.line is not None and self._young:
             self._young = False
             self._changed()
@@ -210,6 +236,11 @@ class RateSlope:
             if self.line is None:
                 self._changed()   # so that what is left out meanwhile is known
             return
+        if self.line is not None and (self.line.word, line.word) == (IRREGULAR, COUNTED) and self._tracker is not None:
+            self._agreeing += 1   # independent steps look counted in one of four reviews
+            if self._agreeing < AGREE:
+                return
+        self._agreeing = 0
         if self.line is None or line.word != self.line.word or not self._suits(line):
             self.settle(line)
         self._due = BLOCK
@@ -235,6 +266,10 @@ class RateSlope:
         self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
         self._due = (self._due - len(stamp_ns) - 1) % BLOCK + 1
         self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)):].tolist()))
+
+
+def _stand_still(line: StampLine) -> bool:
+    return line.word == IRREGULAR and line.period_ns < FASTEST_NS
 
 
 def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:

@@ -130,7 +130,7 @@ class CompensationStream:
             lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
                          'make sure that it is the same sensor')
         if self.slope.n_without and uses_slope(self.calibration, self.transfer):
-            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples follow no clock{WITHOUT}')
+            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples stand still{WITHOUT}')
         if self.flagged:
             lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
         return lines
