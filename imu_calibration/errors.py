@@ -6,6 +6,7 @@ that is called there: an option of the command line, a parameter or topic of a n
 """
 
 KEYS = {
+    'allow_xacro': 'permission to run a .xacro file',
     'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document',
     'columns': 'the columns of a text log', 'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
@@ -55,9 +56,15 @@ class DocumentError(InputError):
     """A calibration document cannot be used."""
 
 
+def printable(text: str) -> str:
+    """Return a text with a question mark for each line end, control character, change of direction and undecodable byte."""
+    return text if text.isprintable() and '\ufffd' not in text else \
+        ''.join(character if character.isprintable() and character != '\ufffd' else '?' for character in text)
+
+
 def shortened(text: str, length: int = 60) -> str:
-    """Return a text on one line, cut off where it goes on for long: for what came, which may be anything."""
-    text = ' '.join(text.split())
+    """Return a text on one line without control characters, truncated at `length` characters: for received text, which may be anything."""
+    text = printable(' '.join(text[:length * 4].split()))
     return text if len(text) <= length else f'{text[:length - 3]}...'
 
 

@@ -82,11 +82,28 @@ def read_effects(path: str | PathLike[str], catalogue: Catalogue = CATALOGUE) ->
     return read_mapping(path, 'file of effects', catalogue.with_document)
 
 
-def read_robot_description(path: str | PathLike[str]) -> str:
-    """Return the text of a robot description; macros of a .xacro file are expanded."""
+def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False) -> str:
+    """
+    Return the text of a robot description.
+
+    Parameters
+    ----------
+    path : path-like
+    allow_xacro : bool
+        Expand a .xacro file. Its expressions can execute any Python code, so that expanding it is running a program.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or expanded, or is a .xacro file without that permission.
+
+    """
+    text = read_text(path, 'robot description')
     if Path(path).suffix != '.xacro':
-        return read_text(path, 'robot description')
-    read_text(path, 'robot description')
+        return text
+    if not allow_xacro:
+        raise InputError(f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
+                         'if you trust its author', key='allow_xacro')
     import xacro
     try:
         return xacro.process_file(str(path)).toxml()

@@ -29,13 +29,15 @@ class Setting:
     """Why not, when it does not."""
     session: bool
     """Whether it names what a session works on: files of settings leave it out, or they would undo what was said before them."""
+    path: bool
+    """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set the others."""
 
 
 def setting(default: Any, unit: str, text: str, bounds: tuple = (None, None), symptom: str = '', *, live: bool = False,
-            fixed: str = 'it is read at the start', session: bool = False) -> Any:
+            fixed: str = 'it is read at the start', session: bool = False, path: bool = False) -> Any:
     """Declare one field of a settings dataclass; arguments as in `Setting`."""
     return field(default=default, metadata={'unit': unit, 'text': text, 'bounds': bounds, 'symptom': symptom, 'live': live, 'fixed': fixed,
-                                            'session': session})
+                                            'session': session, 'path': path})
 
 
 def describe(group: Any) -> list[Setting]:

@@ -26,7 +26,8 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description, YAML; none: no table, by hand'),
-        DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf or .xacro), path; or topic: '
+        DeclareLaunchArgument('urdf', default_value='', description='robot description, path (.urdf, or .xacro with '
+                              'allow_xacro: true in params); or topic: '
                               'robot_description; with table:=none, or one that says where the arm stands'),
         DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),

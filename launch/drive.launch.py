@@ -31,7 +31,7 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
                               description='table description with the limits of its joints, YAML'),
-        DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf or .xacro), path; or topic: '
+        DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf), path; or topic: '
                               'robot_description; with table:=none, or one that says where the arm stands'),
         DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('save_file', default_value='',

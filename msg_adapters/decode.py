@@ -11,7 +11,7 @@ from imu_calibration.errors import InputError
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, imu_from_rows, imu_row
 from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout, joint_row, joints_from_rows
 from msg_adapters.layout import Packed, group_by_layout
-from msg_adapters.stamps import MessageError, UnusableMessage
+from msg_adapters.stamps import MessageError, UnusableMessage, clean_name
 from msg_adapters.temperature import TEMPERATURE_TYPE, decode_temperature, find_temperature_layout, temperature_from_rows, temperature_row
 
 JOINT_PATIENCE = 1000
@@ -123,7 +123,7 @@ class JointDecoder(Decoder):
         self.seen = []
         self.n_messages, self.n_fitting = 0, 0
         self.decode_layout = lambda layout, packed: decode_joints(layout, packed, self._expected(layout.names))
-        self.read_row = lambda message: joint_row(message, self._expected(tuple(message.name)))
+        self.read_row = lambda message: joint_row(message, self._expected(tuple(map(clean_name, message.name))))
         self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from imu_calibration.errors import InputError
 from msg_adapters.bag import open_recording
 from msg_adapters.definitions import deserializer
+from msg_adapters.stamps import clean_name
 
 DESCRIPTION_TOPIC = '/robot_description'
 STRING_TYPE = 'std_msgs/msg/String'
@@ -48,8 +49,8 @@ def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
     """Return (parent, child, quaternion) of each transform of a TFMessage, as an object of rclpy or rosbags."""
-    return [(t.header.frame_id.lstrip('/'), t.child_frame_id.lstrip('/'), np.array([getattr(t.transform.rotation, a) for a in 'xyzw']))
-            for t in message.transforms]
+    return [(clean_name(t.header.frame_id).lstrip('/'), clean_name(t.child_frame_id).lstrip('/'),
+             np.array([getattr(t.transform.rotation, a) for a in 'xyzw'])) for t in message.transforms]
 
 
 def _messages(path, imu_topic, topic, message_type) -> Iterator[Any]:

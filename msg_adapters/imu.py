@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.samples import ImuSamples
 from msg_adapters.layout import MessageLayout, Packed, overlapping
-from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
+from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, clean_name, header_stamp_ns, open_header
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 
@@ -42,7 +42,7 @@ def parse_imu(data: bytes) -> ImuMessage:
 
     """
     header, body = _open_message(data)
-    return ImuMessage(header.stamp_ns, header.frame.decode(errors='replace'), _DOUBLES[header.order].unpack_from(data, body))
+    return ImuMessage(header.stamp_ns, header.frame_id, _DOUBLES[header.order].unpack_from(data, body))
 
 
 def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float]) -> bytes:
@@ -76,7 +76,7 @@ def find_imu_layout(data: bytes) -> MessageLayout:
     header, body = _open_message(data)
     offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
-    return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame.decode(errors='replace'),))
+    return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame_id,))
 
 
 def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
@@ -125,7 +125,8 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
 def imu_row(message: Any) -> tuple[int, tuple[float, float, float], tuple[float, float, float], str]:
     """Return (stamp_ns, force, rate, frame_id) of a message object of rclpy or rosbags; absent readings as NaN."""
     force = _reading(message.linear_acceleration, message.linear_acceleration_covariance)
-    return header_stamp_ns(message), force, _reading(message.angular_velocity, message.angular_velocity_covariance), message.header.frame_id
+    rate = _reading(message.angular_velocity, message.angular_velocity_covariance)
+    return header_stamp_ns(message), force, rate, clean_name(message.header.frame_id)
 
 
 def imu_from_rows(rows: Sequence[Any]) -> ImuSamples:

@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.samples import JointSamples
 from msg_adapters.layout import MessageLayout, Packed
-from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, header_stamp_ns, open_header
+from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, clean_name, header_stamp_ns, open_header
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
@@ -57,7 +57,7 @@ def decode_joints(layout: MessageLayout, packed: Packed, joint_names: Sequence[s
 
 def joint_row(message: Any, joint_names: Sequence[str]) -> tuple[int, list[float], list[float]]:
     """Return (stamp_ns, positions, velocities) of a message object of rclpy or rosbags (raises UnusableMessage)."""
-    columns = joint_columns(message.name, len(message.position), joint_names)
+    columns = joint_columns(list(map(clean_name, message.name)), len(message.position), joint_names)
     has_velocity = len(message.velocity) == len(message.name)
     velocity = [message.velocity[k] for k in columns] if has_velocity else [np.nan] * len(columns)
     return header_stamp_ns(message), [message.position[k] for k in columns], velocity
@@ -100,7 +100,7 @@ class _Walk:
         length = self.count()
         start = self._skip(length)
         self.fixed.append((start, self.position))
-        return self.data[start:start + max(length - 1, 0)].decode(errors='replace')
+        return clean_name(self.data[start:start + max(length - 1, 0)])
 
     def doubles(self):
         """Step over a sequence of doubles; return (offset, count)."""

@@ -11,7 +11,7 @@ from imu_calibration.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
-from msg_adapters.stamps import UnusableMessage
+from msg_adapters.stamps import UnusableMessage, clean_name
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 
@@ -81,10 +81,10 @@ class FrameDecoder(Decoder):
 
     def __init__(self, frame_id: str = ''):
         super().__init__(IMU_TYPE)
-        self.frame_id = frame_id
+        self.frame_id = clean_name(frame_id)
         decode_layout, read_row = self.decode_layout, self.read_row
         self.decode_layout = lambda layout, packed: decode_layout(self._checked(layout, layout.names[0]), packed)
-        self.read_row = lambda message: read_row(self._checked(message, message.header.frame_id))
+        self.read_row = lambda message: read_row(self._checked(message, clean_name(message.header.frame_id)))
 
     def _checked(self, passed, frame_id):
         self.frame_id = self.frame_id or frame_id

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_adapters.layout import overlapping
+from msg_adapters.stamps import clean_name
 
 MAGIC = b'\x89MCAP0\r\n'
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
@@ -61,14 +62,14 @@ class McapDamage(Exception):
 def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
     """Return (id, Schema) from the content of a Schema record."""
     number, = struct.unpack_from('<H', content)
-    (name, encoding, text), _ = _strings(content, 2, 3)
-    return number, Schema(name, encoding, text)
+    name, encoding, text = _strings(content, 2, 3)
+    return number, Schema(clean_name(name), clean_name(encoding), text.decode(errors='replace'))
 
 
 def parse_channel(content: bytes | memoryview) -> tuple[int, Channel]:
     """Return (id, Channel) from the content of a Channel record."""
     number, schema_id = struct.unpack_from('<HH', content)
-    (topic, encoding), _ = _strings(content, 4, 2)
+    topic, encoding = map(clean_name, _strings(content, 4, 2))
     return number, Channel(schema_id, topic, encoding)
 
 
@@ -199,6 +200,6 @@ def _strings(content, position, count):
     texts = []
     for _ in range(count):
         length, = struct.unpack_from('<I', content, position)
-        texts.append(bytes(content[position + 4:position + 4 + length]).decode(errors='replace'))
+        texts.append(bytes(content[position + 4:position + 4 + length]))
         position += 4 + length
-    return texts, position
+    return texts

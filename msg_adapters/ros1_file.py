@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from msg_adapters.layout import Packed
+from msg_adapters.stamps import clean_name
 from msg_adapters.storage import Arrived
 
 STRETCH = 8192
@@ -29,9 +30,10 @@ class Ros1File:
         self.types = {}
         self.definitions = {}
         for connection in self.reader.connections:
-            self.types[connection.topic] = connection.msgtype
-            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
-            self.definitions[connection.msgtype] = ('ros2msg', connection.msgdef.data)
+            topic, message_type = clean_name(connection.topic), clean_name(connection.msgtype)
+            self.types[topic] = message_type
+            self.counts[topic] = self.counts.get(topic, 0) + connection.msgcount
+            self.definitions[message_type] = ('ros2msg', connection.msgdef.data)
 
     @property
     def duration_ns(self) -> int:
@@ -40,7 +42,7 @@ class Ros1File:
 
     def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
         """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
-        connections = [c for c in self.reader.connections if c.topic in topics]
+        connections = [c for c in self.reader.connections if clean_name(c.topic) in topics]
         pending, n_pending, n_read = defaultdict(list), 0, 0
         expected = sum(c.msgcount for c in connections)
         messages = self.reader.messages(connections) if connections else iter(())
@@ -52,7 +54,7 @@ class Ros1File:
             except Exception as error:   # whatever a damaged file makes rosbags raise
                 self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
                 break
-            pending[connection.topic].append((bytes(data), received_ns))
+            pending[clean_name(connection.topic)].append((bytes(data), received_ns))
             n_pending, n_read = n_pending + 1, n_read + 1
             if n_pending == STRETCH:
                 yield _arrived(pending)

@@ -16,6 +16,7 @@ import numpy as np
 from msg_adapters.layout import Packed
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.sqlite_pages import PageReader
+from msg_adapters.stamps import clean_name
 from msg_adapters.storage import StorageFile, Stretch
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
@@ -57,11 +58,15 @@ class SqliteFile(StorageFile):
     def _read_topics(self):
         self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
         for topic_id, name, message_type, encoding in self.connection.execute('SELECT id, name, type, serialization_format FROM topics'):
-            self.topic_ids[name].append(topic_id)
-            self.types[name] = message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
+            if not (isinstance(topic_id, int) and isinstance(name, str) and isinstance(message_type, str)):
+                self._lose('topics without a name or type', 1)
+                continue
+            topic = clean_name(name)
+            self.topic_ids[topic].append(topic_id)
+            self.types[topic] = clean_name(message_type if encoding == 'cdr' else f'{message_type} ({encoding})')
         with suppress(sqlite3.Error):   # before schema version 4 there are no definitions
             rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')
-            self.definitions = {name: (encoding, text) for name, encoding, text in rows}
+            self.definitions = {clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows}
 
     def count(self) -> dict[str, int]:
         """Return topic -> messages by counting them."""
@@ -157,4 +162,5 @@ def _connect(path, logged):
     connection = sqlite3.connect(address, uri=True, check_same_thread=False)
     # Without this SQLite refuses a truncated file as a whole; what is still there can then be read.
     connection.execute('PRAGMA writable_schema = ON')
+    connection.text_factory = partial(str, encoding='utf-8', errors='replace')
     return connection

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from imu_calibration.errors import printable
+
 NS_PER_S = 1_000_000_000
 
 ENCAPSULATION_SIZE = 4
@@ -12,6 +14,9 @@ ENCAPSULATION_SIZE = 4
 
 FRAME_OFFSET = ENCAPSULATION_SIZE + 8
 """Where the length of the frame_id stands, behind the stamp."""
+
+LONGEST_NAME = 256
+"""Bytes of a name; ROS 2 itself allows 255 for a topic."""
 
 _STARTS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
@@ -41,6 +46,12 @@ def byte_order(data: bytes) -> str:
         raise MessageError(f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}') from None
 
 
+def clean_name(name: str | bytes) -> str:
+    """Return a frame, topic, type or joint name without control characters, at most `LONGEST_NAME` bytes; a recording may contain any."""
+    raw = name.encode(errors='replace') if isinstance(name, str) else bytes(name)
+    return printable(raw[:LONGEST_NAME].decode(errors='replace'))
+
+
 class Header(NamedTuple):
     """What stands in front of every stamped message."""
 
@@ -52,6 +63,11 @@ class Header(NamedTuple):
     """frame_id without its closing zero."""
     end: int
     """First byte behind the frame_id, not yet aligned."""
+
+    @property
+    def frame_id(self) -> str:
+        """The frame_id as text."""
+        return clean_name(self.frame)
 
 
 def open_header(data: bytes) -> Header:

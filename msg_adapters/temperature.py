@@ -20,7 +20,7 @@ def find_temperature_layout(data: bytes) -> MessageLayout:
         raise MessageError(f'a Temperature message with its doubles at byte {body} has {body + 16} bytes, got {len(data)}')
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
     return MessageLayout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)},
-                         (header.frame.decode(errors='replace'),))
+                         (header.frame_id,))
 
 
 def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamples:

@@ -22,7 +22,9 @@ def add_stand_arguments(parser: ArgumentParser, without: str) -> None:
     group = parser.add_argument_group('table or arm', without)
     group.add_argument('--table', metavar='TABLE', help='table description (YAML); beside a robot description: where the robot '
                        'stands (up, gravity, latitude, mount, limits of joints by name)')
-    group.add_argument('--urdf', metavar='FILE', help='description (.urdf or .xacro) of the robot that carries the IMU')
+    group.add_argument('--urdf', metavar='FILE', help='description (.urdf, or .xacro with --allow-xacro) of the robot that carries the IMU')
+    group.add_argument('--allow-xacro', action='store_true', help='expand a .xacro file, which is a program: its expressions '
+                       'can execute any Python code; only for files whose author you trust')
     group.add_argument('--imu-link', metavar='LINK', help='link that carries the IMU, default the frame_id of its messages; '
                        'without --urdf: of the description on /robot_description in the recording')
     group.add_argument('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
@@ -33,7 +35,7 @@ def stand_of(options: Namespace) -> Stand | None:
     """Return the table or arm that parsed arguments name."""
     if options.urdf is None and options.imu_link is None:
         return options.table
-    return Arm(options.urdf, options.imu_link, options.table, options.up)
+    return Arm(options.urdf, options.imu_link, options.table, options.up, options.allow_xacro)
 
 
 def add_model_arguments(parser: ArgumentParser) -> _ArgumentGroup:

@@ -1,6 +1,7 @@
 """The static transform from our sensor frame to that of a target, as a line of a file: written, and found again."""
 
 import re
+import shlex
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,14 +19,15 @@ def pose_line(placement: Placement, parent: str, child: str) -> str:
     """Return the transform with the arguments of the program of tf2_ros, with all digits."""
     values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
     pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(NUMBERS, values)}
-    return ' '.join([PUBLISHER, *(f'--{name} {value}' for name, value in (pose | {PARENT: parent, CHILD: child}).items())])
+    return ' '.join([PUBLISHER, *(f'--{name} {shlex.quote(value)}' for name, value in (pose | {PARENT: parent, CHILD: child}).items())])
 
 
 def find_pose(content: bytes) -> tuple[Placement, str] | None:
     """Return (placement, our frame) of the first such line in a file, None where there is none: in files that others wrote."""
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
-    options = dict(re.findall(r'--(\S+) ([^\s"]+)', line.group(1))) if line else {}
     try:
+        words = shlex.split(line.group(1).partition('"')[0]) if line else []
+        options = {name.removeprefix('--'): value for name, value in zip(words, words[1:], strict=False) if name.startswith('--')}
         values = np.array([float(options[name]) for name in NUMBERS])
         parent = options[PARENT]
     except (KeyError, ValueError):

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.errors import InputError, shortened
+from imu_calibration.errors import InputError, printable, shortened
 
 XYZ = 'XYZ'
 """Axes in the names of parameters."""
 
 
 def commented(lines: list[str], mark: str = '# ') -> str:
-    """Return lines as comments."""
-    return ''.join(f'{mark}{line}'.rstrip() + '\n' for line in lines)
+    """Return lines as comments; a name in a line cannot end the comment."""
+    return ''.join(f'{mark}{printable(line)}'.rstrip() + '\n' for line in lines)
 
 
 def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:

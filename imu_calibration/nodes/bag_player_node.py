@@ -26,7 +26,7 @@ class PlayerSettings:
     """What to play, and how fast."""
 
     bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why',
-                       session=True)
+                       session=True, path=True)
     topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing',
                           session=True)
     rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible',

@@ -61,7 +61,7 @@ class CalibrationNodeSettings:
     """What the node reads, asks for and writes."""
 
     table_file: str = setting('', '', 'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
-                              'turns between them', symptom='joint states are not listened to', session=True,
+                              'turns between them', symptom='joint states are not listened to', session=True, path=True,
                               fixed='all motion gathered so far belongs to the table')
     frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
                             symptom='every Imu message is dropped, diagnostics say so', session=True,
@@ -79,21 +79,21 @@ class CalibrationNodeSettings:
     model_as_asked: bool = setting(False, '', 'add nothing to the model, whatever the motion demands',
                                    symptom='an effect that is there bends the others', fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='good parameters are called weak', session=True)
+                                   symptom='good parameters are called weak', session=True, path=True)
     effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
                                 'tolerance, text}, '
                                 'or a calibration that has some; a model may name them then',
                                 symptom='the node refuses a model that names them',
-                                session=True, fixed='motion is gathered for the model')
+                                session=True, path=True, fixed='motion is gathered for the model')
     noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: how its biases move from window to window, on a table; '
                               'empty: what '
-                              'the windows say of it', symptom='standard deviations of the biases are too large or too small', session=True,
-                              fixed='one session is judged by one noise')
+                              'the windows say of it', symptom='standard deviations of the biases are too large or too small',
+                              session=True, path=True, fixed='one session is judged by one noise')
     save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, '
                              'also when '
                              'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, '
                              'with ~/save alone',
-                             symptom='the node says at its start that the place is not writable', live=True, session=True)
+                             symptom='the node says at its start that the place is not writable', session=True, path=True)
     resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
                            symptom='old motion of another IMU enters the calibration', session=True)
     autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
@@ -188,8 +188,6 @@ class CalibrationNode(Node):
     def _change(self, name: str, group: Any) -> None:
         """Take changed parameters: at once what concerns files, the rest by the worker between two of its steps."""
         if name == 'settings':
-            if group.save_file != self.settings.save_file:
-                self.worker.move(SessionFiles(group.save_file))
             self.worker.autosave_period, self.settings = group.autosave_period, group
         elif name == 'live':
             self._live_settings = group

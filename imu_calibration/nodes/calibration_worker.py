@@ -18,7 +18,7 @@ from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveSession
 from imu_calibration.calibration.trust import missing
 from imu_calibration.diagnosis.live import DiagnosisState, question_about
-from imu_calibration.errors import ImuCalibrationError, InputError, NotObservableError, shortened
+from imu_calibration.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
@@ -263,21 +263,6 @@ class CalibrationWorker(threading.Thread):
         self.live.change_by_hand(by_hand)
         self._new_windows = self.live.n_windows > 0
         return True, ''
-
-    def move(self, place: SessionFiles) -> None:
-        """
-        Save to another place from now on.
-
-        Raises
-        ------
-        InputError
-            When nothing can be saved there.
-
-        """
-        if why := place.try_place():
-            raise InputError(why)
-        self.place = place
-        self._note_fault('place', '')
 
     def _autosave(self) -> None:
         if self.place.autosave(self.live, self.autosave_period):

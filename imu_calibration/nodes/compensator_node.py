@@ -205,7 +205,7 @@ class CompensatorNode(Node):
         if self.settings.calibration_file:
             why = self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
-            why = "parameter 'calibration_file' is empty; set it to the file to return to"
+            why = "parameter 'calibration_file' is empty; start the node with the file to read again"
         response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
         return response
 
@@ -218,7 +218,7 @@ class CompensatorNode(Node):
 
     def _change_compensation(self, settings: CompensatorSettings) -> None:
         old, insists = self.settings, settings.anyway and not self.settings.anyway
-        if settings.calibration_file and (settings.calibration_file != old.calibration_file or (insists and not settings.takes_topic)):
+        if settings.calibration_file and insists and not settings.takes_topic:
             self._load_file(settings)
         elif settings.takes_topic and self._heard and (insists or not old.takes_topic):
             self._adopt(self._heard, f'topic {self.documents.topic_name}', settings)

@@ -19,9 +19,9 @@ file wants it displaced by somebody else's session, and nobody who names none ha
 class CompensatorSettings:
     """What to correct with, where to, and how."""
 
-    calibration_file: str = setting('', '', 'calibration.yaml to correct with, and to return to on ~/reload; '
+    calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; '
                                     'empty: wait for imu/calibration',
-                                    symptom='nothing is published, diagnostics say why', live=True, session=True)
+                                    symptom='nothing is published, diagnostics say why', session=True, path=True)
     adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
                          'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
                          symptom='a calibration that comes on the topic is not taken, or displaces the file', live=True)
@@ -48,7 +48,7 @@ class CompensatorSettings:
     noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: '
                               'covariances follow from it where the messages bring none; empty: '
                               'from the noise that the calibration saw', symptom='filters trust the readings too much or too little',
-                              live=True, session=True)
+                              session=True, path=True)
     covariance_rate: float = setting(1.0, 'Hz', 'how often covariances are taken anew at the present motion; '
                                      '0: only with a new calibration',
                                      (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)

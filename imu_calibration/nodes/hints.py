@@ -1,6 +1,6 @@
 """What the nodes call the things that errors of the core ask for: parameters and topics."""
 
-_ARM = {'urdf': "parameter 'urdf_file'", 'imu_link': "parameter 'imu_link'"}
+_ARM = {'allow_xacro': "parameter 'allow_xacro'", 'urdf': "parameter 'urdf_file'", 'imu_link': "parameter 'imu_link'"}
 HINTS = {
     'calibration_node': {'gravity': "parameter 'gravity'", 'table': "parameter 'table_file'", **_ARM, 'imu_topic': 'remap imu/data_raw',
                          'joint_topic': 'remap joint_states', 'temperature_topic': 'remap imu/temperature'},

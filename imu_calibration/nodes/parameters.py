@@ -44,7 +44,8 @@ def declare_parameters(node: Node, group: type) -> Any:
 
 def parameter_descriptor(item: Setting) -> ParameterDescriptor:
     """Return the descriptor of one setting: type, meaning, unit, range, what a wrong value looks like, why it cannot be changed."""
-    descriptor = ParameterDescriptor(name=item.name, description=f'{item.text} [{item.unit}]' if item.unit else item.text)
+    text = f'{item.text} [{item.unit}]' if item.unit else item.text
+    descriptor = ParameterDescriptor(name=item.name, description=text, read_only=item.path)
     notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [f'Fixed while the node runs: {item.fixed}.'] * (not item.live)
     descriptor.additional_constraints = ' '.join(notes)
     if isinstance(item.default, bool) or item.bounds == (None, None):

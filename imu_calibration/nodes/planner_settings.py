@@ -12,16 +12,16 @@ class PlannerNodeSettings:
 
     table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
                               'config/table_three_axis.yaml, or with urdf_file nothing',
-                              symptom='other joints, or limits that are not theirs', session=True)
+                              symptom='other joints, or limits that are not theirs', session=True, path=True)
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='motions go on for too long, or end too early', session=True)
+                                   symptom='motions go on for too long, or end too early', session=True, path=True)
     accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
     gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
     reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that nobody estimates')
     grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
                          symptom='the predicted standard deviations are not those that are reached')
     noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
-                              symptom='the predicted standard deviations are not those that are reached', session=True)
+                              symptom='the predicted standard deviations are not those that are reached', session=True, path=True)
     imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
                               'the predicted standard deviations are not those that are reached')
     command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '

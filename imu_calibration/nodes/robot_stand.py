@@ -32,11 +32,12 @@ Found = TypeVar('Found')
 class RobotSettings:
     """The arm that carries the IMU."""
 
-    urdf_file: str = setting('', '', "description (.urdf or .xacro) of the arm that carries the IMU, path; "
+    urdf_file: str = setting('', '', "description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; "
                              f"{TOPIC}: what comes on robot_description; empty: "
                              'table_file alone. Beside an arm table_file says where it stands: up, gravity, latitude, '
                              'limits of joints by name',
-                             symptom='the node waits, and says for what', session=True, fixed='all motion gathered so far is of that arm')
+                             symptom='the node waits, and says for what', session=True, path=True,
+                             fixed='all motion gathered so far is of that arm')
     imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',
                             symptom='another place and attitude of the sensor', session=True,
                             fixed='all motion gathered so far is of that link')
@@ -44,6 +45,8 @@ class RobotSettings:
                                'empty: up is as table_file says, '
                                "else the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
                                fixed='all motion gathered so far is of an arm that stands so')
+    allow_xacro: bool = setting(False, '', 'expand a .xacro file, which is a program: its expressions can execute any Python code',
+                                symptom='the node refuses a .xacro file')
 
 
 def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str = '') -> Table | None:
@@ -71,7 +74,8 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     if not robot.urdf_file:
         return None if place is None else files.read_table(place)
     site = {} if place is None else files.read_mapping(place, 'table description')
-    text = _topic_text(node) if robot.urdf_file == TOPIC else files.read_robot_description(files.user_path(robot.urdf_file))
+    text = (_topic_text(node) if robot.urdf_file == TOPIC
+            else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro))
     link = robot.imu_link or frame_id or _message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id
     if robot.world_frame:
         site['up'] = _up(node, robot.world_frame, root_of(text))

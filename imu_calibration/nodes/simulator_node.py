@@ -56,7 +56,7 @@ class SimulatorSettings:
 
     table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml, '
                               'or with urdf_file nothing',
-                              symptom='joint names are not those expected', session=True)
+                              symptom='joint names are not those expected', session=True, path=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
                            'a trajectory comes on joint_trajectory', symptom='the node refuses and lists the names', session=True)
@@ -64,7 +64,7 @@ class SimulatorSettings:
     stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting',
                                 symptom='the node does not end')
     calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
-                                    symptom='another IMU is simulated', session=True)
+                                    symptom='another IMU is simulated', session=True, path=True)
     grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
                          symptom='noise too large or small')
     hide: str = setting('', '', 'what else is wrong with the IMU, by its physics, names joined by +: ' + ', '.join(CAUSES),

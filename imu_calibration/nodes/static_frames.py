@@ -8,6 +8,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.static_transforms import StaticTransforms
+from msg_adapters.stamps import clean_name
 
 TOPIC = '/tf_static'
 DEPTH = 100
@@ -44,7 +45,7 @@ class StaticFrames:
         """Take a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             place, turn = stamped.transform.translation, stamped.transform.rotation
-            usable = self.transforms.add(stamped.header.frame_id.lstrip('/'), stamped.child_frame_id.lstrip('/'),
+            usable = self.transforms.add(*(clean_name(name).lstrip('/') for name in (stamped.header.frame_id, stamped.child_frame_id)),
                                          xyz=(place.x, place.y, place.z),
                                          quaternion=(turn.x, turn.y, turn.z, turn.w))
             self.n_unusable += not usable

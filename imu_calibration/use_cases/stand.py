@@ -35,6 +35,8 @@ class Arm:
     """What a table description says beside the joints: file or mapping; its joints may give limits by name."""
     up: Sequence[float] | None = None
     """Up in the frame of the root; None: as the site says, else /tf_static of the recording, else z."""
+    allow_xacro: bool = False
+    """Whether a .xacro file may be expanded, which runs its expressions as Python code."""
 
 
 Stand = str | PathLike | Table | Arm
@@ -83,7 +85,7 @@ def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = 
 def _description(arm, bag):
     """Return the text of the robot description: of the file, else of the recording's topic."""
     if arm.urdf is not None:
-        return files.read_robot_description(arm.urdf)
+        return files.read_robot_description(arm.urdf, arm.allow_xacro)
     if bag is None:
         raise InputError('the description of the robot whose link was named must be given, got none; give the file', key='urdf')
     return description_in(*bag)

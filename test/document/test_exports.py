@@ -343,6 +343,21 @@ def test_the_standard_motion_is_that_of_the_conditions():
     assert isinstance(ref, Reference)
 
 
+HOSTILE = 'imu\nARMING_CHECK,0\r1\t1\tCBRK_IO_SAFETY\t22027\t6\u2028gyroscope_noise_density: 9; $(touch x)'
+
+
+@pytest.mark.parametrize('name', sorted(name for name, target in all_targets().items() if target.write and not target.only_noise))
+def test_a_name_in_a_calibration_adds_no_line_to_the_file_of_another_program(name):
+    """A line end in frame_id ended the comment; what followed was a parameter line of a flight controller."""
+    plain = random_calibration(4, ())
+    files = [export(replace(plain, frame_id=frame), find_target(name), rate=200.0).content for frame in ('imu', HOSTILE)]
+    if find_target(name).whole or b'comments' in files[0]:   # JSON and MATLAB files: strings that escape themselves
+        return
+    lines = [[line for line in file.decode().splitlines() if not line.startswith('#')] for file in files]
+    assert lines[0] == lines[1]
+    assert b"'imu?ARMING" in files[1] or b'static_transform_publisher' not in files[1]   # quoted for the shell
+
+
 # There and back
 
 def back_and_forth(name, calibration):

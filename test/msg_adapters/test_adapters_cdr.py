@@ -17,7 +17,7 @@ from msg_adapters.joint_state import JOINT_STATE_TYPE, MISSING_JOINT, NO_POSITIO
 from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE, encode_trajectory, trajectory_from_message
 from msg_adapters.layout import MAX_LAYOUTS, Packed
 from msg_adapters.live import LiveGatherer
-from msg_adapters.stamps import MessageError
+from msg_adapters.stamps import LONGEST_NAME, MessageError, clean_name
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -59,11 +59,20 @@ def test_imu_fields_are_those_of_rosbags(message, little):
     data = serialize(message, little)
     parsed = parse_imu(data)
     assert parsed.stamp_ns == message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-    assert parsed.frame_id == message.header.frame_id
+    assert parsed.frame_id == clean_name(message.header.frame_id)
     np.testing.assert_array_equal(parsed.doubles[FIELDS['orientation']], [message.orientation.x, message.orientation.y,
                                                                          message.orientation.z, message.orientation.w])
     np.testing.assert_array_equal(parsed.doubles[FIELDS['rate_cov']], message.angular_velocity_covariance)
     np.testing.assert_array_equal(parsed.doubles[FIELDS['force_cov']], message.linear_acceleration_covariance)
+
+
+@quick
+@given(st.text() | st.binary(max_size=400))
+def test_a_name_is_one_short_line_whatever_a_recording_contains(name):
+    clean = clean_name(name)
+    assert clean.isprintable() and len(clean.encode()) <= LONGEST_NAME and clean_name(clean) == clean
+    assert clean_name('imu_größe/左 1') == 'imu_größe/左 1' and len(clean_name('x' * 5000)) == LONGEST_NAME
+    assert clean_name('imu\n1,\x1b[2J\u202e') == 'imu?1,?[2J?'
 
 
 @quick

@@ -107,12 +107,23 @@ def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(b
     answer = bench.call('/calibration_node/save')
     assert not answer.success and 'not written: ' in answer.message and str(place) in answer.message and '\n' not in answer.message
     bench.until(lambda: bench.lines().get(CALIBRATION, (0, ''))[0] == ERROR, 'an error on /diagnostics')
-    refused = node.set_parameters([Parameter('save_file', value=str(tmp_path / 'file' / 'again.yaml'))])[0]
-    assert not refused.successful and 'must be writable' in refused.reason
-    assert node.set_parameters([Parameter('save_file', value=str(tmp_path / 'new' / 'calibration.yaml'))])[0].successful
-    answer = bench.call('/calibration_node/save')
-    assert answer.success and (tmp_path / 'new' / 'calibration.yaml').is_file(), answer.message
     assert (tmp_path / 'file').read_text() == 'here already'
+    if kind == 'a file as parent':
+        (tmp_path / 'file').unlink()
+        answer = bench.call('/calibration_node/save')
+        assert answer.success and place.is_file(), answer.message
+
+
+def test_a_participant_cannot_redirect_what_save_writes(bench, session, tmp_path):
+    node = start(bench, tmp_path)
+    victim = tmp_path / '.profile'
+    victim.write_text('true')
+    answer = node.set_parameters([Parameter('save_file', value=str(victim))])[0]
+    assert not answer.successful and 'read-only' in answer.reason
+    send(bench, *session)
+    gathered(bench, node)
+    assert bench.call('/calibration_node/save').success
+    assert victim.read_text() == 'true' and (tmp_path / 'calibration.yaml').is_file()
 
 
 def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost_where_not(bench, session, tmp_path, monkeypatch):
@@ -164,7 +175,7 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
     assert "'setling' is unknown and ignored; did you mean 'settling'?" in unknown_parameters(node)[0]
     assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
     assert node._options.windows.settling == 2.0
-    for name, value, words in (('table_file', 'other.yaml', 'belongs to the table'), ('accelerometer_model', 'bias', 'gathered for the model')):
+    for name, value, words in (('model_as_asked', True, 'gathered for the model'), ('accelerometer_model', 'bias', 'gathered for the model')):
         answer = node.set_parameters([Parameter(name, value=value)])[0]
         assert not answer.successful and 'cannot be changed while the node runs' in answer.reason and words in answer.reason
 

@@ -122,19 +122,21 @@ def test_a_file_that_was_named_is_not_displaced_unless_asked(bench, place):
 
 
 def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
-    (tmp_path / 'other.yaml').write_text(OTHER_TEXT)
-    (tmp_path / 'broken.yaml').write_text('frame_id: [')
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
 
     def change(**values):
         return node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
-    assert change(calibration_file=str(tmp_path / 'other.yaml')).successful and node.adopted.version == version_of(OTHER_TEXT)
-    for values, words in (({'calibration_file': str(tmp_path / 'broken.yaml')}, 'must be YAML'), ({'calibration_file': str(tmp_path)}, 'readable'),
+    for values, words in (({'calibration_file': str(tmp_path / 'other.yaml')}, 'read-only'), ({'noise_file': '/dev/zero'}, 'read-only'),
                           ({'adopt': 'nobody'}, 'must be file, topic, file_then_topic'), ({'public_executor': True}, 'cannot be changed while the node runs'),
                           ({'target_xyz': [1.0, 0.0, 0.0]}, 'target frame')):
         answer = change(**values)
         assert not answer.successful and words in answer.reason and '\n' not in answer.reason
-        assert node.adopted.version == version_of(OTHER_TEXT)
+        assert node.adopted.version == version_of(GOOD_TEXT)
+    place.write_text(OTHER_TEXT)   # ~/reload reads the same path again
+    assert bench.call('/compensator_node/reload').success and node.adopted.version == version_of(OTHER_TEXT)
+    place.write_text('frame_id: [')
+    answer = bench.call('/compensator_node/reload')
+    assert not answer.success and 'must be YAML' in answer.message and node.adopted.version == version_of(OTHER_TEXT)
     assert change(target_frame='base_link', target_xyz=[1.0, 0.0, 0.0]).successful
     assert node.compensation.transfer.frame_id == 'base_link'
 
