@@ -1,6 +1,6 @@
 # Two commands do all set-up on a machine that has Python 3.11 or later, its venv module and make:
 #   make demo    a simulated recording, its calibration, a compensated bag and a report
-#   make test    every test but the longest, which make test-long runs
+#   make test    the core and the live lane of the tests; make test-long runs the longest tests
 # With a ROS 2 Jazzy sourced its rclpy is used, otherwise rclpy comes from PyPI; all versions are pinned in constraints/.
 
 PYTHON ?= python3
@@ -32,8 +32,9 @@ endif
 
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
-# Three processes on two cores: tests over DDS mostly wait. conftest.py says which files begin first.
-PYTEST = $(PY) -m pytest $(PLUGINS) -n 3 --dist loadfile
+# Three processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
+LANES = $(PY) test/run_lanes.py
+PROCESSES = $(PLUGINS) -n 3
 
 .PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
 
@@ -62,15 +63,15 @@ live-demo: $(STAMP)
 	@$(PY) examples/live_demo.py --output $(OUTPUT)
 
 test: $(STAMP)
-	$(PYTEST) -m 'not long' $(TEST_OPTIONS)
+	$(LANES) core live -- $(PROCESSES) --dist loadfile $(TEST_OPTIONS)
 
-# The longest tests, handed out one by one rather than by files: some seventy cases that take as long as all the others.
+# The longest tests, distributed one by one rather than by file.
 test-long: $(STAMP)
-	$(PYTEST) --dist load -m long $(TEST_OPTIONS)
+	$(LANES) long -- $(PROCESSES) --dist load $(TEST_OPTIONS)
 
-# Everything but what is long or needs DDS.
+# The core lane: no DDS, no other processes, no browser. Two processes, because no test waits.
 test-fast: $(STAMP)
-	$(PYTEST) -m 'not slow and not long and not dds' $(TEST_OPTIONS)
+	$(LANES) core -- $(PLUGINS) -n 2 --dist loadfile $(TEST_OPTIONS)
 
 # Libraries that some tests compare with; without them these tests are skipped.
 oracles: $(STAMP)
@@ -92,7 +93,7 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 test-oldest:
 	$(MAKE) test test-long VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
 
-# Each declared line of the guards broken, one at a time (test/mutants/declared.py): which faults does no test notice?
+# Each fault of test/mutants/declared.py put into a copy of the code, one at a time: which faults does no test notice?
 mutants: $(STAMP)
 	@$(PY) test/mutants/run.py
 

@@ -13,6 +13,8 @@ from hypothesis import HealthCheck, settings  # noqa: E402
 settings.register_profile('suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile('suite')
 
+pytest_plugins = ['lanes']
+
 
 @pytest.fixture(scope='session')
 def recordings():
@@ -31,7 +33,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
-    long = Counter(item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'dds'))))
+    long = Counter(item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'live'))))
     items.sort(key=lambda item: -long[item.path])
 
 

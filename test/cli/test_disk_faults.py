@@ -64,6 +64,7 @@ def test_whatever_step_fails_the_old_file_stays_whole(tmp_path, monkeypatch, ste
     assert len(list(tmp_path.iterdir())) == (2 if step == 'unlink too' else 1)
 
 
+@pytest.mark.live
 def test_a_full_disk_leaves_what_was_there(tmp_path):
     place = tmp_path / 'calibration.yaml'
     place.write_text('old')

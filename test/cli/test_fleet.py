@@ -108,6 +108,7 @@ def test_a_unit_has_the_word_of_each_sensor(result):
     assert 'bad (accelerometer bad, gyroscope good)' in page and '<span class="tag bad">' in page
 
 
+@pytest.mark.live
 @pytest.mark.long
 def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     """Two units at a time write what one after the other writes."""
@@ -115,6 +116,7 @@ def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     assert_same_files(tmp_path, result[1])
 
 
+@pytest.mark.live
 @pytest.mark.long
 def test_a_cluster_gives_the_same_bytes(recordings, result, tmp_path):
     """A scheduler with two workers does the same work."""

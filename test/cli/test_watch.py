@@ -56,7 +56,7 @@ def test_before_anything_came_the_screen_is_short():
 
 
 @pytest.mark.long
-@pytest.mark.dds
+@pytest.mark.live
 def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     pytest.importorskip('rclpy')
     from imu_calibration.nodes.processes import local_environment, node_command

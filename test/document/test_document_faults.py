@@ -150,6 +150,7 @@ print('done')
 '''
 
 
+@pytest.mark.live
 def test_texts_that_would_take_all_memory_or_end_the_process_are_refused_in_one_line():
     """Under a limit of 2 GB for the whole process; most of them took minutes, gigabytes or the process."""
     done = subprocess.run([sys.executable, '-c', ATTACKS], capture_output=True, text=True, timeout=120)

@@ -202,6 +202,7 @@ def test_by_hand_it_is_found_too(name):
     assert name in [finding.effect for finding in found.findings] and ADDED[name]['text'] in found.report
 
 
+@pytest.mark.live
 def test_documents_and_processes_carry_it(tmp_path):
     truth = session(*INVERTED).truth
     text = calibration_to_text(truth)

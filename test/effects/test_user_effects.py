@@ -169,6 +169,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
     assert not called and passed > 150
 
 
+@pytest.mark.live
 def test_the_node_reads_the_file(mine):
     program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
                'from imu_calibration.resources import config_file\n'

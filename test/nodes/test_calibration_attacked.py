@@ -22,7 +22,7 @@ from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 from ros.live_station import TABLE  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 CALIBRATION, STREAMS = 'calibration_node: calibration', 'calibration_node: streams'
 

@@ -28,7 +28,7 @@ from imu_calibration.by_hand.workflow import calibrate_without_table
 
 from ros.live_station import Station, taken  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 RATE = 10.0
 
 

@@ -20,7 +20,7 @@ PARAMETERS = {'calibration_node': [TABLE], 'simulator_node': [TABLE], 'compensat
 
 LOCAL = {'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.live]
 
 
 @pytest.fixture(scope='module')
@@ -93,7 +93,6 @@ def test_the_command_line_starts(workspace, folder):
         assert verb in done.stdout
 
 
-@pytest.mark.dds
 @pytest.mark.parametrize('name', PARAMETERS)
 def test_a_node_joins_the_graph_and_ends_on_sigint(workspace, graph, name):
     namespace = f'build_{uuid.uuid4().hex}'

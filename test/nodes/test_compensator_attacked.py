@@ -27,7 +27,7 @@ from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 
 from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
 GOOD, OTHER = (random_calibration(seed, verdict='good', proof=PROOF) for seed in (1, 2))

@@ -19,7 +19,7 @@ from ros.harness import Harness
 from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 
 DOMAIN = 61
 START_NS = 10**18

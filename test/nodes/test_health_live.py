@@ -19,7 +19,7 @@ from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 
 from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: health'
 WORLD = drive(6, 6, warm_up=(0.0, 0.0, 0.3 * DEG))

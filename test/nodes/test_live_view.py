@@ -155,7 +155,7 @@ def bench(monkeypatch):
     found.close()
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_a_compensator_shows_what_it_does(bench, tmp_path):
     """Raw beside corrected with the band of the published covariance; turned on while it runs, its address said once."""
     from rclpy.parameter import Parameter
@@ -220,7 +220,7 @@ def test_the_layout_asks_for_what_a_compensator_shows():
             schema = schema['properties'][name]
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_asked_for_in_vain_while_it_runs_the_answer_names_the_package(bench, monkeypatch):
     from rclpy.parameter import Parameter
 

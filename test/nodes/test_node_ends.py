@@ -15,6 +15,7 @@ from imu_calibration.nodes.parameter_files import settings_of
 from imu_calibration.settings import describe
 
 ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.live
 SLOW_IMPORT = "import pathlib, time\npathlib.Path({mark!r}).touch()\ntime.sleep(60)\n"
 EARLY = '''
 import os, signal, sys

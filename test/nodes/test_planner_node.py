@@ -202,7 +202,7 @@ def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
     assert not driver.began and said == ['stop']
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once(monkeypatch):
     from sensor_msgs.msg import JointState
 
@@ -254,7 +254,7 @@ class Loop(Station):
         return next(pair.value for pair in self.status['planner_node: drive'].values if pair.key == key)
 
 
-@pytest.mark.dds
+@pytest.mark.live
 @pytest.mark.long
 def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_path):
     with Loop(tmp_path / 'out.txt') as loop:
@@ -275,7 +275,7 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
 
 
 @pytest.mark.long
-@pytest.mark.dds
+@pytest.mark.live
 @pytest.mark.parametrize('fault, words', [
     ({'refuse_after': 0}, 'the controller refused it or does not listen'), ({'stall_joint': 'middle', 'stall_time': 0.0}, '')])
 def test_a_table_that_refuses_or_stalls_ends_everything_with_one_sentence(tmp_path, fault, words):
@@ -291,7 +291,7 @@ def test_a_table_that_refuses_or_stalls_ends_everything_with_one_sentence(tmp_pa
 
 
 @pytest.mark.long
-@pytest.mark.dds
+@pytest.mark.live
 def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_moving(tmp_path):
     from sensor_msgs.msg import JointState
     with Loop(tmp_path / 'out.txt') as loop:
@@ -318,7 +318,7 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
         assert loop.value('state') == 'stopped'
 
 
-@pytest.mark.dds
+@pytest.mark.live
 @pytest.mark.long
 def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_leaves_nothing_moving(tmp_path):
     from sensor_msgs.msg import JointState

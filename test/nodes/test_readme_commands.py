@@ -16,7 +16,7 @@ pytest.importorskip('rclpy')
 from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
 from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
 
-pytestmark = [pytest.mark.slow, pytest.mark.dds]
+pytestmark = [pytest.mark.slow, pytest.mark.live]
 PATIENCE = 90.0
 PLANNER = '/planner_node/'
 """What is asked of who drives; without a table it answers why nothing moves."""

@@ -33,7 +33,7 @@ def test_the_executor_never_takes_what_the_loop_reads():
     assert not group.can_execute(object()) and not group.beginning_execution(object())
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_the_ends_of_the_benchmark_still_fit_the_loop(monkeypatch):
     """They lean on it as the compensator does; nothing else runs them."""
     monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2])

@@ -16,7 +16,7 @@ pytest.importorskip('rclpy')
 from ros.live_station import Publisher, Station  # noqa: E402
 from ros.soak import LIMIT_MB, soak  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 SIGMA = 5.0
 """Errors of some thirty parameters stay below so many reported standard deviations."""
 

@@ -27,7 +27,7 @@ from imu_calibration.nodes.robot_stand import RobotSettings, chain_of  # noqa: E
 from ros.one_process import OneProcess  # noqa: E402
 from worlds.arms import SIX_AXES  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 LINK = 'imu_link'
 
 

@@ -14,7 +14,7 @@ pytest.importorskip('rclpy')
 from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
 from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
 
-pytestmark = [pytest.mark.slow, pytest.mark.dds]
+pytestmark = [pytest.mark.slow, pytest.mark.live]
 TABLE = ROOT / 'bags/sample_session/table.yaml'
 TRUTH = ROOT / 'bags/sample_session/truth.yaml'
 FAULTY = '''

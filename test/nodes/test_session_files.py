@@ -34,6 +34,7 @@ ON_A_SMALL_DISK = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c'
 """Mounts a disk of 128 kB that nobody else sees and that ends with the process."""
 
 
+@pytest.mark.live
 def test_on_a_disk_that_is_really_full_what_was_there_stays_whole(tmp_path):
     try:
         done = subprocess.run([*ON_A_SMALL_DISK, str(tmp_path), sys.executable, FULL_DISK], capture_output=True, text=True, timeout=60)

@@ -192,7 +192,7 @@ def test_the_wander_goes_on_from_block_to_block():
     assert np.max(np.abs(np.diff(rate, axis=0))) < 6 * 1e-3 * np.sqrt(2 / 250)
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_a_simulator_follows_a_trajectory_with_clock_and_truth():
     from builtin_interfaces.msg import Duration
     from rosgraph_msgs.msg import Clock
@@ -230,7 +230,7 @@ def test_a_simulator_follows_a_trajectory_with_clock_and_truth():
     assert np.max(np.abs(true.rate_s)) > 0.2
 
 
-@pytest.mark.dds
+@pytest.mark.live
 def test_the_player_plays_every_message_to_the_last_bit_and_refuses_what_it_cannot(tmp_path):
     imu, joints, _, _ = make_session(1, 100.0, seconds=20.0)
     write_session(tmp_path / 'bag', imu, joints)

@@ -32,7 +32,7 @@ from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
 from ros.message_package import make_package, why_not  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: compensation'
 XYZ, RPY = [0.3, -0.1, 0.05], [0.2, -0.4, 1.1]

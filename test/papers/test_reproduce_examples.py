@@ -9,6 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
+pytestmark = pytest.mark.live
+
 
 def run_example(name):
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
@@ -48,7 +50,6 @@ def test_example_runs_and_reports(name, lines):
 
 
 @pytest.mark.long
-@pytest.mark.dds
 def test_a_navigation_node_is_better_off_with_corrected_readings(tmp_path):
     """Over DDS from a bag: the corrected path ends near the true one, the other one does not."""
     pytest.importorskip('rclpy')

@@ -98,6 +98,7 @@ def inside(names, *packages):
     return {name for name in names if any(name == package or name.startswith(f'{package}.') for package in packages)}
 
 
+@pytest.mark.live
 def test_the_core_imports_with_numpy_and_scipy_alone_and_without_a_screen():
     environment = {k: v for k, v in os.environ.items() if k not in ('DISPLAY', 'WAYLAND_DISPLAY', 'PYTHONPATH')}
     command = [sys.executable, '-c', BLOCKED_IMPORTS, *map(module_name, core_modules())]

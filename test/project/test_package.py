@@ -95,6 +95,7 @@ def distribution(requirement):
     return re.sub(r'[-_.]+', '-', re.match(r'[A-Za-z0-9._-]+', requirement).group()).lower()
 
 
+@pytest.mark.live
 def test_manifest_set_up_and_module_agree(manifest, installed):
     assert manifest.name == installed['name'] == resources.PACKAGE
     assert manifest.version == installed['version'] == imu_calibration.__version__
@@ -126,6 +127,7 @@ def test_the_manifest_declares_what_the_code_imports(manifest):
     assert {ROSDEP_KEYS.get(name, name) for name in imported - EXTRAS} <= declared
 
 
+@pytest.mark.live
 def test_console_scripts_are_those_of_the_contract_and_exist(installed):
     targets = dict(re.split(r'\s*=\s*', script) for script in installed['scripts'])
     assert set(targets) == EXECUTABLES
@@ -137,6 +139,7 @@ def test_console_scripts_are_those_of_the_contract_and_exist(installed):
         assert function in names, target
 
 
+@pytest.mark.live
 def test_every_python_package_and_data_file_is_installed(installed):
     folders = {path.parent for package in ('imu_calibration', 'msg_adapters') for path in (ROOT / package).rglob('*.py')}
     assert set(installed['packages']) == {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
@@ -147,6 +150,7 @@ def test_every_python_package_and_data_file_is_installed(installed):
     assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/report/templates'}
 
 
+@pytest.mark.live
 @pytest.mark.parametrize('name', ['pypi.txt', 'jazzy-ubuntu2404.txt', 'oldest.txt'])
 def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
     lines = pinned(name)
@@ -159,6 +163,7 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
     assert {distribution(requirement) for requirement in installed['requires']} <= set(names)
 
 
+@pytest.mark.live
 def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
     oldest = {distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned('oldest.txt')}
     for requirement in installed['requires']:

@@ -260,6 +260,7 @@ def opened(page, width, tmp_path):
     return dict(zip(words[::2], map(int, words[1::2]), strict=True))
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(('name', 'width'), (('on_table', 1300), ('on_table', 800), ('on_table', 500), ('by_hand', 500)))
 def test_a_browser_shows_it_without_errors_overflow_or_overlap(pages, tmp_path, name, width):
     found = opened(pages[name], width, tmp_path)
@@ -267,6 +268,7 @@ def test_a_browser_shows_it_without_errors_overflow_or_overlap(pages, tmp_path, 
     assert (found['flat'], found['overlaps']) == (0, 0)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize('name', ('on_table', 'by_hand'))
 def test_nothing_is_cut_off_on_paper(pages, tmp_path, name):
     page = pages[name].replace('@media print', '@media all')

@@ -47,10 +47,12 @@ def modules_after(statement):
     return set(done.stdout.split())
 
 
+@pytest.mark.live
 def test_the_package_alone_imports_nothing_heavy():
     assert not modules_after('import imu_calibration') & HEAVY
 
 
+@pytest.mark.live
 def test_its_functions_come_without_ros_and_without_a_screen():
     assert not modules_after('import imu_calibration as imu; imu.calibrate, imu.load') & {'rclpy', 'rosbags', 'matplotlib', 'rich', 'sensor_msgs'}
 
@@ -220,6 +222,7 @@ def test_the_notebook_runs_cell_by_cell_and_shows_its_plots():
     assert max(map(abs, names['error'].values())) < 4.5
 
 
+@pytest.mark.live
 @pytest.mark.long
 def test_the_notebook_is_a_script_too(tmp_path):
     done = subprocess.run([sys.executable, '-W', 'error', str(ROOT / 'examples/notebook.py')], cwd=tmp_path, capture_output=True, text=True, timeout=300)

@@ -143,7 +143,7 @@ def test_the_truth_of_python_ins_is_recovered():
 
 
 @pytest.mark.long
-@pytest.mark.dds
+@pytest.mark.live
 @pytest.mark.real_data
 def test_one_imu_predicts_another_live(recordings):
     pytest.importorskip('rclpy')

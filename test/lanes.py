@@ -1,0 +1,91 @@
+"""Pytest plugin: keeps processes and DDS out of the core lane and reports the processor time of the slowest tests."""
+
+import functools
+import multiprocessing.util
+import os
+import subprocess
+import sys
+
+import pytest
+
+STANDARD_LIBRARY = os.path.dirname(os.__file__)
+SLOWEST = 20
+"""Tests listed at the end of a run."""
+_core_test = None
+"""Node id of the core test that runs; None while a live test runs or none."""
+_seconds = {}
+"""Node id -> processor seconds, fixtures that the test set up included."""
+_start = pytest.StashKey()
+
+
+def _kept_out(function, action):
+    """Return a function that fails a core test before it acts; a failure is no Exception, so that code under test cannot catch it."""
+    @functools.wraps(function)
+    def guarded(*arguments, **options):
+        if _core_test and not _library_calls():
+            pytest.fail(f'A core test must not {action}; {_core_test} did: mark it with pytest.mark.live, or test without it.')
+        return function(*arguments, **options)
+    return guarded
+
+
+def _library_calls():
+    """Return whether an installed library acts by itself, as matplotlib, which runs fc-list when it has no list of fonts yet."""
+    frame = sys._getframe(2)
+    while frame and frame.f_code.co_filename.startswith((STANDARD_LIBRARY, '<frozen')) and '-packages' not in frame.f_code.co_filename:
+        frame = frame.f_back
+    return frame is not None and '-packages' in frame.f_code.co_filename
+
+
+def pytest_configure():
+    """Guard the functions that start processes and DDS participants."""
+    starts = 'start a process'
+    subprocess.Popen.__init__ = _kept_out(subprocess.Popen.__init__, starts)
+    multiprocessing.util.spawnv_passfds = _kept_out(multiprocessing.util.spawnv_passfds, starts)
+    for name in ('fork', 'forkpty', 'posix_spawn', 'posix_spawnp', 'system'):
+        setattr(os, name, _kept_out(getattr(os, name), starts))
+    try:
+        from rclpy.context import Context
+    except ImportError:
+        return
+    Context.init = _kept_out(Context.init, 'use DDS')
+
+
+def _processor_time():
+    """Return seconds of this process and of its ended children; those do not depend on other work of the machine."""
+    return sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """Name the core test that runs, and take the time."""
+    global _core_test
+    _core_test = None if item.get_closest_marker('live') else item.nodeid
+    item.stash[_start] = _processor_time()
+    try:
+        return (yield)
+    finally:
+        _core_test = None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Attach the processor time to the last report of a test, which also arrives from other processes."""
+    report = yield
+    if call.when == 'teardown':
+        report.user_properties.append(('processor_seconds', _processor_time() - item.stash[_start]))
+    return report
+
+
+def pytest_runtest_logreport(report):
+    """Collect the processor times."""
+    _seconds.update({report.nodeid: seconds for name, seconds in report.user_properties if name == 'processor_seconds'})
+
+
+def pytest_terminal_summary(terminalreporter):
+    """List the tests that took most processor time."""
+    slowest = [item for item in sorted(_seconds.items(), key=lambda item: -item[1])[:SLOWEST] if item[1] > 1]
+    if not slowest:
+        return
+    terminalreporter.section(f'slowest {len(slowest)} of {len(_seconds)} tests, {sum(_seconds.values()):.0f} s of processor time in total')
+    for name, seconds in slowest:
+        terminalreporter.write_line(f'{seconds:6.1f} s {name}')
