@@ -1,4 +1,4 @@
-"""Break each declared line, one at a time, in a copy of the code, and report the faults that no test noticed."""
+"""Put each declared fault into a copy of the code, one at a time, and report the faults that no test noticed."""
 
 import argparse
 import os
@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / 'test'))
 
 from mutants.declared import MUTANTS  # noqa: E402
+from mutants.mutation import NotFound, mutated, path_of_test  # noqa: E402
 
 LONGEST = 120
 """s of processor time; a test that a fault keeps from ending has noticed it, one that waits for a busy machine has not."""
@@ -51,14 +52,16 @@ def tested(folder, tests, *options, longest=LONGEST):
 
 def tried(folder, mutant):
     """Return (what became of a mutant, the test that noticed)."""
-    path = folder / mutant.file
+    try:
+        place, broken = mutated(ROOT, mutant.place, mutant.pattern, mutant.fault)
+    except NotFound as error:
+        return BROKEN, str(error)
+    path = folder / place.relative_to(ROOT)
     text = path.read_text()
-    if text.count(mutant.line) != 1:
-        return BROKEN, f'{mutant.file} has its line {text.count(mutant.line)} times'
-    path.write_text(text.replace(mutant.line, mutant.fault))
+    path.write_text(broken)
     try:
         for test in mutant.tests:
-            code, line = tested(folder, [test])
+            code, line = tested(folder, [path_of_test(ROOT, test)])
             if code == 1:
                 return NOTICED, line
             if code:
@@ -69,18 +72,18 @@ def tried(folder, mutant):
 
 
 def main():
-    """Try all mutants, or those whose name or file holds a word that is given; exit code 1 when one survives."""
+    """Try all mutants, or those whose name or place contains a given word; exit code 1 when one survives."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('words', nargs='*', help='only mutants with one of these in their name or file')
+    parser.add_argument('words', nargs='*', help='only mutants with one of these in their name or place')
     parser.add_argument('--workers', type=int, default=2)
     asked = parser.parse_args()
-    chosen = [m for m in MUTANTS if not asked.words or any(word in m.name or word in m.file for word in asked.words)]
+    chosen = [m for m in MUTANTS if not asked.words or any(word in m.name or word in m.place for word in asked.words)]
     start, counts = time.monotonic(), dict.fromkeys((NOTICED, SURVIVED, BROKEN), 0)
     with tempfile.TemporaryDirectory() as place:
         folders = Queue()
         for number in range(asked.workers):
             folders.put(copied(Path(place) / str(number)))
-        needed = sorted({test for mutant in chosen for test in mutant.tests})
+        needed = sorted({path_of_test(ROOT, test) for mutant in chosen for test in mutant.tests})
         code, line = tested(folders.queue[0], needed, '-n', str(asked.workers), '--dist', 'loadfile', longest=PATIENCE * LONGEST)   # all of them in one go
         if code:
             sys.exit(f'the tests must pass before anything is broken: {line or code}')
