@@ -19,7 +19,7 @@ PAUSE_NS = 2_000_000_000
 def bench_table():
     """Return the three-axis Table that the sessions run on."""
     import yaml
-    return Table.from_mapping(yaml.safe_load(config_file('table_three_axis.yaml').read_text(encoding='utf-8')))
+    return Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
 
 
 def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):

@@ -92,7 +92,7 @@ def iterate(bag):
 
 def calibrate(bag, output):
     """Return (seconds, peak memory in MB) of calibrating a bag in a process of its own."""
-    command = [sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_three_axis.yaml')),
+    command = [sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_simulated.yaml')),
                '--output', str(output), '--no-report']
     found = subprocess.run([sys.executable, '-c', RUNNER, *command], cwd=ROOT, capture_output=True, text=True, check=True)
     seconds, kilobytes, code = found.stdout.split()

@@ -23,7 +23,7 @@ from imu_calibration import files  # noqa: E402
 from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 
 G, DEG = 9.80665, np.pi / 180
-TABLE = ROOT / 'config' / 'table_three_axis.yaml'
+TABLE = ROOT / 'config' / 'table_simulated.yaml'
 FACTOR = 4.0
 """Simulated seconds per second."""
 HIDDEN, PROFILE = 'soft_spring', 'six_faces'

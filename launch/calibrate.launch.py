@@ -24,8 +24,8 @@ CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 def generate_launch_description():
     """Describe calibration_node and the names it can be given."""
     return LaunchDescription([
-        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
-                              description='table description, YAML; none: no table, by hand'),
+        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
+                              description='table description, YAML; the template is refused; none: no table, by hand'),
         DeclareLaunchArgument('urdf', default_value='', description='robot description, path (.urdf, or .xacro with '
                               'allow_xacro: true in params); or topic: '
                               'robot_description; with table:=none, or one that says where the arm stands'),

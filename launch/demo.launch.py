@@ -21,7 +21,7 @@ def generate_launch_description():
     simulator = {'profile': ParameterValue(LaunchConfiguration('profile'), value_type=str), 'clock': True, 'wait_for_subscribers': 2,
                  'time_factor': ParameterValue(LaunchConfiguration('time_factor'), value_type=float)}
     return LaunchDescription([
-        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
+        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_simulated.yaml']),
                               description='table description, YAML'),
         DeclareLaunchArgument('profile', default_value='quick', description='motion of the table'),
         DeclareLaunchArgument('time_factor', default_value='1.0', description='seconds of simulated time per second'),

@@ -29,8 +29,8 @@ def generate_launch_description():
     topics = [('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
               ('joint_trajectory', LaunchConfiguration('joint_trajectory'))]
     return LaunchDescription([
-        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_three_axis.yaml']),
-                              description='table description with the limits of its joints, YAML'),
+        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
+                              description='table description with the limits of its joints, YAML; the template is refused'),
         DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf), path; or topic: '
                               'robot_description; with table:=none, or one that says where the arm stands'),
         DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),

@@ -40,7 +40,7 @@ class ReferenceErrors:
     joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, drawn anew in every window', (0.0, 0.1))
     rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
     gravity: float = setting(5e-4, 'm/s^2',
-                             'local gravity, when the table description states no gravity_sd: 50 mGal, an anomaly of the normal field',
+                             'local gravity, if the table description gives gravity without gravity_sd',
                              (0.0, 1.0))
 
 
@@ -74,7 +74,8 @@ def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceError
     errors : ReferenceErrors
 
     """
-    gravity_sd = result.table.gravity_sd if result.table.gravity_sd is not None else errors.gravity
+    table = result.table
+    gravity_sd = errors.gravity if table.gravity is not None and table.gravity_sd is None else table.gravity_sd_value
     causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
     declared = _causes(result, errors, gravity_sd)
     shifts = parameter_shifts(result, [change for _, _, _, changes in declared for change in changes])

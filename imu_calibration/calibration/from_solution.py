@@ -73,11 +73,9 @@ def _besides(directions, needed, in_tolerances):
 
 def with_gravity_uncertainty(solution: Solution, table: Table) -> np.ndarray:
     """Return the covariance with the uncertainty of gravity, which scales the accelerometer matrix as a whole."""
-    if not table.gravity_sd:
-        return solution.covariance
     direction = np.zeros(len(solution.values))
     part = solution.model.part('accelerometer', Role.LINEAR)
-    direction[part] = solution.values[part] * table.gravity_sd / table.gravity_value
+    direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value
     return solution.covariance + np.outer(direction, direction)
 
 

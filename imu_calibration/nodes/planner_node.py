@@ -70,7 +70,10 @@ class PlannerNode(Node):
         settings = self.settings
         require_grade(settings.grade)
         robot = declare_parameters(self, RobotSettings)
-        self._table = chain_of(self, robot, settings.table_file) or files.read_table(config_file('table_three_axis.yaml'))
+        table = chain_of(self, robot, settings.table_file)
+        if table is None:
+            raise InputError("planner_node requires the description of the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them")
+        self._table = table
         own = settings.tolerances_file
         tolerances = files.read_tolerances(files.user_path(own) if own else config_file('tolerances.yaml'))
         self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,

@@ -10,8 +10,7 @@ from imu_calibration.simulation.sensor_noise import GRADES
 class PlannerNodeSettings:
     """What is moved, for which parameters, and how it is commanded."""
 
-    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: the installed '
-                              'config/table_three_axis.yaml, or with urdf_file nothing',
+    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
                               symptom='other joints, or limits that are not theirs', session=True, path=True)
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='motions go on for too long, or end too early', session=True, path=True)

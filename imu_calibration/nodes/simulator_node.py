@@ -54,7 +54,7 @@ trajectory takes effect about half a second later."""
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_three_axis.yaml, '
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_simulated.yaml, '
                               'or with urdf_file nothing',
                               symptom='joint names are not those expected', session=True, path=True)
     profile: str = setting('quick', '',
@@ -134,7 +134,7 @@ class SimulatorNode(Node):
         settings = self.settings
         robot = declare_parameters(self, RobotSettings)
         table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id)
-        table = table or files.read_table(config_file('table_three_axis.yaml'))
+        table = table or files.read_table(config_file('table_simulated.yaml'))
         profile = None if settings.profile in NO_PROFILE else make_profile(settings.profile, settings.seed, table)
         if profile is not None and profile.table is not None:
             table = Table.from_mapping(profile.table)

@@ -5,6 +5,9 @@ import numpy as np
 EARTH_RATE = 7.292115e-5
 """Rate of the Earth against inertial space, rad/s (WGS 84)."""
 
+NORMAL_GRAVITY_ACCURACY = 1e-4
+"""Relative standard deviation of the normal gravity of a place: gravity anomalies and an inexact height."""
+
 _SEMI_MAJOR_AXIS = 6378137.0
 _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)

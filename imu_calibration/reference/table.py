@@ -10,7 +10,7 @@ import numpy as np
 from imu_calibration.errors import InputError
 from imu_calibration.reference.axis_angles import axis_angles
 from imu_calibration.reference.checked_values import finite_number, require_keys, three_numbers, unit_vector
-from imu_calibration.reference.earth import normal_gravity
+from imu_calibration.reference.earth import NORMAL_GRAVITY_ACCURACY, normal_gravity
 from imu_calibration.reference.joint import Joint, JointNames, joint_from_mapping, joint_to_mapping, place_names
 from imu_calibration.reference.rotations import align, rotation_from_rpy
 
@@ -33,7 +33,7 @@ class Table:
     gravity: float | None = None
     """Local gravity, m/s^2; None: WGS 84 normal gravity from latitude and height."""
     gravity_sd: float | None = None
-    """Standard deviation of the gravity, m/s^2."""
+    """Standard deviation of the gravity, m/s^2; None: see `gravity_sd_value`."""
     latitude: float | None = None
     """Geodetic latitude, degrees; None: Earth rate is not modelled."""
     height: float | None = None
@@ -104,6 +104,13 @@ class Table:
     def gravity_value(self) -> float:
         """Local gravity, m/s^2: as given, else normal gravity."""
         return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)  # type: ignore[arg-type]
+
+    @property
+    def gravity_sd_value(self) -> float:
+        """Standard deviation of `gravity_value`, m/s^2: as given, else zero for a given gravity and the accuracy of normal gravity."""
+        if self.gravity_sd is not None:
+            return self.gravity_sd
+        return 0.0 if self.gravity is not None else NORMAL_GRAVITY_ACCURACY * self.gravity_value
 
     @property
     def mat_nb(self) -> np.ndarray:

@@ -80,7 +80,7 @@ def _(result: TableResult):
             (table.joint_error_rad, 'rad'), (table.joint_error_m, 'm')) if value) + ' (sd)'))
     rows += [('up', f'({", ".join(text(a) for a in table.up)})'),
              ('gravity', f'{fixed(table.gravity_value, 5)} m/s²' + (' as given' if table.gravity is not None else ', WGS 84 normal gravity')
-              + (f', sd {text(table.gravity_sd)} m/s²' if table.gravity_sd else ''))]
+              + (f', sd {text(table.gravity_sd_value)} m/s²' if table.gravity_sd_value else ''))]
     rows.append(('place', 'not given: Earth rate is estimated' if table.latitude is None
                  else f'latitude {text(table.latitude, 5)}°'
                  + (f', azimuth {text(table.azimuth_deg, 4)}°' if table.azimuth_deg is not None else ', azimuth not given')))

@@ -91,7 +91,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
         When a name is unknown, or table, profile and calibration do not fit together.
 
     """
-    given = table_of(table or config_file('table_three_axis.yaml'))
+    given = table_of(table or config_file('table_simulated.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue_of(catalogue))

@@ -109,3 +109,12 @@ def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result):
 def test_gravity_sd_of_the_table_description_is_used(result):
     stated = replace(result, table=replace(result.table, gravity_sd=1e-3))
     assert 'to 0.001' in error_budget(stated).texts['gravity']
+
+
+def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording, result):
+    """The sd of every scale factor contains 1e-4 of its value; the budget has the same share."""
+    place = replace(result.table, gravity=None)
+    scales = [result.solution.param_names.index(f'accelerometer.matrix.{axis}') for axis in ('xx', 'yy', 'zz')]
+    stated, exact = (np.diag(calibrated(recording, table).calibration.covariance)[scales] for table in (place, replace(place, gravity_sd=0.0)))
+    assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales]**2, rel=1e-3)
+    assert error_budget(replace(result, table=place)).causes['gravity'][scales] == pytest.approx(1e-4, rel=0.02)

@@ -17,7 +17,7 @@ from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping(yaml.safe_load(config_file('table_three_axis.yaml').read_text(encoding='utf-8')))
+TABLE = Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
 PAUSE_NS = 2_000_000_000
 """Between the repetitions, so that the jump of the joints back to the start lies in no window."""

@@ -173,7 +173,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 def test_the_node_reads_the_file(mine):
     program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
                'from imu_calibration.resources import config_file\n'
-               'given = {"effects_file": sys.argv[1], "table_file": config_file("table_three_axis.yaml"),\n'
+               'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
                '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
                'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'
                'node = CalibrationNode()\n'

@@ -10,14 +10,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
+from imu_calibration.files import read_table
 from imu_calibration.reference.axis_angles import axis_error_directions, with_axis_angles
-from imu_calibration.reference.earth import earth_rate_n
+from imu_calibration.reference.earth import earth_rate_n, normal_gravity
 from imu_calibration.reference.joint import TYPES, Joint, Mimic
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.levelling import tilt
 from imu_calibration.reference.reference_motion import skew
 from imu_calibration.reference.table import Table
+from imu_calibration.resources import config_file
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
               'gravity': 9.81}
@@ -265,3 +267,24 @@ def test_wrong_descriptions_are_refused_in_one_line(change, says):
 def test_something_else_than_a_mapping_is_refused():
     with pytest.raises(InputError, match='table must be a mapping'):
         Table.from_mapping(['outer'])
+
+
+@pytest.mark.parametrize('name', sorted(path.name for path in config_file('table_template.yaml').parent.glob('table_*.yaml')))
+def test_the_files_that_users_copy_have_no_place(name):
+    """A copied latitude of 48.8 degrees made scale factors wrong by more than 100 sd at 13 degrees."""
+    if name == 'table_simulated.yaml':
+        assert read_table(config_file(name)).latitude == 48.8
+        return
+    mapping = yaml.safe_load(config_file(name).read_text(encoding='utf-8'))
+    assert [mapping[key] for key in ('gravity', 'gravity_sd', 'latitude', 'height', 'azimuth_deg')] == [None] * 5
+    assert all(set(joint) == {'name', 'axis'} for joint in mapping['joints'])   # limits of another table would move joints
+    with pytest.raises(InputError, match='gravity or latitude must be given'):
+        Table.from_mapping(mapping)
+    assert Table.from_mapping(mapping | {'gravity': 9.78}).gravity_value == 9.78
+
+
+@pytest.mark.parametrize(('given_values', 'expected'), [
+    ({'latitude': 13.0}, 1e-4 * normal_gravity(13.0)), ({'latitude': 13.0, 'gravity': 9.78}, 0.0), ({'gravity': 9.78}, 0.0),
+    ({'latitude': 13.0, 'gravity_sd': 0.0}, 0.0), ({'latitude': 13.0, 'gravity_sd': 3e-3}, 3e-3)])
+def test_sd_of_gravity_is_that_of_the_formula_unless_gravity_is_given(given_values, expected):
+    assert Table.from_mapping(THREE_AXES | {'gravity': None} | given_values).gravity_sd_value == pytest.approx(expected)

@@ -26,7 +26,7 @@ def station(tmp_path, monkeypatch):
     clock, waiting = SimpleNamespace(now=100.0), []
     monkeypatch.setattr(calibration_worker, 'time', SimpleNamespace(monotonic=lambda: clock.now))
     gatherer = SimpleNamespace(flush=lambda: waiting.pop() if waiting else SampleBlock())
-    live = LiveCalibration(read_table(config_file('table_three_axis.yaml')))
+    live = LiveCalibration(read_table(config_file('table_simulated.yaml')))
     worker = CalibrationWorker(gatherer, live, lambda: live, place=SessionFiles(str(tmp_path / 'calibration.yaml')), autosave_period=0.0,
                                listeners=Listeners(lambda text: None, lambda residuals: None))
     return worker, waiting, clock

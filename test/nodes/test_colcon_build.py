@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 EXECUTABLES = ('imu_calibration', *NODES)
 
-TABLE = 'table_file:={config}/table_three_axis.yaml'
+TABLE = 'table_file:={config}/table_simulated.yaml'
 PARAMETERS = {'calibration_node': [TABLE], 'simulator_node': [TABLE], 'compensator_node': []}
 
 LOCAL = {'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}

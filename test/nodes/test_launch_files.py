@@ -52,6 +52,8 @@ def test_arguments_are_declared_and_parameters_exist(path, launch):
     of_kind = {kind: [r for r in Recorded.made if type(r).__name__ == kind] for kind in ('DeclareLaunchArgument', 'LaunchConfiguration', 'Node')}
     declared = [r.args[0] for r in of_kind['DeclareLaunchArgument']]
     assert sorted(declared) == sorted({r.args[0] for r in of_kind['LaunchConfiguration']})
+    tables = [r.kwargs['default_value'].args[0][1] for r in of_kind['DeclareLaunchArgument'] if r.args[0] == 'table']
+    assert tables in ([], ['table_simulated.yaml' if path.name == 'demo.launch.py' else 'table_template.yaml'])   # the template is refused
     for node in of_kind['Node']:
         name = node.kwargs['executable']
         if node.kwargs['package'] != 'imu_calibration':

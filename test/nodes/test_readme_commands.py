@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -13,7 +14,7 @@ from imu_calibration.calibration.document import calibration_to_text
 from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
-from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
+from ros.live_station import STAY_LOCAL, TABLE, free_domain  # noqa: E402
 from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
@@ -56,6 +57,7 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp('home')
     environment = with_ros2(tmp_path_factory.mktemp('ros2')) | STAY_LOCAL | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
     build(folder / 'ws')
+    shutil.copy(TABLE, folder / 'ws' / 'table.yaml')
     (folder / 'ws' / 'calibration.yaml').write_text(calibration_to_text(random_calibration(1)))
     return folder, environment
 
@@ -179,7 +181,7 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
     elif 'none' in command or 'gravity' in command:
         terminal.wait('calibrates by hand')
     elif 'calibration_node --' in command:
-        terminal.wait('calibrates on the table /.*/table_three_axis.yaml with the joints outer, middle, inner')
+        terminal.wait('calibrates on the table /.*/table.yaml with the joints outer, middle, inner')
     elif 'calibration.yaml' in command:
         terminal.wait('calibration [0-9a-f]{12} from .*taken over')
     elif 'drive.launch' in command:

@@ -45,7 +45,7 @@ TIGHT = {'accelerometer': {'bias': 2e-3, 'matrix': 1.5e-4, 'accel_size_effect': 
 @pytest.fixture(scope='module')
 def table():
     """The usual table."""
-    return table_of(config_file('table_three_axis.yaml'))
+    return table_of(config_file('table_simulated.yaml'))
 
 
 @pytest.fixture(scope='module')
@@ -119,7 +119,7 @@ def test_a_single_shaft_gives_the_best_it_can_and_says_what_is_missing(capsys, t
 
 def test_the_verb_writes_a_plan_that_a_controller_can_follow(capsys, tmp_path):
     out = tmp_path / 'out'
-    assert main(['plan', '--table', str(config_file('table_three_axis.yaml')), '--output', str(out), '--no-bound']) == 0
+    assert main(['plan', '--table', str(config_file('table_simulated.yaml')), '--output', str(out), '--no-bound']) == 0
     document = yaml.safe_load((out / 'plan.yaml').read_text())
     trajectory = yaml.safe_load((out / 'trajectory.yaml').read_text())
     assert document['format'] == 'imu_calibration/plan/1' and document['lower_bound_seconds'] is None
@@ -217,7 +217,7 @@ def test_what_a_live_session_saved_is_known_as_well_as_its_calibration(capsys, t
     (tmp_path / 'mine.yaml').write_text(calibration_to_text(live.solve(pending=True).calibration))
     documents = []
     for known in ('mine.accumulator.npz', 'mine.yaml'):
-        assert main(['plan', '--table', str(config_file('table_three_axis.yaml')), '--known', str(tmp_path / known), '--tolerances',
+        assert main(['plan', '--table', str(config_file('table_simulated.yaml')), '--known', str(tmp_path / known), '--tolerances',
                      str(tight(tmp_path)), '--output', str(tmp_path / 'out'), '--no-bound', '--no-report']) == 0
         documents.append(yaml.safe_load((tmp_path / 'out/plan.yaml').read_text()) | {'provenance': None})
         (tmp_path / 'out').rename(tmp_path / f'plan of {known}')
@@ -226,7 +226,7 @@ def test_what_a_live_session_saved_is_known_as_well_as_its_calibration(capsys, t
     assert documents[0]['seconds'] < 0.8 * nothing.seconds
     capsys.readouterr()
     (tmp_path / 'mine.accumulator.npz').write_bytes(b'half')
-    assert main(['plan', '--table', str(config_file('table_three_axis.yaml')), '--known', str(tmp_path / 'mine.accumulator.npz'), '--output',
+    assert main(['plan', '--table', str(config_file('table_simulated.yaml')), '--known', str(tmp_path / 'mine.accumulator.npz'), '--output',
                  str(tmp_path / 'no')]) == 1
     assert 'mine.accumulator.npz: a saved accumulator must be a whole file' in capsys.readouterr().err
 

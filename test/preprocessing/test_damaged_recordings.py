@@ -12,7 +12,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from msg_adapters.write import write_session
 
-TABLE_FILE = config_file('table_three_axis.yaml')
+TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
 VALUES = random_values(MODEL, 'industrial', 6)
