@@ -72,7 +72,7 @@ class PlannerNode(Node):
         robot = declare_parameters(self, RobotSettings)
         table = chain_of(self, robot, settings.table_file)
         if table is None:
-            raise InputError("planner_node requires the description of the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them")
+            raise InputError("planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them")
         self._table = table
         own = settings.tolerances_file
         tolerances = files.read_tolerances(files.user_path(own) if own else config_file('tolerances.yaml'))
