@@ -22,6 +22,15 @@ SHOWN_OF_NOISE = {
 """The same for the figures of noise, as data sheets print them."""
 
 
+OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
+"""Units of specific force that drivers publish by mistake, per m/s^2."""
+
+
+def unit_of_rest(length: float) -> str:
+    """Return the unit other than m/s^2 in which a specific force at rest has this length, within a fifth; '' for none."""
+    return next((unit for unit, scale in OTHER_UNITS.items() if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25), '')
+
+
 def for_people(unit: str) -> tuple[float, str]:
     """Return (factor, unit) that turns an SI value into what people read; (1, unit) where SI is what they read."""
     return SHOWN.get(unit, (1.0, unit))

@@ -12,11 +12,12 @@ from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.stops import Stop
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.units import unit_of_rest
 
 LIMIT = 4.0
 """Standard deviations; three axes pass it by chance once in five thousand calibrations."""
 LEAST = 2.0
-"""Seconds that a stop must last before it says anything."""
+"""Shortest stop that is tested, s."""
 PLACE = 0.005
 """Share by which gravity differs between places."""
 WORSE = 1.5
@@ -37,7 +38,11 @@ class HealthWord(StrEnum):
     """At rest, readings are farther from the truth with the calibration than without."""
 
 
-WAITING, HOLDS, MOVED, FOLLOWED, HARMS = HealthWord
+    UNIT = 'unit'
+    """The specific force at rest is that of another unit."""
+
+
+WAITING, HOLDS, MOVED, FOLLOWED, HARMS, UNIT = HealthWord
 
 
 @dataclass(frozen=True)
@@ -117,7 +122,8 @@ class CalibrationHealth:
             return   # too short, or a slow and steady turn
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
-        of_mean = np.square(np.maximum(stop.shake_sd, self.noise_sd)) / stop.n_samples
+        # A mean with a trend is not rest: motion that decays is an error of the mean of about its change.
+        of_mean = np.maximum(stop.shake_sd, self.noise_sd)**2 / stop.n_samples + (2 * stop.change)**2
         if self.update is not None:
             self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
         self._last = _Judged(stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end))
@@ -139,6 +145,10 @@ class CalibrationHealth:
                   'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate), 'rate at rest [sd]': f'{rate_off.max():.1f}',
                   'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}',
                   'gravity off [sd]': f'{force_off:.1f}'}
+        measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
+        if unit := unit_of_rest(measured_length):
+            return HealthState(UNIT, f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
+                                     'correct the driver', values)
         lines = []
         if rate_off[axis] > LIMIT:
             lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
@@ -153,7 +163,6 @@ class CalibrationHealth:
         if not lines:
             off = f'{rate_off.max():.1f} and {force_off:.1f} sd'
             return HealthState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {off}', values)
-        measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
         harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
             force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
         if harms:

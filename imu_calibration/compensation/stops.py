@@ -29,13 +29,15 @@ class Stop:
     end: float
     """The end of its last block, s."""
     n_samples: int
-    """Samples in it."""
+    """Samples in its later half."""
     mean: np.ndarray
-    """Mean of specific force and rate, m/s^2 and rad/s, shape (6,)."""
+    """Mean of specific force and rate over the later half, m/s^2 and rad/s, shape (6,): a slow stop settles in the earlier half."""
     others: np.ndarray
-    """Mean of the further columns that were pushed, shape (k,)."""
+    """Mean of the further columns over the later half, shape (k,)."""
     shake_sd: np.ndarray
-    """Standard deviation of the samples in its blocks, shape (6,)."""
+    """Standard deviation of the samples in the blocks of the later half, shape (6,)."""
+    change: np.ndarray
+    """Mean over the later half less that over the earlier half, shape (6,): bounds the error of `mean` while the motion decays."""
 
     @property
     def seconds(self) -> float:
@@ -61,7 +63,8 @@ class StopDetector:
         self._most_variance = (MOST_SHAKE + 4 * self._noise_sd)**2
         self._rest: np.ndarray = np.zeros((0, 1))
         self._blocks: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
-        self._sums: tuple[float, float, int, np.ndarray, np.ndarray] | None = None
+        self._stand: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
+        self._stop: Stop | None = None
 
     def push(self, rows: np.ndarray) -> Stop | None:
         """
@@ -79,29 +82,21 @@ class StopDetector:
             self._take(rows[:n])
             rows = rows[n:]
         self._rest = rows
-        return self.present()
-
-    def present(self) -> Stop | None:
-        """Return the stop that goes on, or None."""
-        if self._sums is None:
-            return None
-        start, end, n, sums, variances = self._sums
-        return Stop(start, end, n, sums[:6] / n, sums[6:] / n, np.sqrt(variances / n))
+        return self._stop
 
     def _take(self, rows):
         """Take one block, or start anew after a gap."""
         if self._blocks and rows[0, 0] - self._blocks[-1][1] > BLOCK:
-            self._blocks, self._sums = [], None
+            self._blocks, self._stand = [], []
         block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
         self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
         if not self._may_be_still(*block[3:]) or not self._is_still():
-            self._sums = None
-        elif self._sums is not None and block[1] - self._sums[0] > LONGEST:
-            self._sums = None
-            self._add(*block)
+            self._stand = []
+        elif self._stand and block[1] - self._stand[0][0] <= LONGEST:
+            self._stand.append(block)
         else:
-            for each in self._blocks if self._sums is None else [block]:
-                self._add(*each)
+            self._stand = [block] if self._stand else list(self._blocks)
+        self._stop = self._stop_of(self._stand) if self._stand else None
 
     def _may_be_still(self, mean, variance):
         """Return whether a block turns and shakes little enough by itself; most blocks of a robot that drives do not."""
@@ -119,6 +114,15 @@ class StopDetector:
         allowed = STEADY + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
         return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
 
-    def _add(self, start, end, n, mean, variance):
-        before = self._sums or (start, end, 0, np.zeros_like(mean), np.zeros(6))
-        self._sums = (before[0], end, before[2] + n, before[3] + n * mean, before[4] + n * variance)
+    @staticmethod
+    def _stop_of(stand):
+        half = len(stand) // 2
+        (early, _, _), (late, shake, n) = (_mean_of(part) for part in (stand[:half] or stand, stand[half:]))
+        return Stop(stand[0][0], stand[-1][1], n, late[:6], late[6:], shake, (late - early)[:6])
+
+
+def _mean_of(blocks):
+    """Return (mean, sd within blocks, samples) of blocks."""
+    number = np.array([n for _, _, n, _, _ in blocks])
+    share = number / number.sum()
+    return share @ [mean for *_, mean, _ in blocks], np.sqrt(share @ [variance for *_, variance in blocks]), int(number.sum())

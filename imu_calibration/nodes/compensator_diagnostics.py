@@ -10,7 +10,7 @@ from imu_calibration.calibration import trust
 from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
-from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, WAITING
+from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
 from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.segmentation.stamping import COUNTED
@@ -23,7 +23,7 @@ ANOTHER_RATE = 0.1
 """Relative change of the period from which the stamps are worth another line."""
 COLD = 10.0
 """Seconds without a temperature after which diagnostics say so; drivers send one per second."""
-HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR}
+HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',

@@ -10,7 +10,7 @@ from imu_calibration.preflight.evidence import RecordingEvidence
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
 from imu_calibration.preflight.frozen_parts import SENSOR_COLUMNS
 from imu_calibration.preflight.full_scale import FACTORS, nearest_power
-from imu_calibration.units import significant
+from imu_calibration.units import OTHER_UNITS, significant, unit_of_rest
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
 GRAVITY_SHARE = 0.02
@@ -42,10 +42,8 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     came = f'specific force must be in m/s^2, its length {"at rest" if evidence.rest is not None else "in the middle"} is {length:.4g}: '
     convert = 'convert it in the driver or give a nominal scaling with accelerometer_scale'
-    if 0.8 < length < 1.25:
-        yield _unit('force_unit', f'{came}it looks like g; {convert} {1 / STANDARD_GRAVITY:.6f}')
-    elif 800 < length < 1250:
-        yield _unit('force_unit', f'{came}it looks like mg; {convert} {1000 / STANDARD_GRAVITY:.6g}')
+    if unit := unit_of_rest(length):
+        yield _unit('force_unit', f'{came}it looks like {unit}; {convert} {OTHER_UNITS[unit]:.6g}')
     elif not 3.0 < length < 30.0:
         yield _unit('force_unit', f'{came}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale')
     else:

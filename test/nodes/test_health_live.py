@@ -1,5 +1,7 @@
 """compensator_node on a robot whose gyroscope warms up: the stops say so on /diagnostics, and an update takes it off where it is allowed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,13 @@ def test_a_drift_is_told_at_the_stops(bench, tmp_path):
     bench.until(lambda: bench.lines()[STATUS][0] == WARN, 'a warning')
     assert 'the bias of the gyroscope has moved by +0.2' in bench.lines()[STATUS][1] and bench.heard('has moved by', 'warning') == 1
     assert bench.figure(STATUS, 'outcome') == 'moved' and bench.figure(STATUS, 'stops') == '9'
+
+
+def test_a_driver_that_publishes_g_is_told_the_unit(bench, tmp_path):
+    node = start(bench, tmp_path)
+    converted(node, [bytes(row) for row in rows(encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665)))])
+    bench.until(lambda: bench.lines().get(STATUS, (OK,))[0] == ERROR, 'an error')
+    assert bench.figure(STATUS, 'outcome') == 'unit' and bench.heard('unit is g', 'error') == 1 and not bench.heard('calibrate again, unless')
 
 
 def test_an_update_is_taken_off_where_it_is_allowed_and_its_uncertainty_is_published(bench, tmp_path):
