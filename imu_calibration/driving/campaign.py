@@ -40,9 +40,9 @@ class CampaignSettings:
     """When to end."""
 
     time_limit: float = setting(1800.0, 's', 'time given to all motions together, by the stamps of the joint states', (1.0, 1e6),
-                                'too small: parameters stay outside their tolerance')
+                                'too small: parameters stay outside their tolerance', live=True)
     separations: int = setting(2, '1', 'how often motions are asked for that tell apart what the diagnosis cannot; 0: never, and '
-                               'nothing is diagnosed at the end', (0, 20), 'too small: a finding keeps its mates')
+                               'nothing is diagnosed at the end', (0, 20), 'too small: a finding keeps its mates', live=True)
 
 
 @dataclass(frozen=True)

@@ -45,20 +45,21 @@ class DriverSettings:
     """How far joints may stray, and how long they may take."""
 
     following_tolerance: float = setting(0.05, 'rad', 'a joint that turns stops everything when it is further from its path, however late '
-                                         'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late')
-    following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above')
+                                         'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
+                                         live=True)
+    following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above', live=True)
     stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long, by their clock and by ours, have stalled, or '
                                     'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
                                     'stop may be as late',
-                                    (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing')
+                                    (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing', live=True)
     silence: float = setting(1.0, 's', 'without joint states for so long everything is stopped', (0.1, 60.0),
-                             'too small: stops when the machine is busy')
+                             'too small: stops when the machine is busy', live=True)
     settling_time: float = setting(0.5, 's', 'the joints must have rested for so long before the next motion', (0.0, 60.0),
-                                   'too small: what swings out is measured')
+                                   'too small: what swings out is measured', live=True)
     settling_patience: float = setting(20.0, 's', 'joints that do not come to rest for so long stop everything', (0.5, 600.0),
-                                       'too small: a soft arm is called restless')
+                                       'too small: a soft arm is called restless', live=True)
     first_speed: float = setting(0.3, '1', 'share of its speed at which the first motion after a start is made', (0.01, 1.0),
-                                 'too large: a wrong table is noticed at full speed')
+                                 'too large: a wrong table is noticed at full speed', live=True)
 
 
 class Driver:
@@ -75,17 +76,24 @@ class Driver:
     """
 
     def __init__(self, joint_names: tuple[str, ...], limits: MotionLimits, settings: DriverSettings = DriverSettings()):
-        self.joint_names, self.limits, self.settings = tuple(joint_names), limits, settings
+        self.joint_names, self.limits = tuple(joint_names), limits
+        self.change(settings)
         self.state, self.reason, self.motions = DriveState.IDLE, 'nothing moves before start', 0
-        self.tolerance = np.where(limits.turns, settings.following_tolerance, settings.following_tolerance_m)
         self.position: np.ndarray | None = None
         """Where the joints were seen last."""
-        self._time, self._heard = 0.0, -np.inf
+        self.ignored: dict[str, int] = {}
+        """Joint -> number of joint states that were ignored because its position was not finite."""
+        self._time, self._heard, self._advanced = 0.0, -np.inf, -np.inf
         self._watch: PathWatch | None = None
         self._rested_at: np.ndarray | None = None
         self._rested_since = self._settling_since = 0.0
         self._stopped: tuple[float, float] | None = None
         self._slow = True
+
+    def change(self, settings: DriverSettings) -> None:
+        """Use other settings from now on; speed and tolerances from the next motion on."""
+        self.settings = settings
+        self.tolerance = np.where(self.limits.turns, settings.following_tolerance, settings.following_tolerance_m)
 
     @property
     def is_driving(self) -> bool:
@@ -118,6 +126,14 @@ class Driver:
     def is_silent(self, now: float) -> bool:
         """Whether nothing was heard of the joints for too long, by a steady clock."""
         return now - self._heard > self.settings.silence
+
+    def stamp_fault(self, now: float) -> str:
+        """Return a line if joint states arrive but their stamps have not changed for `silence`, '' otherwise."""
+        constant = self._heard - self._advanced
+        if self.is_silent(now) or not constant > self.settings.silence:
+            return ''
+        return (f'the stamps of the joint states must advance, they have not for {constant:.1f} s while messages arrive: stopped; correct '
+                'the clock of their publisher')
 
     def start(self) -> None:
         """Allow motions, once the joints rest; the first one will be slow."""
@@ -170,7 +186,9 @@ class Driver:
 
     def observe(self, time: float, position: np.ndarray, rate: np.ndarray, *, now: float) -> bool:
         """
-        Take what the joints do; return whether everything has to be stopped.
+        Take one joint state; return whether everything has to be stopped.
+
+        A position that is not finite makes the message count as ignored, a rate that is not finite as missing.
 
         Parameters
         ----------
@@ -182,9 +200,17 @@ class Driver:
             Seconds of a steady clock.
 
         """
-        if self._stopped is not None and time < self._time:   # where the clock is set back the wait begins anew
+        if not np.all(np.isfinite(position)):   # ros2_control publishes NaN until the hardware was read
+            for joint in np.flatnonzero(~np.isfinite(position)):
+                self.ignored[self.joint_names[joint]] = self.ignored.get(self.joint_names[joint], 0) + 1
+            return False
+        if self._stopped is not None and time < self._time:   # after a clock step backwards the wait starts again
             self._stopped = time, now
+        if time != self._time or self.position is None:
+            self._advanced = now
         self._time, self._heard, self.position = time, now, np.asarray(position, float)
+        if self.is_driving and (trouble := self.stamp_fault(now)):
+            return self.stop(trouble)
         self._note_rest()
         if self._watch is None or not self.is_driving:
             return False
@@ -203,8 +229,14 @@ class Driver:
     def tick(self, now: float) -> bool:
         """Look at the clock; return whether everything has to be stopped."""
         if self.is_driving and self.is_silent(now):
-            return self.stop(f'nothing was heard of the joints for {now - self._heard:.1f} s: stopped; see that joint states are published')
+            return self.stop(f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint states are published'
+                             + self.ignored_words())
         return False
+
+    def ignored_words(self) -> str:
+        """Return the joints whose positions were not finite and the number of ignored joint states, in brackets; '' for none."""
+        counts = ', '.join(f'{name} {count}' for name, count in self.ignored.items())
+        return f' (ignored because a position was not finite: {counts})' if counts else ''
 
     def refused(self, why: str) -> bool:
         """Take note that the controller does not do what it was asked; return whether everything has to be stopped."""
@@ -238,7 +270,7 @@ class Driver:
         if np.max(over) > 0:
             joint = int(np.argmax(over))
             return f'joint {self._told(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
-        fast = np.abs(np.nan_to_num(rate)) / self.limits.speed
+        fast = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
         if np.max(fast) > OVERSPEED:
             joint = int(np.argmax(fast))
             return (f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest speed: stopped; '
@@ -251,7 +283,7 @@ class Driver:
         if watch.has_strayed:
             joint = watch.suspect()
             return (f'joint {self._told(joint, self.position)} does not follow: the joints are '
-                    f'{self._amount(joint, watch.deviation.max() * self.tolerance[joint])} from their path: stopped; '
+                    f'{self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their path: stopped; '
                     'see whether something holds it')
         if watch.has_stalled_for <= self.settings.stall_patience:
             return ''

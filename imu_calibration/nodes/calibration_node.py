@@ -36,7 +36,7 @@ from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.live_view import FoxgloveSettings
-from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
+from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles
@@ -105,11 +105,11 @@ class CalibrationNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
-        self.settings = declare_parameters(self, CalibrationNodeSettings)
-        self._live_settings = declare_parameters(self, LiveSettings)
-        self._options = self._read_options(declare_parameters(self, WindowSettings))
-        self._hand_settings = declare_parameters(self, LiveByHandSettings)
-        view = declare_parameters(self, FoxgloveSettings)
+        self.settings = declare_parameters(self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node'])
+        self._live_settings = declare_parameters(self, LiveSettings, self._change_live)
+        self._options = self._read_options(declare_parameters(self, WindowSettings, self._change_windows))
+        self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_by_hand)
+        view = declare_parameters(self, FoxgloveSettings, lambda group: self._view.change(group))
         robot = declare_parameters(self, RobotSettings)
         self._reference = reference_of(chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id),
                                        words_of(robot, self.settings.table_file))
@@ -130,9 +130,6 @@ class CalibrationNode(Node):
         self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
                                        live.observations.removesuffix('s'))
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
-        groups = {'settings': self.settings, 'live': self._live_settings, 'windows': self._options.windows, 'by_hand': self._hand_settings,
-                  'view': view}
-        watch_parameters(self, groups, self._change, hints=HINTS['calibration_node'])
         self.worker.start()
 
     def _listen(self) -> None:
@@ -185,21 +182,22 @@ class CalibrationNode(Node):
         self._diagnostics.publish_now()
         return response
 
-    def _change(self, name: str, group: Any) -> None:
-        """Take changed parameters: at once what concerns files, the rest by the worker between two of its steps."""
-        if name == 'settings':
-            self.worker.autosave_period, self.settings = group.autosave_period, group
-        elif name == 'live':
-            self._live_settings = group
-            self.worker.ask(lambda: self.worker.change_settings(group))
-        elif name == 'windows':
-            self._options = replace(self._options, windows=group)
-            self.worker.ask(lambda: self.worker.change_windows(group))
-        elif name == 'by_hand':
-            self._hand_settings = group
-            self.worker.ask(lambda: self.worker.change_by_hand(group))
-        elif name == 'view':
-            self._view.change(group)
+    # Changed parameters: the period of saving at once, all others by the worker between two of its steps.
+
+    def _change_files(self, group: CalibrationNodeSettings) -> None:
+        self.worker.autosave_period, self.settings = group.autosave_period, group
+
+    def _change_live(self, group: LiveSettings) -> None:
+        self._live_settings = group
+        self.worker.ask(lambda: self.worker.change_settings(group))
+
+    def _change_windows(self, group: WindowSettings) -> None:
+        self._options = replace(self._options, windows=group)
+        self.worker.ask(lambda: self.worker.change_windows(group))
+
+    def _change_by_hand(self, group: LiveByHandSettings) -> None:
+        self._hand_settings = group
+        self.worker.ask(lambda: self.worker.change_by_hand(group))
 
     def _publish_document(self, text: str) -> None:
         self._publish(self._document, String(data=text))

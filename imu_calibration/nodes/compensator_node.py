@@ -29,7 +29,7 @@ from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.nodes.parameters import declare_parameters, watch_parameters
+from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.static_frames import StaticFrames
 
@@ -47,8 +47,8 @@ class CompensatorNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('compensator_node', **options)
-        self.settings = declare_parameters(self, CompensatorSettings)
-        view = declare_parameters(self, CompensatorFoxglove)
+        self.settings = declare_parameters(self, CompensatorSettings, self._change_compensation, hints=HINTS['compensator_node'])
+        view = declare_parameters(self, CompensatorFoxglove, lambda group: self._view.change(group))
         self._view = CompensatorView(self, view)
         self.adopted: Adopted | None = None
         self._current: LiveCompensation | None = None
@@ -71,7 +71,6 @@ class CompensatorNode(Node):
         self.diagnostics = CompensatorDiagnostics(self)
         self.create_service(Trigger, '~/reload', self._on_reload)
         self._start()
-        watch_parameters(self, {'settings': self.settings, 'view': view}, self._change, hints=HINTS['compensator_node'])
         self._timer: Timer | None = None
         self._set_refresh(self.settings.covariance_rate)
 
@@ -209,14 +208,8 @@ class CompensatorNode(Node):
         response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
         return response
 
-    def _change(self, name: str, settings: Any) -> None:
-        """Take changed parameters; raises an ImuCalibrationError and stays as it was."""
-        if name == 'view':
-            self._view.change(settings)
-        else:
-            self._change_compensation(settings)
-
     def _change_compensation(self, settings: CompensatorSettings) -> None:
+        """Take changed parameters; raises an ImuCalibrationError and changes nothing."""
         old, insists = self.settings, settings.anyway and not self.settings.anyway
         if settings.calibration_file and insists and not settings.takes_topic:
             self._load_file(settings)

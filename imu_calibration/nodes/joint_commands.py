@@ -79,7 +79,7 @@ class ActionCommand:
         self._number += 1
         number = self._number
         goal = self._action.Goal(trajectory=deserialize_message(encode_trajectory(points), JointTrajectory))
-        self._client.send_goal_async(goal).add_done_callback(lambda future: self._answered(number, future.result()))
+        self._client.send_goal_async(goal).add_done_callback(self._guarded(lambda future: self._answered(number, future.result())))
 
     def stop(self, joint_names: tuple[str, ...]) -> None:
         """Cancel the goal, and send the trajectory without points: whichever comes first stops the joints."""
@@ -98,7 +98,16 @@ class ActionCommand:
             self._refused('it refused the goal')
             return
         self._handle = handle
-        handle.get_result_async().add_done_callback(lambda future: self._ended(number, future.result().result))
+        handle.get_result_async().add_done_callback(self._guarded(lambda future: self._ended(number, future.result().result)))
+
+    def _guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback of a future whose exceptions count as a refusal: in an executor they would end the node."""
+        def call(future: Any) -> None:
+            try:
+                callback(future)
+            except Exception as error:
+                self._refused(f'{type(error).__name__}: {error}')
+        return call
 
     def _ended(self, number: int, result: Any) -> None:
         if number != self._number:

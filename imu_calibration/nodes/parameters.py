@@ -3,7 +3,9 @@
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -20,11 +22,27 @@ NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the parameters that rclpy itself has."""
 
 
-def declare_parameters(node: Node, group: type) -> Any:
-    """
-    Declare every field of the settings `group` as a parameter of `node` and return the settings with the values it was given.
+_GROUPS = '_imu_calibration_groups'
+"""Attribute of a node that holds its groups."""
 
-    Tuples become arrays.
+
+def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | None = None, *,
+                       hints: dict[str, str] | None = None) -> Any:
+    """
+    Declare every field of the settings `group` as a parameter of `node` and return the settings with the given values.
+
+    Tuples become arrays. From then on a request to change a parameter is answered: a setting declared `live` changes, of any other setting
+    the request is rejected with the reason.
+
+    Parameters
+    ----------
+    node : Node
+    group : type
+        Settings class; one with live settings needs `take`.
+    take : callable, optional
+        Called with the new settings before they are in force; an ImuCalibrationError rejects them.
+    hints : mapping, optional
+        As for `errors.with_hint`.
 
     Raises
     ------
@@ -39,7 +57,9 @@ def declare_parameters(node: Node, group: type) -> Any:
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise InputError(f"parameter '{item.name}' must be {_type_name(item.default)}{_range_text(item.bounds)}: {error}") from error
         values[item.name] = _from_ros(item, value)
-    return override(group(), values)
+    settings = override(group(), values)
+    _watch(node, _Group(settings, take, hints or {}))
+    return settings
 
 
 def parameter_descriptor(item: Setting) -> ParameterDescriptor:
@@ -59,42 +79,45 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
     return descriptor
 
 
-def watch_parameters(node: Node, groups: dict[str, Any], take: Callable[[str, Any], None], *,
-                     hints: dict[str, str] | None = None) -> None:
-    """
-    Let the settings that are declared `live` be changed while the node runs; the others say why they cannot.
+@dataclass
+class _Group:
+    """A group of settings whose parameters a node has."""
 
-    Parameters
-    ----------
-    node : Node
-        Whose parameters were declared.
-    groups : mapping
-        Name -> settings in force; replaced in place as parameters change.
-    take : callable
-        Called with the name of a group and its new settings before they are in force; an ImuCalibrationError refuses them.
-    hints : mapping, optional
-        As for `errors.with_hint`.
-
-    """
-    def on_set(parameters: list) -> SetParametersResult:
-        new = dict(groups)
-        try:
-            for parameter in parameters:
-                _change(new, parameter)
-            for name, group in new.items():
-                if group is not groups[name]:
-                    take(name, group)
-                    groups[name] = group
-        except ImuCalibrationError as error:
-            return SetParametersResult(successful=False, reason=error.told(hints or {}))
-        except Exception as error:   # who asks gets an answer, and the node goes on as it was
-            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
-        return SetParametersResult(successful=True)
-    node.add_on_set_parameters_callback(on_set)
+    settings: Any
+    take: Callable[[Any], None] | None
+    hints: dict[str, str]
 
 
-def _change(groups: dict[str, Any], parameter: Any) -> None:
-    for name, group in groups.items():
+def _watch(node: Node, group: _Group) -> None:
+    """Answer requests to change the parameters of a group: one callback per node, for all its groups."""
+    groups = getattr(node, _GROUPS, None)
+    if groups is None:
+        groups = []
+        setattr(node, _GROUPS, groups)
+        node.add_on_set_parameters_callback(partial(_set, groups))
+    groups.append(group)
+
+
+def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
+    new, hints = [group.settings for group in groups], {}
+    try:
+        for parameter in parameters:
+            _change(new, parameter)
+        for group, settings in zip(groups, new, strict=True):
+            if settings is not group.settings:
+                hints = group.hints
+                if group.take is not None:
+                    group.take(settings)
+                group.settings = settings
+    except ImuCalibrationError as error:
+        return SetParametersResult(successful=False, reason=error.told(hints))
+    except Exception as error:   # the requester gets an answer, and the node continues unchanged
+        return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
+    return SetParametersResult(successful=True)
+
+
+def _change(groups: list, parameter: Any) -> None:
+    for place, group in enumerate(groups):
         item = next((item for item in describe(group) if item.name == parameter.name), None)
         if item is None:
             continue
@@ -104,7 +127,7 @@ def _change(groups: dict[str, Any], parameter: Any) -> None:
         if not item.live:
             raise InputError(f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed}; start the node with "
                              f'-p {item.name}:={parameter.value}')
-        groups[name] = override(group, {item.name: value})
+        groups[place] = override(group, {item.name: value})
 
 
 def unknown_parameters(node: Node) -> list[str]:

@@ -10,6 +10,7 @@ out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_jo
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -28,7 +29,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
 from imu_calibration.driving.separating import separator_of
-from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
@@ -65,8 +66,8 @@ class PlannerNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('planner_node', **options)
         self.settings = declare_parameters(self, PlannerNodeSettings)
-        self._campaign_settings = declare_parameters(self, CampaignSettings)
-        driver_settings = declare_parameters(self, DriverSettings)
+        self._campaign_settings = declare_parameters(self, CampaignSettings, self._change_campaign)
+        driver_settings = declare_parameters(self, DriverSettings, self._change_driver)
         settings = self.settings
         require_grade(settings.grade)
         robot = declare_parameters(self, RobotSettings)
@@ -90,14 +91,14 @@ class PlannerNode(Node):
                                     lock=self._lock)
         self.worker.stamp = lambda: self._stamp
         # All that wait at once: one by one they would wait in line while a plan is made, and the motion begin where the joints were before.
-        self._joints = BatchInput(self, JointState, 'joint_states', add=self._joint_state, single=False)
-        self._calibrations = MatchedInput(self, String, 'imu/calibration', callback=self._document, raw=False, latched=True)
+        self._joints = BatchInput(self, JointState, 'joint_states', add=self._guarded(self._joint_state), single=False)
+        self._calibrations = MatchedInput(self, String, 'imu/calibration', callback=self._guarded(self._document), raw=False, latched=True)
         watch_inputs(self, [self._joints, self._calibrations])
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._diagnostic, 100)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._guarded(self._diagnostic), 100)
         self._calibrator = {what: self.create_client(Trigger, f'{settings.calibration_node}/{what}') for what in ('solve', 'diagnose')}
         for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
-        every(self, PERIOD, self._tick)
+        every(self, PERIOD, self._guarded(self._tick))
         self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
@@ -117,6 +118,15 @@ class PlannerNode(Node):
         if self.driver.is_driving:
             self._is_halted = True
             self.worker.halt('the node is ending')
+
+    def _change_campaign(self, group: CampaignSettings) -> None:
+        self._campaign_settings = group
+        if self.worker.campaign is not None:
+            self.worker.campaign.settings = group
+
+    def _change_driver(self, group: DriverSettings) -> None:
+        with self._lock:
+            self.driver.change(group)
 
     def _make_campaign(self) -> Campaign:
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
@@ -149,7 +159,10 @@ class PlannerNode(Node):
         now = time.monotonic()
         self._stamp = stamp_ns * 1e-9 if stamp_ns else now
         with self._lock:
+            ignored = dict(self.driver.ignored)
             must_stop = self.driver.observe(self._stamp, np.array(position), np.array(rate), now=now)
+        if self.driver.ignored != ignored:
+            self._complaints.event(f'joint_states: positions must be finite{self.driver.ignored_words()}; see the driver of that joint')
         if must_stop:
             self._stopped()
 
@@ -171,6 +184,22 @@ class PlannerNode(Node):
             must_stop = self.driver.tick(time.monotonic())
         if must_stop:
             self._stopped()
+
+    def _guarded(self, callback: Callable) -> Callable:
+        """Return a callback whose exceptions stop the joints instead of ending the node."""
+        def call(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self._failed(error)
+        return call
+
+    def _failed(self, error: Exception) -> str:
+        line = shortened(f'an internal error: {type(error).__name__}: {error}', 200)
+        if self.driver.is_driving or self.worker.doing:
+            self.worker.halt(f'{line}: stopped; start again, and report it')
+        self._complaints.event(line, ERROR)
+        return line
 
     def _refused(self, why: str) -> None:
         with self._lock:
@@ -234,7 +263,9 @@ class PlannerNode(Node):
         if missing_ranges(self._table):
             return False, range_warnings(self._table)[0]
         if self.driver.position is None:
-            return False, self._joints.silence()
+            return False, self._joints.silence(self.driver.ignored_words().strip(' ()'))
+        if trouble := self.driver.stamp_fault(time.monotonic()):
+            return False, trouble
         if not self._command.is_heard:
             return False, f'nobody listens to {self._command.name}: start the controller, or remap joint_trajectory'
         if not self._calibrator['solve'].service_is_ready():
@@ -258,6 +289,8 @@ class PlannerNode(Node):
             response.success, response.message = answer()
         except ImuCalibrationError as error:
             response.success, response.message = False, error.told(HINTS['planner_node'])
+        except Exception as error:
+            response.success, response.message = False, self._failed(error)
         self._say(INFO if response.success else ERROR, f'~/{what}: {response.message}')
         self._diagnostics.publish_now()
         return response
@@ -274,7 +307,8 @@ class PlannerNode(Node):
         values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
                   'it takes [s]': f'{worker.seconds:.1f}',
                   'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside, 'furthest outside': name,
-                  'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name}
+                  'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name,
+                  'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
         if worker.campaign is not None and worker.campaign.findings is not None:
             values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
                        'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),

@@ -157,6 +157,8 @@ class PlannerWorker(threading.Thread):
         end = time.monotonic() + patience
         while self._wanted and not self._ending and not self.driver.rests:
             self.doing = 'waiting until the joints rest'
+            if trouble := self.driver.stamp_fault(time.monotonic()):
+                raise InputError(trouble)
             if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # nobody need be looked for yet
                 self.doing, end = 'waiting until the controller must have taken the stop', time.monotonic() + patience
             if time.monotonic() > end:

@@ -57,6 +57,9 @@ def test_a_new_setting_is_a_parameter_and_a_line_of_its_file(monkeypatch):
     class Bench:
         def declare_parameter(self, name, default, descriptor):
             return SimpleNamespace(value=3.5 if name == 'patience' else default, descriptor=descriptor)
+
+        def add_on_set_parameters_callback(self, answer):
+            self.answer = answer
     monkeypatch.setattr(node_module, 'CompensatorSettings', Wider)
     assert '    # how long to wait [s], 0 to 9. When wrong: it waits too long\n    patience: 2.5\n' in rendered('compensator_node')
     assert declare_parameters(Bench(), Wider).patience == 3.5

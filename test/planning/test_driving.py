@@ -268,7 +268,7 @@ def test_joint_states_that_fall_silent_stop_everything():
         bench.look()
     bench.silent, before = True, bench.now
     assert bench.until_it_rests() is DriveState.STOPPED and bench.now - before < 1.1
-    assert bench.driver.reason.startswith('nothing was heard of the joints for 1.0 s: stopped')
+    assert bench.driver.reason.startswith('no usable joint state for 1.0 s: stopped')
 
 
 def test_joints_that_do_not_come_to_rest_stop_everything():

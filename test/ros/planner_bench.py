@@ -1,7 +1,8 @@
 """planner_node over DDS in the test's process, with the joints, the controller and calibration_node of the test."""
 
+import json
+
 import numpy as np
-import yaml
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
@@ -39,7 +40,7 @@ class PlannerBench(OneProcess):
         super().__init__(monkeypatch)
         self.table_file = folder / 'table.yaml'
         joints = [{'name': name, 'axis': axis} | dict(limits) for name, axis in zip(NAMES, ([0, 0, 1], [1, 0, 0]), strict=True)]
-        self.table_file.write_text(yaml.safe_dump({'joints': joints, 'gravity': 9.81}))
+        self.table_file.write_text(json.dumps({'joints': joints, 'gravity': 9.81}))
         self.stamp, self.position, self.rate, self.trajectories = 100.0, np.zeros(2), [], []
         self.publisher = self.node.create_publisher(JointState, 'joint_states', output_qos())
         self.node.create_subscription(JointTrajectory, 'joint_trajectory', self.trajectories.append, 10)
@@ -68,9 +69,14 @@ class PlannerBench(OneProcess):
             return condition()
         self.until(step, what)
 
-    def ask(self, what):
-        """Call a service of the planner."""
-        return self.call(f'/planner_node/{what}')
+    def ask(self, what, elapsed=PERIOD):
+        """Call a service of the planner while joint states go on."""
+        client = self.node.create_client(Trigger, f'/planner_node/{what}')
+        self.looks(client.service_is_ready, what, elapsed)
+        future = client.call_async(Trigger.Request())
+        self.looks(future.done, f'the answer of {what}', elapsed)
+        self.node.destroy_client(client)
+        return future.result()
 
     def moving(self, **parameters):
         """Start and return once a motion is driven."""

@@ -1,0 +1,94 @@
+"""Every parameter of every node, set from outside: a live one changes, any other one is rejected with the reason."""
+
+import pytest
+
+pytest.importorskip('rclpy')
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
+
+from imu_calibration.driving.campaign import CampaignSettings  # noqa: E402
+from imu_calibration.driving.driver import DriverSettings  # noqa: E402
+from imu_calibration.nodes.parameter_files import NODES, settings_of  # noqa: E402
+from imu_calibration.settings import describe  # noqa: E402
+
+from ros.live_station import ROOT, TABLE, Station  # noqa: E402
+from ros.planner_bench import PlannerBench  # noqa: E402
+
+pytestmark = pytest.mark.dds
+SAMPLE = ROOT / 'bags' / 'sample_session'
+START = {'simulator_node': {'profile': 'none', 'table_file': TABLE}, 'bag_player_node': {'bag': SAMPLE, 'wait_for_subscribers': 100},
+         'planner_node': {'table_file': TABLE}, 'calibration_node': {'table_file': TABLE}, 'compensator_node': {}}
+SERVICES = {GetParameters: 'get_parameters', SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically'}
+NAMED = {'adopt': 'topic', 'foxglove': False, 'calibration_file': str(SAMPLE / 'truth.yaml'), 'target_frame': 'base_link',
+         'noise_file': ''}
+"""Values of live parameters that not every value fits."""
+
+
+def other_value(item):
+    """Return a value within the bounds that is not the default, of its type."""
+    if item.name in NAMED and item.live:
+        return NAMED[item.name]
+    default, (low, high) = item.default, item.bounds
+    if isinstance(default, bool):
+        return not default
+    if isinstance(default, (int, float)):
+        tried = [default + 1, default - 1] if isinstance(default, int) else [default * 1.25, default * 0.75, 0.5 * (high or 0.5)]
+        return next(value for value in tried if value != default and (low is None or value >= low) and (high is None or value <= high))
+    return [value + 0.25 for value in default] if isinstance(default, tuple) else 'other'
+
+
+def plain(value):
+    """Return an array as a list, anything else unchanged."""
+    return list(value) if hasattr(value, '__len__') and not isinstance(value, str) else value
+
+
+def asked(station, kind, node, **fields):
+    """Call a parameter service of a node."""
+    client = station.node.create_client(kind, f'/{node}/{SERVICES[kind]}')
+    station.until(client.service_is_ready, f'{node} to answer')
+    future = client.call_async(kind.Request(**fields))
+    station.until(future.done, f'the answer of {node}')
+    station.node.destroy_client(client)
+    return future.result()
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_a_live_parameter_changes_and_any_other_is_rejected_with_the_reason(node, tmp_path):
+    items = [item for group in settings_of(node) for item in describe(group)]
+    with Station(tmp_path / 'out.txt') as station:
+        station.start(node, START[node])
+        values = {item.name: other_value(item) for item in items} | (
+            {'save_file': str(tmp_path / 'other.yaml')} if node == 'calibration_node' else {})
+        before = asked(station, GetParameters, node, names=list(values)).values
+        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        live = [message for message, item in zip(messages, items, strict=True) if item.live]
+        together = asked(station, SetParametersAtomically, node, parameters=live).result   # a pose needs its frame, and the reverse
+        results = asked(station, SetParameters, node, parameters=messages).results
+        after = asked(station, GetParameters, node, names=list(values)).values
+        process, = station.processes.running
+        assert process.poll() is None
+    for item, old, new, result in zip(items, before, after, results, strict=True):
+        old, new = (parameter_value_to_python(value) for value in (old, new))
+        if item.live:
+            assert together.successful and result.successful and plain(new) == values[item.name], (item.name, together.reason, result.reason)
+        else:
+            assert not result.successful and plain(new) == plain(old), item.name
+            assert item.fixed in result.reason or 'read-only' in result.reason, (item.name, result.reason)
+
+
+def test_speeds_tolerances_patience_and_time_limit_of_the_planner_are_in_force_once_set(monkeypatch, tmp_path):
+    bench = PlannerBench(monkeypatch, tmp_path)
+    try:
+        settings = {item.name: other_value(item) for group in (DriverSettings, CampaignSettings) for item in describe(group)}
+        assert all(result.successful for result in bench.set(**settings))
+        planner = bench.planner
+        assert vars(planner.driver.settings) | vars(planner._campaign_settings) == settings
+        assert planner.driver.tolerance.tolist() == [settings['following_tolerance']] * 2
+        bench.set(settling_time=0.1, first_speed=0.05)
+        bench.moving()
+        slow = max(abs(rate) for message in bench.trajectories for point in message.points for rate in point.velocities)
+        assert slow <= 0.05 * 100.0 * 3.14159 / 180
+        bench.set(time_limit=12.5)
+        assert planner.worker.campaign.settings.time_limit == 12.5
+    finally:
+        bench.close()
