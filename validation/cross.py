@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from imu_calibration.calibration.decision import HELPS
 from imu_calibration.effects.lags import FAMILY, total_lags
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.reference.table import Table
@@ -57,12 +58,12 @@ def outcome(found, checked):
     """Return (what happened, whether it is as it must be): it helps and harms in no motion, or it is refused with a sentence."""
     if checked is None:
         return f'refused: {found}', True
-    ratios = {sensor: entry['after'] / entry['before'] for sensor, entry in checked.proof.items()}
-    worst = max(part['after'] / part['before'] for entry in checked.proof.values() for part in entry['regimes'].values())
-    words = ', '.join(f'{sensor} {ratio:.2f}' for sensor, ratio in ratios.items()) + f', at most {worst:.2f} in any motion'
-    if found.verdict.word == 'bad':
-        return f'"bad", {found.verdict.reasons[0].what.partition(":")[2].strip() or found.verdict.reasons[0].what} (would be: {words})', True
-    return words, bool(ratios) and max(ratios.values()) < 1.0 and worst <= WORSE
+    words, claimed = [], []
+    for sensor, entry in checked.proof.items():
+        ratio, worst = entry['after'] / entry['before'], max(part['after'] / part['before'] for part in entry['regimes'].values())
+        words.append(f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any motion')
+        claimed.append(found.verdict.decisions[sensor] is not HELPS or ratio < 1.0 and worst <= WORSE)
+    return '; '.join(words), bool(words) and all(claimed)
 
 
 def spread(first, second):
@@ -121,9 +122,7 @@ def _attempt(source, table: Table, **choices):
     except ImuCalibrationError as error:
         return f'refused: {error}', True
     warned = [item['text'] for item in found.calibration.statistics['preflight'] if 'frozen' in item['text'] or 'stay' in item['text']]
-    if warned or found.verdict.word == 'bad':
-        return f'"{found.verdict.word}": {(warned or [found.verdict.reasons[0].what])[0]}', True
-    return f'"{found.verdict.word}"', False
+    return found.verdict.text + ''.join(f'; {text}' for text in warned[:1]), bool(warned) or HELPS not in found.verdict.decisions.values()
 
 
 def run(folder, plots):

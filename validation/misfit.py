@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+from imu_calibration.calibration.decision import HELPS
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
@@ -36,9 +37,8 @@ def outcome(cause, options):
     ratios = [entry['after'] / entry['before'] for entry in proof.values()]
     worst = [max(part['after'] / part['before'] for part in entry['regimes'].values()) for entry in proof.values()]
     figures = [' / '.join(f'{value:.2f}' for value in values) for values in (ratios, worst)]
-    if found.verdict.word == 'bad':
-        return f'"bad": {found.verdict.reasons[0].what.partition(";")[0]}', *(f'({each})' for each in figures), True
-    return 'handed over', *figures, max(ratios) < 1.0 and max(worst) <= WORSE
+    helped = [found.verdict.decisions[sensor] is HELPS for sensor in proof]
+    return found.verdict.text, *figures, all(not helps or a < 1.0 and b <= WORSE for helps, a, b in zip(helped, ratios, worst, strict=True))
 
 
 def run(folder, plots):

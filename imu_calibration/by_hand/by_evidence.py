@@ -11,6 +11,7 @@ from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.named_models import BASE
+from imu_calibration.estimation.covariance_terms import REJECTED, with_term
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +64,12 @@ def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOpti
     """Return the calibration with the model that is asked for and what was found; what is denied or implausible widens its covariance."""
     asked, names = _asked(data, options), found.names
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
-    covariance = hand.covariance.copy()
+    terms = hand.terms
     for question in (*found.denied, *found.implausible):
         moved = found.moved_by(question)
         shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
-        covariance += np.outer(shift, shift)
-    return replace(hand, covariance=covariance)
+        terms = with_term(terms, REJECTED, np.outer(shift, shift))
+    return replace(hand, terms=terms)
 
 
 def _asked(data, options):

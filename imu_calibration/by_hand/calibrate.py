@@ -17,11 +17,12 @@ from imu_calibration.by_hand.outliers import possible_turns, without_outliers
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.by_hand.solver import first_state, solve_joint
 from imu_calibration.by_hand.turns import collect_turns, known_turn_data, rising
-from imu_calibration.calibration.status import DETERMINED, statuses
+from imu_calibration.calibration.status import DETERMINED, HELD, statuses
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.estimation.covariance_terms import DRIFT, Terms, replace_weak, total, with_term
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
@@ -48,8 +49,8 @@ class HandCalibration:
     """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
     values: np.ndarray
     """Parameters in `param_names` order, SI, shape (n,)."""
-    covariance: np.ndarray
-    """Covariance of `values`, shape (n, n)."""
+    terms: Terms
+    """Covariance of `values` as named terms (`covariance_terms`), each of shape (n, n)."""
     statuses: tuple
     """'determined', 'weak' or 'held' for each parameter."""
     tolerances: np.ndarray
@@ -76,6 +77,13 @@ class HandCalibration:
     """`TurnData` that were not left out."""
     model_error: ModelError
     """What the covariance grew by, beyond noise and scatter, in the order of `model`."""
+    replaced: tuple[str, ...] = ()
+    """Weak parameters that were replaced by their prior."""
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of `values`, the sum of its terms, shape (n, n)."""
+        return total(self.terms)
 
     @cached_property
     def advice(self) -> tuple[dict, ...]:
@@ -213,20 +221,33 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
         found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
-    found = replace(found, covariance=with_movement(found.covariance, model, movements))
+    terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # as they are: what was left out, or moved, is for everybody to see
     goals = model.tolerances(options.tolerances)
-    status = statuses(np.sqrt(np.diag(found.covariance)), found.held, goals)
+    status = statuses(np.sqrt(np.diag(total(terms))), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
                   **_statistics(model, found, poses, turns)}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
     index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
-    covariance = np.pad(found.covariance, (0, 1))  # index -1: zero by convention, for certain
-    return HandCalibration(names, np.append(found.state.values, 0.0)[index], covariance[np.ix_(index, index)],
+    padded = {name: np.pad(term, (0, 1))[np.ix_(index, index)] for name, term in terms.items()}  # index -1: zero by convention, certain
+    return HandCalibration(names, np.append(found.state.values, 0.0)[index], padded,
                            tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
                            np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), statistics, poses, found.state, model,
                            found.factor.T @ found.factor, used, turns, found.model_error)
+
+
+def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
+    """Return the calibration with weak values replaced by their prior where that lowers the expected error (`replace_weak`)."""
+    held = np.array([status == HELD for status in hand.statuses])
+    nominal = dict.fromkeys(FIXED, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
+    weak = np.flatnonzero(~held & (hand.sd > hand.tolerances))
+    values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
+                                           weak=weak.tolist())
+    known = dict(zip(hand.param_names, values))
+    state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
+    return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
+                   statuses=statuses(np.sqrt(np.diag(total(terms))), held | replaced, hand.tolerances))
 
 
 def _settled(model, found):

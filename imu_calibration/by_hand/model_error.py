@@ -33,7 +33,7 @@ def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: lis
     """
     count = len(poses.start)
     if count < LEAST_BLOCKS or not free.any():
-        return ModelError(np.ones(model.size), np.zeros(model.size))
+        return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     system = build_system(model, state, poses, turns=turns)
     root = np.sqrt(scatter.total(system.noise, system.component))
     along, rest = system.nuisance / root[:, None], system.residual / root

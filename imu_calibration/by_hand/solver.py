@@ -9,6 +9,7 @@ from imu_calibration.by_hand.equations import Poses, State, TurnData, build_syst
 from imu_calibration.by_hand.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, LOWER, HandModel, unpack
 from imu_calibration.by_hand.model_error import hand_model_error
+from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, EARTH_RATE, GRAVITY, HELD, NOISE, Terms
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.scaled_solve import covariance_with_held
 from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
@@ -25,8 +26,8 @@ class HandSolution:
 
     state: State
     """Parameters, directions and drifts."""
-    covariance: np.ndarray
-    """Covariance of the parameters, shape (n, n)."""
+    terms: Terms
+    """Covariance of the parameters as named terms, each of shape (n, n)."""
     held: np.ndarray
     """True where the prior's value was kept, shape (n,)."""
     scatter: GroupVariances
@@ -69,9 +70,11 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
     error = hand_model_error(model, state, poses, turns=turns, scatter=scatter, free=~held)
-    known = _of_gravity(state.values, gravity_sd / model.gravity) + _of_earth(model, state, poses, ~held)
-    cov = error.added(covariance_with_held(factor, ~held, held, prior_sd=priors)) + known
-    return HandSolution(state, cov, held, scatter, factor, steps + more, error)
+    own, of_held = covariance_with_held(factor, ~held, held, prior_sd=priors)
+    scattered = _of_scatter(model, state, poses, turns=turns, scatter=scatter, free=~held, memory=memory)
+    terms = {NOISE: own - scattered, BIAS_PROCESS: scattered, HELD: of_held, **error.terms(own + of_held),
+             GRAVITY: _of_gravity(state.values, gravity_sd / model.gravity), EARTH_RATE: _of_earth(model, state, poses, ~held)}
+    return HandSolution(state, terms, held, scatter, factor, steps + more, error)
 
 
 def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:
@@ -149,6 +152,17 @@ def _factor(model, state, poses, turns, scatter, memory):
     root = np.sqrt(scatter.total(system.noise, system.component, inflated=True))
     full = np.linalg.qr(np.hstack([system.nuisance, system.main]) / root[:, None], mode='r')
     return full[system.nuisance.shape[1]:, system.nuisance.shape[1]:]
+
+
+def _of_scatter(model, state, poses, *, turns, scatter, free, memory):
+    """Return the part of the covariance that is due to the scatter of poses, drifts and turns beyond the noise, shape (n, n)."""
+    system = build_system(model, state, poses, turns=turns, memory=memory)
+    variance = scatter.total(system.noise, system.component, inflated=True)
+    orthogonal, factor = np.linalg.qr(np.hstack([system.nuisance, system.main[:, free]]) / np.sqrt(variance)[:, None])
+    gain = scipy.linalg.solve_triangular(factor, orthogonal.T)[system.nuisance.shape[1]:] * np.sqrt(1 - system.noise / variance)
+    found = np.zeros((model.size,) * 2)
+    found[np.ix_(free, free)] = gain @ gain.T
+    return found
 
 
 def _of_gravity(values, relative_sd):

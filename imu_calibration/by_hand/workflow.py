@@ -8,7 +8,7 @@ import numpy as np
 import imu_calibration
 from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.by_evidence import EvidentHand, solve_by_evidence
-from imu_calibration.by_hand.calibrate import gather_by_hand
+from imu_calibration.by_hand.calibrate import gather_by_hand, with_weak_replaced
 from imu_calibration.by_hand.equations import TurnData
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.proof import prove_by_hand
@@ -17,7 +17,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import HELD, statuses, tolerances_of
+from imu_calibration.calibration.status import HELD, reasons_held, statuses, tolerances_of
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
@@ -132,18 +132,20 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
         When the specific force at rest is plainly in another unit.
 
     """
-    hand = evident.hand
+    hand = with_weak_replaced(evident.hand)
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     model, gathered = hand.model.model, recording.gathered
     gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     order = [hand.param_names.index(name) for name in model.param_names]
+    terms = {name: np.diag(term)[order] for name, term in hand.terms.items()}
     covariance = hand.covariance[np.ix_(order, order)]
     held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
     calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
-                              proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings))
+                              proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings),
+                              covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced))
     needed = {name: (item['needs'], float('nan')) for item in reversed(hand.advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
                       options=options, hand=hand)

@@ -7,7 +7,7 @@ from functools import partial
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.from_solution import document, motions_needed
+from imu_calibration.calibration.from_solution import document, motions_needed, with_gravity_uncertainty, with_weak_replaced
 from imu_calibration.calibration.gathered import Gathered, join
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.model_changes import ModelChanges
@@ -135,6 +135,7 @@ def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, tabl
              changes: ModelChanges = ModelChanges()) -> TableResult:
     """Judge a solution of what was gathered with `model`, say which motions it lacks, and return the TableResult."""
     tolerances = tolerances_of(solution.model, options.tolerances)
+    solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
     proof = prove_solution(gathered.held_out, solution, model)
     calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof,

@@ -5,42 +5,43 @@ from dataclasses import dataclass
 from typing import Any
 
 from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.decision import HELPS, decide, reason_of, worse_regimes
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.gathered import join
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.proof import model_for, prove_calibration
-from imu_calibration.calibration.proof_words import disproved, proven
 from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.reference.table import Table
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """What a recording says of a calibration."""
+    """The errors of a calibration on a recording."""
 
     proof: dict
     """Sensor -> error before and after, interval, on how much, by what the IMU does (see `proof.prove`); {}: it cannot be told."""
     findings: tuple = ()
     """What a look at the recording found."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
-    """Why it cannot be told, where it cannot."""
+    """Why there is no proof, where there is none."""
 
     @property
     def helps(self) -> bool:
-        """Whether the recording shows that the calibration helps, and harms in no motion."""
-        return bool(self.proof) and not disproved(self.proof)
+        """Whether the decision on each sensor is `helps`."""
+        return bool(self.proof) and len(self.helped) == len(self.proof)
 
     @property
     def helped(self) -> dict[str, Any]:
-        """The entries of the proof of those sensors that it is shown to help."""
-        return {sensor: entry for sensor, entry in self.proof.items() if not disproved({sensor: entry})}
+        """The entries of the proof of the sensors that it helps."""
+        return {sensor: entry for sensor, entry in self.proof.items() if decide(entry) is HELPS}
 
     @property
     def lines(self) -> list[str]:
-        """The answer in sentences, the gravest first."""
+        """The decision on each sensor with its reason, then the regimes with a larger error."""
         if not self.proof:
-            return [f'whether it helps cannot be told: {self.why}']
-        return disproved(self.proof) + proven(self.helped)
+            return [f'unproven: {self.why}']
+        return [*(f'{sensor} {decide(entry)}: {reason_of(entry)}' for sensor, entry in self.proof.items()),
+                *(f'{sensor}: {line}' for sensor, entry in self.proof.items() for line in worse_regimes(entry))]
 
 
 def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,

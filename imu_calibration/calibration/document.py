@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imu_calibration.calibration import shown
+from imu_calibration.calibration.decision import SensorDecision, decide, most_cautious
 from imu_calibration.calibration.document_checks import check_numbers, check_parts
 from imu_calibration.calibration.document_parts import parts_of
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.base import SECTIONS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 FORMAT = 'imu_calibration/1'
 UNKNOWN = 'unknown'
 """What the provenance says of the uncertainty of imported values."""
-_WHERE_KNOWN = ('verdict', 'verdicts', 'verdict_reasons', 'proof')
+_WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
 """Parts of a document that are left out while nobody knows them."""
 
 
@@ -52,16 +53,20 @@ class Calibration:
     """Temperature range, largest rate, gravity, duration, date."""
     provenance: dict = field(default_factory=dict)
     """Software version, bag names and hashes, options."""
-    verdict: str = ''
-    """'good', 'weak' or 'bad' (see `verdict`); '' in files from before it was written down."""
-    verdicts: dict[str, str] = field(default_factory=dict)
-    """Sensor -> the same of its parameters alone; {} where nobody judged them apart."""
-    verdict_reasons: tuple = ()
-    """What speaks for or against it, a line each, and what to do next."""
+    decision: dict[str, str] = field(default_factory=dict)
+    """Sensor -> decision in the file (`decision.SensorDecision`); see `decisions` for a sensor without one."""
+    decision_reasons: dict[str, str] = field(default_factory=dict)
+    """Sensor -> the reason for the decision."""
+    notes: tuple = ()
+    """Parameters within tolerance, warnings, notes and next steps, a line each."""
     proof: dict = field(default_factory=dict)
     """
     Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured.
     """
+    covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
+    """Term (`estimation.covariance_terms`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
+    held_reason: dict[str, str] = field(default_factory=dict)
+    """Held parameter -> the reason (`status.reasons_held`)."""
     judgement: Verdict | None = None
     """The verdict with its reasons one by one, where it was not read from a file."""
 
@@ -109,6 +114,15 @@ class Calibration:
     def uncertainty_known(self) -> bool:
         """Whether somebody knows how certain the values are: of those that another program made nobody does."""
         return self.provenance.get('uncertainty') != UNKNOWN
+
+    @property
+    def decisions(self) -> dict[str, SensorDecision]:
+        """Sensor -> decision: the more cautious of that in the file and that of the proof; UNPROVEN without both."""
+        found = {}
+        for sensor in SENSORS:
+            known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
+            found[sensor] = most_cautious([*known, decide(self.proof.get(sensor))] if self.proof.get(sensor) or not known else known)
+        return found
 
     @property
     def requested(self) -> dict[str, str]:
@@ -190,8 +204,10 @@ def to_mapping(calibration: Calibration) -> dict:
     if (errors := calibration.model.joint_names.errors) is not None:
         document['joint_errors'] = errors
     document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
+    if calibration.covariance_terms:
+        document['covariance_terms'] = _plain(calibration.covariance_terms)
     document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
-    for name in ('statistics', 'conditions', 'verdict', 'verdicts', 'verdict_reasons', 'proof', 'provenance'):
+    for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
         part = getattr(calibration, name)
         if part or name not in _WHERE_KNOWN:
             document[name] = _plain(part)
@@ -207,6 +223,9 @@ def _section(calibration, section):
         entries[effect.name] = {
             'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.sd[part].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
+        reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
+        if any(reasons):
+            entries[effect.name]['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()
     return entries
 
 

@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_calibration.calibration.decision import HARMS, SensorDecision
+from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.errors import DocumentError, shortened
@@ -71,8 +74,8 @@ def _is_joint_errors(value):
                                            for name in ('turning', 'zeros', 'angles'))
 
 
-def _is_word(value):
-    return value in ('good', 'weak', 'bad')
+def _is_decision(value):
+    return value in tuple(SensorDecision)
 
 
 _NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
@@ -85,14 +88,15 @@ def _is_proof(value):
 
 _SECTION = {'effects': _is_list_of(_is_text)}
 KNOWN = {
-    **{section: _SECTION for section in SECTIONS}, 'covariance': {},
+    **{section: _SECTION for section in SECTIONS}, 'covariance': {}, 'covariance_terms': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
     'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {},
     'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
-    'verdict': _is_word, 'verdicts': {sensor: _is_word for sensor in SENSORS}, 'verdict_reasons': _is_list_of(_is_text),
+    'decision': {sensor: _is_decision for sensor in SENSORS}, 'decision_reasons': {sensor: _is_text for sensor in SENSORS},
+    'notes': _is_list_of(_is_text),
     'proof': {sensor: _is_proof for sensor in SENSORS},
 }
 """Part of a document -> what it must be, when it is there: a function, or a mapping whose entries are told in the same way."""
@@ -125,10 +129,12 @@ def check_numbers(calibration: 'Calibration') -> 'Calibration':
     """
     Return the calibration when its numbers can belong to an IMU.
 
+    A sensor whose matrix is ill-conditioned has nominal parameters and the decision `harms` in the result: the other one can be used.
+
     Raises
     ------
     DocumentError
-        When a value is not finite, a covariance is none, or a sensor matrix cannot be inverted.
+        When a value is not finite, a covariance is none, or neither sensor matrix can be inverted.
 
     """
     values, covariance = calibration.values, calibration.covariance
@@ -141,15 +147,27 @@ def check_numbers(calibration: 'Calibration') -> 'Calibration':
     if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > LARGEST:
         raise DocumentError(f'values and standard deviations must stay below {LARGEST:g}, some do not; calibrate again')
     _check_covariance(covariance)
+    terms, variance = calibration.covariance_terms, np.diag(covariance)
+    parts = np.array(list(terms.values()))
+    if terms and not np.all(np.abs(parts.sum(axis=0) - variance) <= ROUNDING * np.abs(parts).sum(axis=0)):
+        raise DocumentError('the terms of each variance must sum to it, those of some do not; calibrate again')
     for sensor in SENSORS:
         for needed in BASE:
             if not calibration.has(sensor, needed):
                 raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
-        condition = np.linalg.cond(calibration.of(sensor, Role.LINEAR))
-        if not condition < CONDITION_LIMIT:
-            raise DocumentError(f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), '
-                                f'its condition number is {condition:.3g}; calibrate again with more attitudes')
-    return calibration
+    return _without_ill_conditioned(calibration)
+
+
+def _without_ill_conditioned(calibration):
+    condition = {sensor: float(np.linalg.cond(calibration.of(sensor, Role.LINEAR))) for sensor in SENSORS}
+    wrong = {sensor: f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {number:.3g}; '
+                     'calibrate again with more attitudes' for sensor, number in condition.items() if not number < CONDITION_LIMIT}
+    if len(wrong) == len(SENSORS):
+        raise DocumentError(next(iter(wrong.values())))
+    if not wrong:
+        return calibration
+    return replace(with_nominal(calibration, list(wrong)), decision=calibration.decision | dict.fromkeys(wrong, str(HARMS)),
+                   decision_reasons=calibration.decision_reasons | wrong)
 
 
 def _check_covariance(covariance):

@@ -34,9 +34,12 @@ def parts_of(document: Mapping) -> dict[str, Any]:
                                 "write it anew")
     return {'model': model.at(values), 'values': values, 'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
-            'undetermined': tuple(document.get('undetermined_directions') or ()), 'verdict': document.get('verdict') or '',
-            'verdict_reasons': tuple(document.get('verdict_reasons') or ()),
-            **{name: dict(document.get(name) or {}) for name in ('gauge', 'statistics', 'conditions', 'verdicts', 'proof', 'provenance')}}
+            'covariance_terms': _covariance_terms(document, model),
+            'held_reason': {name: str(reason) for e in model.effects if 'held_reason' in entries[e.key] for name, reason in zip(
+                e.param_names(), np.array(entries[e.key]['held_reason'], dtype=object).reshape(e.size), strict=True) if reason},
+            'undetermined': tuple(document.get('undetermined_directions') or ()), 'notes': tuple(document.get('notes') or ()),
+            **{name: dict(document.get(name) or {})
+               for name in ('gauge', 'statistics', 'conditions', 'decision', 'decision_reasons', 'proof', 'provenance')}}
 
 
 def _model(document):
@@ -75,6 +78,13 @@ def _check_unit(found, effect):
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
         raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the calibration file")
+
+
+def _covariance_terms(document, model):
+    """Return term -> variance of each parameter in the model's order; the document has the order of its covariance."""
+    terms = document.get('covariance_terms') or {}
+    order = [document['covariance']['names'].index(name) for name in model.param_names] if terms else []
+    return {str(name): np.asarray(variance, float)[order] for name, variance in terms.items()}
 
 
 def _covariance(given, model, entries):

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.decision import decisions_text
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, exit_code
-from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import ImuCalibrationError, InputError
@@ -39,7 +39,7 @@ class UnitResult:
     calibration: Calibration | None = None
     """The Calibration, or None when the unit was refused."""
     verdict: str = 'refused'
-    """'good', 'weak', 'bad' or 'refused'."""
+    """The more cautious decision, or 'refused'."""
     exit_code: int = 1
     """0, 1 or 3, as for a single calibration."""
     error: str = ''
@@ -51,14 +51,13 @@ class UnitResult:
 
     @property
     def verdicts(self) -> dict[str, str]:
-        """Sensor -> its own word; the same for both where nobody judged them apart."""
-        known = self.calibration.verdicts if self.calibration is not None else {}
-        return {sensor: known.get(sensor, self.verdict) for sensor in SENSORS}
+        """Sensor -> decision, or 'refused'."""
+        return dict.fromkeys(SENSORS, self.verdict) if self.calibration is None else {**self.calibration.decisions}
 
     @property
     def verdict_text(self) -> str:
-        """The verdict in words, sensor by sensor where they differ."""
-        return verdict_text(self.verdict, self.verdicts)
+        """The decisions in one phrase, or 'refused'."""
+        return self.verdict if self.calibration is None else decisions_text(self.calibration.decisions)
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class FleetStep:
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         if self.report is not None:
             texts['report.html'] = self.report(result)
-        return UnitResult(unit.name, result.calibration, result.verdict.word, exit_code(result.calibration), files=texts)
+        return UnitResult(unit.name, result.calibration, str(result.verdict.word), exit_code(result.calibration), files=texts)
 
 
 @dataclass(frozen=True)

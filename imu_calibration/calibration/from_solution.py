@@ -1,6 +1,7 @@
 """From a solution to the content of the calibration document: statuses, weak directions, needed motions, statistics."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -10,10 +11,11 @@ import imu_calibration
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import ModelChanges
-from imu_calibration.calibration.status import statuses
+from imu_calibration.calibration.status import reasons_held, statuses
 from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
+from imu_calibration.estimation.covariance_terms import GRAVITY, replace_weak, with_term
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import Motion, motions_about
@@ -40,8 +42,7 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
              provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges()) -> Calibration:
     """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its `proof` and the verdict."""
     model = solution.model
-    covariance = with_gravity_uncertainty(solution, table)
-    sd = np.sqrt(np.diag(covariance))
+    covariance, sd = solution.covariance, solution.sd
     status = statuses(sd, solution.held, tolerances)
     directions = observability.weak_directions(covariance, tolerances, model.param_names)
     others = _besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))
@@ -53,7 +54,9 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
                               statistics(solution, gathered) | changes.to_mapping(), conditions(gathered, table.gravity_value),
-                              {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {})
+                              {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {},
+                              covariance_terms={name: np.diag(term) for name, term in solution.terms.items()},
+                              held_reason=reasons_held(solution.held, model.param_names, solution.replaced))
     return judged(calibration, tolerances)
 
 
@@ -71,12 +74,26 @@ def _besides(directions, needed, in_tolerances):
     return [(names, text) for text, names in others.items()]
 
 
-def with_gravity_uncertainty(solution: Solution, table: Table) -> np.ndarray:
-    """Return the covariance with the uncertainty of gravity, which scales the accelerometer matrix as a whole."""
+def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
+    """Return the solution with the uncertainty of gravity, which scales the accelerometer matrix as a whole, in its covariance."""
     direction = np.zeros(len(solution.values))
     part = solution.model.part('accelerometer', Role.LINEAR)
     direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value
-    return solution.covariance + np.outer(direction, direction)
+    return replace(solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction)))
+
+
+def with_weak_replaced(solution: Solution, tolerances: np.ndarray) -> Solution:
+    """
+    Return the solution with weak values that compensation applies replaced by their prior where that lowers the expected error.
+
+    See `replace_weak`. A replaced parameter is held.
+    """
+    model, applied = solution.model, np.repeat([e.compensation == 'exact' for e in solution.model.effects],
+                                               [e.size for e in solution.model.effects])
+    weak = np.flatnonzero(applied & ~solution.held & (solution.sd > tolerances))
+    values, terms, replaced = replace_weak(solution.values, solution.terms, make_prior(model).mean, weak=weak.tolist())
+    return replace(solution, values=values, terms=terms, held=solution.held | replaced,
+                   replaced=tuple(np.array(model.param_names)[replaced].tolist()))
 
 
 def statistics(solution: Solution, gathered: Gathered) -> dict:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.estimation.covariance_terms import REJECTED, with_term
 from imu_calibration.estimation.solution import Solution
 
 
@@ -67,8 +68,9 @@ class Demand:
         return total
 
     def applied(self, solution: Solution) -> Solution:
-        """Return a solution of `options` as it is handed over."""
-        return self.clipped or replace(solution, covariance=solution.covariance + self.disagreement(solution.param_names))
+        """Return a solution of `options`, or that without clipped samples, with the covariance of rejected and collinear effects."""
+        found = self.clipped or solution
+        return replace(found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names)))
 
     @property
     def is_nothing(self) -> bool:

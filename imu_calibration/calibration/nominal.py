@@ -2,18 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import SECTIONS, Role
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.document import Calibration
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
 """Sensor -> what of `ColumnGroup.uses` is made of its readings when others are corrected."""
 
 
-def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibration:
+def with_nominal(calibration: 'Calibration', sensors: Sequence[str]) -> 'Calibration':
     """
     Return a calibration that leaves sensors as they come.
 
@@ -34,7 +37,8 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
             values[part], status[part] = effect.prior_values(), [HELD] * effect.size
             covariance[part, :] = covariance[:, part] = 0.0
             covariance[part, part] = np.diag(effect.prior_sds()**2)
-    return replace(calibration, model=small, values=values, covariance=covariance, status=tuple(status))
+    return replace(calibration, model=small, values=values, covariance=covariance, status=tuple(status), covariance_terms={},
+                   held_reason={})
 
 
 def _stays(effect, sensors):

@@ -1,4 +1,4 @@
-"""What speaks for or against a calibration, one thing at a time, and the words for it."""
+"""Statements about a calibration: decisions, warnings and notes, with the next step."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,20 +8,20 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.effects.base import SENSORS
 
 
-class Judgement(StrEnum):
-    """What a reason, or all of them together, say of a calibration."""
+class StatementKind(StrEnum):
+    """What a statement is."""
 
-    GOOD = 'good'
-    """Use it."""
-    WEAK = 'weak'
-    """Usable, with gaps."""
-    BAD = 'bad'
-    """Do not use it as it is."""
+    DECISION = 'decision'
+    """The decision on a sensor."""
+    PARAMETERS = 'parameters'
+    """How many parameters are within their tolerance, or which are not."""
+    WARNING = 'warning'
+    """A finding that the user should follow up."""
     NOTE = 'note'
-    """A reason that leaves the verdict alone."""
+    """A remark."""
 
 
-GOOD, WEAK, BAD, NOTE = Judgement
+DECISION, PARAMETERS, WARNING, NOTE = StatementKind
 MISFIT = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
 LOOSE = 2.0
@@ -34,14 +34,14 @@ HAND_AXES = 'accelerometer_lower_triangular'
 
 @dataclass(frozen=True)
 class Reason:
-    """One thing that speaks for or against the calibration."""
+    """One statement about the calibration."""
 
-    word: Judgement
-    """What it says."""
+    word: StatementKind
+    """What it is."""
     what: str
-    """What was seen."""
+    """The statement."""
     next: str
-    """What to do about it; empty when nothing has to be done."""
+    """The next step; empty when nothing has to be done."""
     key: str | None = None
     """What has to be given for it, a key of `errors.KEYS`."""
     sensors: tuple[str, ...] = SENSORS

@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from imu_calibration.calibration.decision import HELPS, most_cautious
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.reasons import BAD
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
 from imu_calibration.calibration.verdict import Verdict
@@ -38,7 +38,7 @@ class CalibrationResult(ABC):
 
     @property
     def verdict(self) -> Verdict:
-        """Good, weak or bad, with reasons."""
+        """The decision per sensor with all statements."""
         assert self.calibration.judgement is not None, 'a result is made of a calibration that was judged'
         return self.calibration.judgement
 
@@ -81,15 +81,16 @@ class CalibrationResult(ABC):
 
 def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> tuple[str, list[str]]:
     """
-    Return (verdict, lines): 'good', 'weak' or 'bad' with reasons and next steps, for people (see `verdict`).
+    Return (the more cautious decision, lines for people: decisions, parameters, warnings, notes and next steps).
 
     `hints` as for `errors.with_hint`.
     """
-    said = usage(result.calibration)
-    return result.verdict.word, [*[said] * bool(said), *result.verdict.lines(hints)]
+    lines, told = result.verdict.lines(hints), usage(result.calibration)
+    return str(result.verdict.word), [*lines, *[told] * bool(told)]
 
 
 def exit_code(calibration: Calibration) -> int:
-    """Return 0 when every requested parameter is determined, nothing was lost and the verdict is not bad, else 3."""
-    lacking = calibration.verdict == BAD or any(status != DETERMINED for status in calibration.requested.values())
+    """Return 0 when each sensor helps, every requested parameter is determined and nothing was lost, else 3."""
+    harmful = most_cautious(calibration.decisions.values()) is not HELPS
+    lacking = harmful or any(status != DETERMINED for status in calibration.requested.values())
     return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0

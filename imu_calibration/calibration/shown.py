@@ -1,9 +1,10 @@
-"""A calibration for people: every parameter with its standard deviation, in their units, and the verdict."""
+"""A calibration for people: every parameter with its standard deviation, in their units, and the decision per sensor."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from html import escape
 from typing import TYPE_CHECKING
 
+from imu_calibration.calibration.decision import decisions_text
 from imu_calibration.calibration.status import Status
 from imu_calibration.units import for_people, with_sd
 
@@ -25,18 +26,11 @@ def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
 
 
-def verdict_text(verdict: str, verdicts: Mapping[str, str]) -> str:
-    """Return a verdict in words, sensor by sensor where they differ; '' without one."""
-    differ = len(set(verdicts.values())) > 1
-    return f'{verdict} ({", ".join(f"{sensor} {word}" for sensor, word in verdicts.items())})' if differ else str(verdict)
-
-
 def summary(calibration: 'Calibration') -> str:
-    """Return one line: the frame, the verdict, and how many parameters have which status."""
+    """Return one line: the frame, the decisions, and how many parameters have which status."""
     counts = {status: sum(own == status for own in calibration.status) for status in Status}
     parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
-    verdict = verdict_text(calibration.verdict, calibration.verdicts) or 'no verdict'
-    return f'<Calibration of {calibration.frame_id or "an IMU"}: {verdict}, {parts}>'
+    return f'<Calibration of {calibration.frame_id or "an IMU"}: {decisions_text(calibration.decisions)}, {parts}>'
 
 
 def as_text(calibration: 'Calibration') -> str:

@@ -1,6 +1,6 @@
 """How well a recording knows a parameter, and how well it must."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from enum import StrEnum
 
 import numpy as np
@@ -20,6 +20,11 @@ class Status(StrEnum):
 
 
 DETERMINED, WEAK, HELD = Status
+WEAK_DATA, LIKELIHOOD_RATIO, REPLACEMENT = 'weak data', 'likelihood ratio', 'replacement'
+"""
+Reasons for which a parameter is held: its sd would exceed half the prior's; its prior is not significantly worse; the prior has the smaller
+expected error.
+"""
 
 
 def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[float]) -> tuple[Status, ...]:
@@ -37,6 +42,11 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
 
     """
     return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
+
+
+def reasons_held(held: Iterable[bool], names: Iterable[str], replaced: Collection[str]) -> dict[str, str]:
+    """Return held parameter -> the reason: it is one of those `replaced` by their prior, or the data determine too little of it."""
+    return {name: REPLACEMENT if name in replaced else WEAK_DATA for name, flag in zip(names, held, strict=True) if flag}
 
 
 def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:

@@ -1,103 +1,94 @@
-"""May a calibration be used, of both sensors or of one? What its document says against it, and what whoever uses it should know."""
+"""What of a calibration is applied: the decision per sensor, and consent of the user."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN, decisions_text
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
-from imu_calibration.calibration.plausibility import implausible
-from imu_calibration.calibration.proof_words import disproved
-from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, listed
-from imu_calibration.calibration.shown import verdict_text
+from imu_calibration.calibration.reasons import HAND_AXES, listed
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import grave_reasons
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
 
 
-def objections(calibration: Calibration, sensor: str | None = None) -> list[str]:
-    """
-    Return why nobody should be corrected with a calibration unless they insist, a line each; the first is the gravest.
-
-    A bad verdict; values beyond what is known of any instrument; a proof that does not show a smaller error with the calibration
-    than without, or a larger one in some motion (`proof_words.disproved`). With a `sensor`, what concerns its parameters.
-    """
-    reasons, proof = calibration.verdict_reasons[:1], calibration.proof
-    word = calibration.verdict
-    if sensor is not None:
-        word = calibration.verdicts.get(sensor, word) if BAD in calibration.verdicts.values() else word   # nobody judged them apart
-        reasons = [reason.what for reason in grave_reasons(calibration) if sensor in reason.sensors][:1] or reasons
-        proof = {sensor: proof[sensor]} if sensor in proof else {}
-    bad = [': '.join([f'its verdict is {verdict_text(BAD, calibration.verdicts)}', *reasons])] if word == BAD else []
-    return list(dict.fromkeys([*bad, *implausible(calibration, sensor), *disproved(proof)]))
-
-
 @dataclass(frozen=True, eq=False)
 class Usable:
-    """What a calibration is used as."""
+    """The part of a calibration that is applied."""
 
     calibration: Calibration
-    """With the parameters of refused sensors as of a data sheet."""
+    """With nominal parameters of refused sensors."""
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Sensor that is left as it comes -> why."""
+    """Sensor that is not corrected -> why."""
+    cautions: tuple[str, ...] = ()
+    """A line for each sensor that is corrected although the decision is not `helps`."""
 
     @property
     def lines(self) -> list[str]:
-        """What whoever uses it should know of that, a line each."""
-        return [f'the {sensor} is left as it comes: {why}' for sensor, why in self.refused.items()]
+        """Sensors that are not corrected, or corrected with caution, a line each."""
+        return [*(f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()), *self.cautions]
 
 
-def usable(calibration: Calibration) -> Usable:
+def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False) -> Usable:
     """
-    Return what of a calibration may be used by people who do not insist.
+    Return the part of a calibration that is applied.
+
+    A sensor with the decision `helps` is applied always. Offline `unproven` is applied with a caution, and `harms` with the user's consent
+    only. Live `unproven` is applied with consent only, and `harms` never. By hand the gyroscope's axes are those of the accelerometer, so
+    that it is not applied without the accelerometer.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    anyway : bool
+        The user's consent.
+    live : bool
+        Whether a robot uses the readings while they are made.
 
     Raises
     ------
     DocumentError
-        When that is nothing, with the gravest objection.
+        When no sensor is left.
 
     """
-    refused = refused_sensors(calibration)
+    words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
     if refused.keys() == set(SENSORS):
-        raise DocumentError('a calibration must help before anybody is corrected with it, against this one speaks: '
-                            f'{objections(calibration)[0]}; calibrate again, or insist', key='anyway')
-    return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused)
+        first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
+        consent = not live or UNPROVEN in words.values()
+        step, key = ('calibrate again, or give your consent', 'anyway') if consent else ('calibrate again', None)
+        raise DocumentError('a calibration must help a sensor on held-out data to be applied, this one does not: '
+                            f'{first} {refused[first]}; {step}', key=key)
+    cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
+                     if sensor not in refused and words[sensor] is not HELPS)
+    return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions)
 
 
-def refused_sensors(calibration: Calibration) -> dict[str, str]:
-    """
-    Return sensor -> why nobody should be corrected with its parameters.
+def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: bool = False) -> dict[str, str]:
+    """Return sensor -> why it is not corrected; arguments as in `usable`."""
+    accepted = {HELPS} | ({UNPROVEN} if anyway or not live else set()) | ({HARMS} if anyway and not live else set())
+    refused = {sensor: _text(calibration, sensor) for sensor in SENSORS if calibration.decisions[sensor] not in accepted}
+    if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
+        refused.setdefault('gyroscope', 'its axes are those of the accelerometer')
+    return refused
 
-    What makes one sensor bad may have spoilt the other: beside a refused sensor only one is used that is shown to help. By hand a gyroscope
-    has its axes and its proof from the accelerometer.
-    """
-    against = {sensor: found[0] for sensor in SENSORS if (found := objections(calibration, sensor))}
-    if not against and objections(calibration):   # of the table, or of the clock
-        against = dict.fromkeys(SENSORS, objections(calibration)[0])
-    for sensor in SENSORS if against else ():
-        if sensor not in against and sensor not in calibration.proof:
-            against[sensor] = 'that it helps is not shown'
-    if 'accelerometer' in against and calibration.gauge.get('axes') == HAND_AXES:
-        against.setdefault('gyroscope', 'its axes are those of the accelerometer')
-    return against
+
+def _text(calibration, sensor):
+    """Return the decision on a sensor with its reason."""
+    return ': '.join([calibration.decisions[sensor], *[why for why in [calibration.decision_reasons.get(sensor)] if why]])
 
 
 def usage(calibration: Calibration) -> str:
-    """Return what compensation makes of a calibration of which it uses one sensor alone, a line; '' otherwise."""
+    """Return which sensor compensation corrects where it corrects one alone, a line; '' otherwise."""
     refused = refused_sensors(calibration)
-    if not 0 < len(refused) < len(SENSORS):
-        return ''
+    if len(refused) != 1:
+        return 'compensation corrects neither sensor with it' if refused else ''
     corrected = next(s for s in SENSORS if s not in refused)
-    return f'compensation corrects the {corrected} with it, and leaves the {next(iter(refused))} as it comes'
+    return f'compensation corrects the {corrected} with it, and leaves the {next(iter(refused))} unchanged'
 
 
 def caveats(calibration: Calibration) -> list[str]:
-    """Return what should be known about a calibration that may be used, a line each."""
-    if not calibration.verdict:
-        return ['it carries no verdict, as files of earlier versions do: calibrate again to know how good it is']
-    why = missing(calibration) or ''.join(calibration.verdict_reasons[:1])
-    told = f'its verdict is {verdict_text(calibration.verdict, calibration.verdicts)}' + (f': {why}' if why else '')
-    return [] if calibration.verdict == GOOD else [told]
+    """Return what a user of the calibration should know in addition to the decisions, a line each."""
+    return [text] if (text := missing(calibration)) else []
 
 
 def missing(calibration: Calibration) -> str:
@@ -107,6 +98,5 @@ def missing(calibration: Calibration) -> str:
 
 
 def standing(calibration: Calibration) -> str:
-    """Return in a few words how well a calibration is known, for one line in a log."""
-    proof = 'proven on held-out data' if calibration.proof and not disproved(calibration.proof) else 'no proof on held-out data'
-    return f'{verdict_text(calibration.verdict, calibration.verdicts) or "no verdict"}, {proof}'
+    """Return the decisions in a few words, for one line in a log."""
+    return decisions_text(calibration.decisions)

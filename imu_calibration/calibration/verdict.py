@@ -1,14 +1,35 @@
-"""Good, weak or bad: whether a calibration may be used, why, and what to do next."""
+"""The verdict on a calibration: the decision per sensor, the parameters within tolerance, warnings, and the next steps."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imu_calibration.calibration.decision import (
+    HELPS,
+    UNPROVEN,
+    SensorDecision,
+    decide,
+    decisions_text,
+    helps_everywhere,
+    most_cautious,
+    reason_of,
+)
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
-from imu_calibration.calibration.proof_words import disproved, helps_everywhere
-from imu_calibration.calibration.reasons import BAD, GOOD, HAND_AXES, MISFIT, WEAK, Judgement, Reason, listed, misfit_ratios, quiet, rested
-from imu_calibration.calibration.shown import verdict_text
+from imu_calibration.calibration.reasons import (
+    DECISION,
+    HAND_AXES,
+    MISFIT,
+    NOTE,
+    PARAMETERS,
+    WARNING,
+    Reason,
+    listed,
+    misfit_ratios,
+    quiet,
+    rested,
+)
 from imu_calibration.calibration.status import DETERMINED, HELD, Status
 from imu_calibration.calibration.verdict_notes import notes_on
 from imu_calibration.constants import STANDARD_GRAVITY
@@ -21,37 +42,55 @@ SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict with its reasons, the gravest first."""
+    """The decisions with all statements, the most important first."""
 
-    word: Judgement
-    """GOOD, WEAK or BAD."""
-    reasons: tuple
-    """Reason, ..."""
-    sensors: dict[str, Judgement]
-    """Sensor -> the same of its parameters alone."""
+    decisions: dict[str, SensorDecision]
+    """Sensor -> decision."""
+    reasons: tuple[Reason, ...]
+    """Decisions, parameters, warnings, notes."""
+    within: int
+    """Requested parameters that are determined."""
+    requested: int
+    """Requested parameters."""
+    limiting: tuple[str, float]
+    """The requested parameter with the largest sd in units of its tolerance, and that ratio; ('', 0) without any."""
+
+    @property
+    def word(self) -> SensorDecision:
+        """The more cautious of the decisions."""
+        return most_cautious(self.decisions.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether each sensor helps and every requested parameter is determined."""
+        return self.word is HELPS and self.within == self.requested
 
     @property
     def text(self) -> str:
-        """The verdict in words, sensor by sensor where they differ."""
-        return verdict_text(self.word, self.sensors)
+        """The decisions in one phrase."""
+        return decisions_text(self.decisions)
 
     def lines(self, hints: dict[str, str] | None = None) -> list[str]:
-        """Return reasons and next steps, a line each; `hints` as for `errors.with_hint`."""
-        lines = []
-        for reason in self.reasons:
-            lines.append(reason.what if reason.word in (GOOD, self.word) else f'{reason.word}: {reason.what}')
-            lines += [f'next: {with_hint(reason.next, reason.key, hints or {})}'] if reason.next else []
-        return list(dict.fromkeys(lines))
+        """Return the statements and next steps, a line each; `hints` as for `errors.with_hint`."""
+        return lines_of(self.reasons, hints)
+
+
+def lines_of(reasons: Iterable[Reason], hints: dict[str, str] | None = None) -> list[str]:
+    """Return statements and next steps, a line each; `hints` as for `errors.with_hint`."""
+    lines = []
+    for reason in reasons:
+        lines.append(f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what)
+        lines += [f'next: {with_hint(reason.next, reason.key, hints or {})}'] if reason.next else []
+    return list(dict.fromkeys(lines))
 
 
 def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     Return the Verdict on a calibration.
 
-    Bad: no help on data that took no part, or harm in some motion; a value outside what is known of any instrument; residuals in motion far
-    above the noise at rest, where nothing proves that the calibration helps in every motion all the same; or a sensor of which nothing was
-    determined and the whole matrix is held (after a rest in one attitude). Weak: a requested parameter is not determined to its tolerance,
-    what explains the rest has a size that is known of no instrument, or such residuals beside that proof. Good: neither.
+    The decision follows from the proof (`decision.decide`); `helps` without rests and with large residuals becomes `unproven`. Warnings are
+    values beyond any known instrument, residuals in motion far above the noise at rest, known causes that are not in the model, and a
+    sensor that the recording does not determine at all.
 
     Parameters
     ----------
@@ -60,37 +99,59 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         Largest standard deviation of a determined parameter.
 
     """
-    against = grave_reasons(calibration) + _misfits(calibration, WEAK) + _strange_causes(calibration) + _undetermined(calibration)
-    words = {sensor: _worst([reason for reason in against if sensor in reason.sensors]) for sensor in SENSORS}
-    favour = [] if against else [_all_well(calibration, tolerances)]
-    order = (BAD, WEAK)
-    against = sorted(against, key=lambda r: order.index(r.word))
-    return Verdict(_worst(against), tuple(favour + against + notes_on(calibration, tolerances)), words)
-
-
-def _worst(against):
-    return BAD if any(reason.word == BAD for reason in against) else WEAK if against else GOOD
-
-
-def grave_reasons(calibration: Calibration) -> list[Reason]:
-    """Return what makes a verdict bad; it follows from what a document says."""
-    return _disproved(calibration) + _implausible(calibration) + _misfits(calibration, BAD) + _blind(calibration)
+    decisions = {sensor: _decision(calibration, sensor) for sensor in SENSORS}
+    found = list(calibration.requested.values())
+    share = np.where(calibration.model.requested, calibration.sd / tolerances, 0.0)
+    worst = int(np.argmax(share))
+    limiting = (calibration.param_names[worst], float(share[worst])) if found else ('', 0.0)
+    within = found.count(DETERMINED)
+    reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
+    reasons.append(_parameters(calibration, within, limiting, complete=within == len(found) and set(decisions.values()) == {HELPS}))
+    reasons += _undetermined(calibration) + _blind(calibration) + _implausible(calibration) + _misfits(calibration)
+    return Verdict(decisions, (*reasons, *_strange_causes(calibration), *notes_on(calibration, tolerances)), within, len(found), limiting)
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
-    """Return the calibration with its verdict and the reasons in it, so that its document carries them; arguments as in `judge`."""
+    """Return the calibration with its verdict, which its document contains; arguments as in `judge`."""
     found = judge(calibration, tolerances)
-    return replace(calibration, verdict=str(found.word), verdicts={sensor: str(word) for sensor, word in found.sensors.items()},
-                   verdict_reasons=tuple(found.lines()), judgement=found)
+    counts = {'requested': found.requested, 'determined': found.within, 'limiting': found.limiting[0],
+              'sd_over_tolerance': found.limiting[1]}
+    return replace(calibration, decision={sensor: str(word) for sensor, word in found.decisions.items()},
+                   decision_reasons={sensor: _reason(calibration, sensor) for sensor in SENSORS},
+                   notes=tuple(lines_of(reason for reason in found.reasons if reason.word is not DECISION)),
+                   judgement=found, statistics=calibration.statistics | {'parameters': counts})
 
 
-def _disproved(calibration):
-    return [Reason(BAD, line, "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
-            for sensor, entry in calibration.proof.items() for line in disproved({sensor: entry})]
+def _decided(calibration, sensor, word):
+    step = '' if word is HELPS else ("run 'imu_calibration diagnose' to find the cause" if calibration.proof.get(sensor)
+                                     else 'record more windows, or hold it still in more attitudes')
+    return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, sensors=(sensor,))
+
+
+def _decision(calibration, sensor):
+    found = decide(calibration.proof.get(sensor))
+    return UNPROVEN if found is HELPS and _periodic(calibration, sensor) else found
+
+
+def _reason(calibration, sensor):
+    more = '; unproven, because stamps that are late by a period of this motion without rests would give the same errors'
+    return reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
+
+
+def _periodic(calibration, sensor):
+    """Return whether held-out windows may repeat an error of the clock: no rests, and residuals far above the noise."""
+    return not rested(calibration) and any(ratio > MISFIT for ratio in misfit_ratios(calibration, sensor).values())
+
+
+def _parameters(calibration, within, limiting, *, complete):
+    name, share = limiting
+    limit = f'; limiting: {name}, its sd is {share:.2g} of its tolerance' if name else ''
+    return Reason(PARAMETERS, f'{within} of {len(calibration.requested)} parameters are within their tolerance{limit}',
+                  "compensate with it: 'imu_calibration compensate', or compensator_node" if complete else '')
 
 
 def _implausible(calibration):
-    return [Reason(BAD, line.partition(': check')[0], 'check the units of the recording and the axes in the table description',
+    return [Reason(WARNING, line.partition(': check')[0], 'check the units of the recording and the axes in the table description',
                    sensors=_whose([section]))
             for section in SECTIONS for line in implausible(calibration, section)]
 
@@ -105,24 +166,19 @@ def _strange_causes(calibration):
     """Return reasons why a cause that is known stays out of the model."""
     found = calibration.statistics.get('implausible') or {}
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
-    return [Reason(WEAK, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
+    return [Reason(WARNING, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
                    'it is not in the model, and the standard deviations allow for it',
                    f"see 'imu_calibration diagnose'; where {name} is what you expect, "
                    "name it in the model", sensors=_whose([catalogue.get(name, '')]))
             for name, share in found.items()]
 
 
-def _misfits(calibration, word):
-    """
-    Return the residuals in motion that are too large, of the sensors for which that weighs as much as the word says.
-
-    A table that shakes while it turns, a cable, a mount that gives way: a calibration is better than none. Without rests no proof counts:
-    stamps that are late by a period of the motion predict the next period as well as this one.
-    """
-    return [Reason(word, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
-                   f'the model leaves something out{", though the calibration helps in every motion" if word == WEAK else ""}',
+def _misfits(calibration):
+    """Return the residuals in motion that are far above the noise at rest."""
+    return [Reason(WARNING, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
+                            f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
                    "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
-            for sensor in SENSORS if (word == WEAK) == (rested(calibration) and helps_everywhere(calibration.proof.get(sensor)))
+            for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
             for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
 
 
@@ -132,7 +188,7 @@ def _blind(calibration):
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
         matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
         if own and matrix_held and DETERMINED not in own:
-            reasons.append(Reason(BAD, f'the recording says nothing about the {sensor}', _first_need(calibration, sensor),
+            reasons.append(Reason(WARNING, f'the recording does not determine the {sensor}', _first_need(calibration, sensor),
                                   sensors=(sensor,)))
     return reasons
 
@@ -144,15 +200,15 @@ def _first_need(calibration, start=''):
 
 def _undetermined(calibration):
     reasons = []
-    for status, text in ((Status.WEAK, 'known less well than its tolerance asks'),
-                         (HELD, 'not shown by this recording, held at the prior value')):
+    for status, text in ((Status.WEAK, 'sd above the tolerance'),
+                         (HELD, 'held at the prior value')):
         names = [name for name, found in calibration.requested.items() if found == status]
         if status == Status.WEAK and _gravity_unknown(calibration, names):
             scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
             what = f'{listed(scale)}: the local gravity was not given, which scales them together'
-            reasons.append(Reason(WEAK, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
+            reasons.append(Reason(PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
         for next_step, members in _by_need(calibration, names).items():
-            reasons.append(Reason(WEAK, f'{listed(members)}: {text}', next_step,
+            reasons.append(Reason(PARAMETERS, f'{listed(members)}: {text}', next_step,
                                   sensors=_whose(name.partition('.')[0] for name in members)))
     return reasons
 
@@ -174,14 +230,3 @@ def _by_need(calibration, names):
             best = (1.0, same[0] if same else 'record the same motion for longer')
         found.setdefault(best[1], []).append(name)
     return found
-
-
-def _all_well(calibration, tolerances):
-    share = np.where(calibration.model.requested, calibration.sd / tolerances, 0.0)
-    worst = int(np.argmax(share))
-    fit = [ratio for sensor in SENSORS for ratio in misfit_ratios(calibration, sensor).values()]
-    more = f'; residuals in motion are at most {np.sqrt(max(fit)):.2f} times {quiet(calibration)}' if fit else ''
-    return Reason(GOOD, f'all {len(calibration.requested)} parameters are within their tolerance (the closest, '
-                        f'{calibration.param_names[worst]}, '
-                        f'at {100 * share[worst]:.0f} % of it){more}', "compensate with it: 'imu_calibration compensate', "
-                        "or compensator_node")

@@ -1,11 +1,11 @@
-"""What a calibration's reader is told beside the verdict: what was added, left out, lost, or moves from window to window."""
+"""Notes on a calibration: effects that were added, windows that were excluded, lost samples, biases that change between windows."""
 
 import numpy as np
 
+from imu_calibration.calibration.decision import worse_regimes
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.proof import UNITS
-from imu_calibration.calibration.proof_words import disproved, proven
-from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, Reason, misfit_ratios, quiet
+from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.units import for_people, significant
 
@@ -14,16 +14,14 @@ LOST_SHARE = 0.05
 
 
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
-    """Return what leaves the verdict alone and is worth knowing; arguments as in `verdict.judge`."""
-    return (_proven(calibration) + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
+    """Return the notes; arguments as in `verdict.judge`."""
+    return (_worse(calibration) + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
             + _left_out(calibration) + _lost(calibration))
 
 
-def _proven(calibration):
-    if not calibration.proof and calibration.gauge.get('axes') == HAND_AXES:
-        return [Reason(NOTE, 'that it helps is not proven: too few attitudes to leave some out and predict them',
-                       'hold it still in more attitudes')]
-    return [] if disproved(calibration.proof) else [Reason(NOTE, line, '') for line in proven(calibration.proof)]
+def _worse(calibration):
+    return [Reason(WARNING, f'{sensor}: {line}', "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
+            for sensor, entry in calibration.proof.items() for line in worse_regimes(entry)]
 
 
 def _adopted(calibration):

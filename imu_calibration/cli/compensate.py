@@ -21,8 +21,7 @@ def add_arguments(parser: ArgumentParser) -> None:
                         help='place of the sensor in the target frame, m')
     parser.add_argument('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
                         help='roll, pitch, yaw of the sensor in the target frame, rad')
-    parser.add_argument('--anyway', action='store_true', help='also with a calibration whose verdict is bad or whose proof failed; '
-                        'without it a sensor of which that is so is left as it comes, where the other one is shown to be helped')
+    parser.add_argument('--anyway', action='store_true', help='also correct a sensor whose decision is harms')
     parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
     parser.add_argument('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     add_topic_arguments(parser)

@@ -23,8 +23,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
     parser.add_argument('--output', metavar='FILE', help='the file to write')
     parser.add_argument('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
-    parser.add_argument('--anyway', action='store_true', help='also the numbers of a sensor whose verdict is bad or whose proof failed; '
-                        'without it they are those of a data sheet, where the other sensor is shown to be helped')
+    parser.add_argument('--anyway', action='store_true', 
+                        help='also the numbers of a sensor whose decision is harms; without it they are nominal')
     add_stand_arguments(parser, 'what says how the recording moved; without it: its own readings')
     add_topic_arguments(parser)
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imu_calibration import files
+from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.calibration.fleet import FleetStep, Spread, UnitResult, fleet_exit_code, summarise
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.reasons import BAD, GOOD, WEAK
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
@@ -75,10 +75,10 @@ def parameters_csv(spreads: Sequence[Spread]) -> str:
 
 
 def units_csv(results: Sequence[UnitResult]) -> str:
-    """Return one row per unit: verdict, those of the sensors, exit code, why refused, samples lost, each parameter with its sd, SI."""
+    """Return one row per unit: decision, those of the sensors, exit code, why refused, samples lost, each parameter with its sd, SI."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
     headings = [heading for name in names for heading in (name, f'{name}.sd')]
-    rows: list[list] = [['name', 'verdict', *SENSORS, 'exit_code', 'error', 'dropped', *headings]]
+    rows: list[list] = [['name', 'decision', *SENSORS, 'exit_code', 'error', 'dropped', *headings]]
     for result in results:
         known, dropped = {}, ''
         if result.calibration is not None:
@@ -130,7 +130,7 @@ def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder:
 def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:
     """Return the summary as one page."""
     verdicts = [result.verdict for result in results]
-    word = GOOD if set(verdicts) == {GOOD} else WEAK if set(verdicts) <= {GOOD, WEAK} else BAD
-    headline = f'{verdicts.count(GOOD)} of {len(results)} units are good'
+    word = HELPS if set(verdicts) == {HELPS} else UNPROVEN if set(verdicts) <= {HELPS, UNPROVEN} else HARMS
+    headline = f'the calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
     return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=COLUMNS,
                   rows=[shown(spread) for spread in spreads])

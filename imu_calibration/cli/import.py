@@ -21,9 +21,10 @@ def run(options: Namespace) -> int:
     """Read, write, and say what is not known."""
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
     held = [name for name, status in found.requested.items() if status == HELD]
-    print(f'verdict: {found.verdict}')
-    for line in found.verdict_reasons:
-        print(f'  {line}')
+    for sensor, word in found.decisions.items():
+        print(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))
+    for line in found.notes:
+        print(line)
     if held:
         print(f'not in the file, held at the prior: {", ".join(held)}')
     print(f'written: {options.output}')

@@ -44,7 +44,7 @@ def show_findings(out: Any, findings: tuple[CheckFinding, ...], hints: dict[str,
 
 
 def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
-    """Print the parameters of a `Calibrated`, the verdict and where the files are."""
+    """Print the parameters of a `Calibrated`, the decisions and where the files are."""
     from rich.table import Table
     out, table = console(), Table(title=None, box=None, pad_edge=False)
     for heading in HEADINGS:
@@ -52,8 +52,7 @@ def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, 
     for row in parameter_rows(found.calibration):
         table.add_row(*row)
     out.print(table)
-    out.print(f'verdict: {found.verdict.text}')
     for line in summary(found.result, hints)[1]:
-        out.print('  ' + line, soft_wrap=True)
+        out.print(line, soft_wrap=True)
     files = 'calibration.yaml' + (' and report.html' if report else '')
     out.print(f'written: {files} in {folder}', soft_wrap=True)

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.compensation.fitted import FittedErrors
-from imu_calibration.compensation.weak_values import applied_values
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
@@ -95,9 +94,9 @@ def invertible(model: SensorModel) -> SensorModel:
 
 
 def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarray]:
-    """Return (model, values) of the part of a calibration that compensation inverts, weak values as far as they help."""
-    model, applied = invertible(calibration.model), applied_values(calibration)
-    values = np.concatenate([applied[calibration.model.slices[e.key]] for e in model.effects])
+    """Return (model, values) of the part of a calibration that compensation applies."""
+    model = invertible(calibration.model)
+    values = np.concatenate([calibration.values[calibration.model.slices[e.key]] for e in model.effects])
     return model, values
 
 

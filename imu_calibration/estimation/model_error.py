@@ -14,6 +14,7 @@ import numpy as np
 from imu_calibration.chances import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -27,7 +28,7 @@ SLOW_WAVES = 3
 CHANCE = 0.01
 """Chance of a drift for each sensor, and of misfit for each, in a recording without."""
 UNSEEN = 1.5
-"""Misfit in excess of noise is taken larger by this factor: what repeats in every block shows in none."""
+"""Factor on the variance of misfit in excess of noise: misfit that is the same in every block does not scatter between blocks."""
 NO_BIAS = 30.0
 """Biases wander with longer correlation times than this, s."""
 SEEN = 1e-6
@@ -40,16 +41,15 @@ class ModelError:
 
     factor: np.ndarray
     """Factor on the standard deviations that noise alone gives, at least 1, shape (n_params,)."""
-    added_variance: np.ndarray
-    """Variance on top, of parameters that drift and of biases that go with the attitude, shape (n_params,)."""
+    drift_variance: np.ndarray
+    """Variance to add for parameters that drift, shape (n_params,)."""
+    scatter_variance: np.ndarray
+    """Variance to add for a bias that depends on the attitude, shape (n_params,)."""
 
-    def added(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance that noise alone gives, grown by what the model misses."""
-        return covariance * np.outer(self.factor, self.factor) + np.diag(self.added_variance)
-
-    def without(self, covariance: np.ndarray) -> np.ndarray:
-        """Return what noise alone gives, from a covariance that has grown."""
-        return (covariance - np.diag(self.added_variance)) / np.outer(self.factor, self.factor)
+    def terms(self, covariance: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the terms (`covariance_terms`) to add to the covariance from noise and fixed parameters."""
+        scaled = covariance * (np.outer(self.factor, self.factor) - 1.0)
+        return {MODEL_ERROR: scaled + np.diag(self.scatter_variance), DRIFT: np.diag(self.drift_variance)}
 
 
 def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray) -> ModelError:
@@ -68,13 +68,13 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
 
     """
     if len(system.accumulator.blocks) < LEAST_BLOCKS or not free.any():
-        return ModelError(np.ones(len(values)), np.zeros(len(values)))
+        return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
     model = system.model
     groups = {sensor: [model.slices[e.key] for e in model.effects if e.sensor == sensor] for sensor in {e.sensor for e in model.effects}}
     found, misfits = errors_of_waves(waves, len(values), groups=groups)
     if 'accelerometer' in misfits:   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
-        found.added_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN**2 * _scatter_of_means(noises['accelerometer'])
+        found.scatter_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN * _scatter_of_means(noises['accelerometer'])
     return found
 
 
@@ -106,7 +106,7 @@ def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[
             misfits.add(sensor)
             for group in shown:
                 factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
-    return ModelError(factor, more), misfits
+    return ModelError(factor, more, np.zeros(size)), misfits
 
 
 def fisher(p_values: list[float]) -> float:

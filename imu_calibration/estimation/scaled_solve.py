@@ -69,9 +69,10 @@ def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.n
     return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)
 
 
-def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *, prior_sd: np.ndarray) -> np.ndarray:
+def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *,
+                         prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the covariance of all parameters where some are held at their prior, which enters everybody else's.
+    Return (covariance of the free parameters, covariance due to those fixed at their prior), both shape (n, n); their sum is the total.
 
     Parameters
     ----------
@@ -86,6 +87,6 @@ def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *
     influence[held] = np.eye(int(held.sum()))
     if held.any() and free.any():
         influence[free] = -scaled_lstsq(rows[:, free], rows[:, held])
-    total = influence @ np.diag(prior_sd[held]**2) @ influence.T
-    total[np.ix_(free, free)] += inverse_gram(rows[:, free])
-    return total
+    own = np.zeros((len(prior_sd),) * 2)
+    own[np.ix_(free, free)] = inverse_gram(rows[:, free])
+    return own, influence @ np.diag(prior_sd[held]**2) @ influence.T

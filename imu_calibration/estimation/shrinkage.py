@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_calibration.estimation.covariance_terms import of_fit
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 
@@ -27,7 +28,7 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     if solution.model_error is None:
         return solution
     values, prior = solution.values.copy(), make_prior(solution.model).mean
-    covariance = solution.model_error.without(solution.covariance)
+    covariance = of_fit(solution.terms)
     for part in parts:
         at = np.arange(part.start, part.stop)[~solution.held[part]]
         if not len(at):

@@ -1,10 +1,12 @@
 """What a solve hands back: parameters, covariance, noise, quality of the fit."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.covariance_terms import Terms, total
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.noise_model import NoiseModel
 
@@ -17,10 +19,10 @@ class Solution:
     """The effects, linearised where the columns were taken."""
     values: np.ndarray
     """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
-    covariance: np.ndarray
-    """Their covariance, the priors of held parameters included, shape (n_params, n_params)."""
+    terms: Terms
+    """Their covariance as named terms (`covariance_terms`), each of shape (n_params, n_params)."""
     held: np.ndarray
-    """True where the recording says next to nothing and the prior stands, shape (n_params,)."""
+    """True where a parameter is fixed at its prior, shape (n_params,)."""
     noise: dict[str, NoiseModel]
     """Sensor -> its noise."""
     chi2_per_dof: dict
@@ -35,10 +37,13 @@ class Solution:
     """
 
     model_error: ModelError | None = None
-    """What the covariance has grown by, beyond what noise gives."""
+    """Allowances for misfit and drift in the covariance."""
 
     not_believed: dict[str, float] = field(default_factory=dict)
     """Held parameter -> the value that it would have had, beyond what is known of any sensor and within what misfit can feign."""
+
+    replaced: tuple[str, ...] = ()
+    """Held parameters that the recording determines weakly, replaced by their prior (`covariance_terms.replace_weak`)."""
 
     def at(self, values: np.ndarray) -> 'Solution':
         """Return the same with other values, shape (n_params,)."""
@@ -48,6 +53,11 @@ class Solution:
     def param_names(self) -> list[str]:
         """Names in the order of `values`."""
         return self.model.param_names
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the values, the sum of its terms, shape (n_params, n_params)."""
+        return total(self.terms)
 
     @property
     def sd(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.contradicted import contradicted
+from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
@@ -83,16 +84,17 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         if held.any():
             values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
         data = system.jacobian(values, factors)
-        covariance = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
-        strange = unbelievable(system, values, sd=np.sqrt(np.diag(covariance)), noises=noises, free=free & ~held)
+        own, of_held = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
+        strange = unbelievable(system, values, sd=np.sqrt(np.diag(own + of_held)), noises=noises, free=free & ~held)
         if not allow_holding or not strange.any() or (held | strange | ~free).all():
             break
         not_believed |= {name: float(value) for name, value, flag in zip(model.param_names, values, strange) if flag}
         held |= strange
     error = model_error(system, values, noises, free=free & ~held)
-    covariance = error.added(covariance)
+    moving = system.bias_information(values, noises)
+    terms = {NOISE: own - own @ moving @ own, BIAS_PROCESS: own @ moving @ own, HELD: of_held} | error.terms(own + of_held)
     chi2, rms = _fit_quality(system, values, noises)
-    return Solution(model, values, covariance, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
+    return Solution(model, values, terms, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
                     not_believed)
 
 

@@ -88,8 +88,27 @@ class WeightedSystem:
 
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
+        return self._whitening(noise)(rows)
+
+    def _whitening(self, noise):
         variance = self.mean_variance(noise) + noise.offset_sd**2
-        return Whitening(variance, self.times, self.sessions, processes=noise.bias_processes, session_variance=noise.session_variance)(rows)
+        return Whitening(variance, self.times, self.sessions, processes=noise.bias_processes, session_variance=noise.session_variance)
+
+    def bias_information(self, values: np.ndarray, noises: dict[str, NoiseModel]) -> np.ndarray:
+        """
+        Return ``A' V^-1 B V^-1 A``, shape (n_params, n_params), over the window means.
+
+        A is the design at `values`, V the covariance of the means, and B its part due to offsets of windows, bias processes and the bias of
+        each recording. With C the covariance of the estimate, ``C (A' V^-1 B V^-1 A) C`` is the part of C due to them.
+        """
+        total = np.zeros((len(values),) * 2)
+        for sensor in SENSORS:
+            slope, whitening = coefficient_jacobian(self.model, sensor, values), self._whitening(noises[sensor])
+            design = np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope)
+            white, weighed = whitening(design), whitening.weigh(design)
+            apart = weighed * self.mean_variance(noises[sensor], beside_bias=False)[:, :, None]
+            total += np.einsum('kap,kaq->pq', white, white) - np.einsum('kap,kaq->pq', weighed, apart)
+        return total
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
         """Return the whitened mean rows ``[columns | output]`` of each axis, shape (n_windows, 3, p + 1)."""

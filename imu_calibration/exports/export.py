@@ -9,7 +9,7 @@ import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
-from imu_calibration.calibration.trust import Usable, caveats, objections, usable
+from imu_calibration.calibration.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.errors import InputError
 from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
@@ -50,7 +50,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     Return the file of a target.
 
     A sensor that compensation would leave as it comes is left so here, too: its numbers are those of a data sheet. A target that holds the
-    whole document gets its verdicts with it.
+    whole document includes its decisions.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     motion : TrialMotion, optional
         Where the loss is measured; default `motion.standard_motion`.
     anyway : bool
-        Also the numbers of a sensor whose verdict is bad or whose proof failed.
+        Also the numbers of a sensor whose decision is `harms`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
         When nobody should be corrected with the calibration.
 
     """
-    used = Usable(calibration) if anyway or target.whole or target.only_noise else usable(calibration)
+    used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
     calibration = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it')
@@ -119,8 +119,8 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
 
 
 def _trust_lines(used: Usable) -> list[str]:
-    """Say what speaks against the calibration, and what should be known about it."""
-    return [f'of the calibration: {line}' for line in used.lines or objections(used.calibration) or caveats(used.calibration)]
+    """Return the decisions other than `helps`, and the parameters that are not determined."""
+    return [f'of the calibration: {line}' for line in (*used.lines, *caveats(used.calibration))]
 
 
 def _walk_lines(noise: Noise) -> list[str]:

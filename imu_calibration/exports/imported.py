@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 import imu_calibration
+from imu_calibration.calibration.decision import UNPROVEN
 from imu_calibration.calibration.document import UNKNOWN, Calibration, from_mapping
 from imu_calibration.calibration.document_checks import check_numbers
-from imu_calibration.calibration.reasons import Judgement
 from imu_calibration.calibration.status import HELD, WEAK
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
@@ -23,7 +23,7 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
 
     Values are those of the file; where it says how its frame stands against the sensor's, as files of an export do, they are turned back.
     Standard deviations are those of the priors, since the file has none: a value that stands in the file is
-    weak, what cannot stand there is held at its prior. The verdict is weak, and there is no proof.
+    weak, what cannot stand there is held at its prior. Without a proof each sensor is unproven.
 
     Parameters
     ----------
@@ -66,15 +66,15 @@ def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any,
             known = np.eye(3).ravel() > 0 if holding.own_axis else np.full(effect.size, True)
             status[part] = np.where(known, WEAK, HELD)
     name = getattr(path, 'name', str(path))
-    reasons = (f'imported from {target.title} ({name}), which says no uncertainties and was not proven on a recording',
-               "next: see what it does to a recording: 'imu_calibration check'")
+    reason = f'imported from {target.title} ({name}) without uncertainties, its error was not measured on a recording'
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
     conditions = {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
     gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN, 'axes': axes}
     provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN}
     return check_numbers(Calibration(
         model, values, np.diag(sd**2), tuple(status), frame_id, gauge, statistics=statistics, conditions=conditions, provenance=provenance,
-        verdict=Judgement.WEAK.value, verdict_reasons=reasons))
+        decision=dict.fromkeys(SENSORS, str(UNPROVEN)), decision_reasons=dict.fromkeys(SENSORS, reason),
+        notes=("next: measure its error on a recording: 'imu_calibration check'",)))
 
 
 def _names(sensor: str, holds: tuple[Holding, ...], imu: AffineImu):

@@ -39,8 +39,8 @@ class Adopted:
 
     @property
     def caveats(self) -> list[str]:
-        """What should be known of it: which sensor is left as it comes, and what speaks against it where somebody insisted."""
-        return self.used.lines or trust.objections(self.calibration) + trust.caveats(self.calibration)
+        """Sensors that are not corrected or corrected with caution, and parameters that are not determined."""
+        return [*self.used.lines, *trust.caveats(self.calibration)]
 
     def line(self) -> str:
         """Return in one line what is in force."""
@@ -48,7 +48,7 @@ class Adopted:
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
         """Return whether a person should hear of this after `other`: it came from elsewhere, or says something else."""
-        if other is None or any(getattr(self.calibration, name) != getattr(other.calibration, name) for name in ('verdict', 'verdicts')):
+        if other is None or self.calibration.decisions != other.calibration.decisions:
             return True
         if self.source != other.source or self.used.refused.keys() != other.used.refused.keys():
             return True
@@ -69,7 +69,7 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
     """
     try:
         calibration = calibration_from_text(text)
-        used = trust.Usable(calibration) if settings.anyway else trust.usable(calibration)
+        used = trust.usable(calibration, anyway=settings.anyway, live=True)
         _require_same_frame(calibration, before)
         return Adopted(calibration, used, _prepared(used.calibration, settings, frames, before), version_of(text), source)
     except ImuCalibrationError:

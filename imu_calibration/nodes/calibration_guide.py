@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 
+from imu_calibration.calibration.decision import HARMS
 from imu_calibration.diagnosis import live as diagnosis
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.complaints import INFO, WARNING
@@ -59,17 +60,18 @@ class CalibrationGuide:
             self._stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        if state.verdict == self._verdict:
+        known = f'{state.judged}, every parameter is determined' if state.complete else state.judged
+        if known == self._verdict:
             return
-        self._verdict = state.verdict
-        if state.verdict == 'good':
-            yield INFO, f'verdict: good; save it with `{self._save_command}`'
-        elif state.verdict:
-            yield WARNING if state.verdict == 'bad' else INFO, f'verdict: {state.verdict}: {state.lines[0] if state.lines else ""}'
+        self._verdict = known
+        if state.complete:
+            yield INFO, f'{known}; save it with `{self._save_command}`'
+        elif known:
+            yield WARNING if state.verdict == HARMS else INFO, '; '.join([known, *state.lines[:2]])
 
     def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         advice = advice_of(state)
-        if advice and advice != self._advice and state.verdict != 'good' and self._clock() - self._advised >= PATIENCE:
+        if advice and advice != self._advice and not state.complete and self._clock() - self._advised >= PATIENCE:
             self._advice, self._advised = advice, self._clock()
             yield INFO, f'next: {advice}'
 

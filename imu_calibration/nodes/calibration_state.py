@@ -18,7 +18,7 @@ class WorkerState:
     solution: int = 0
     """Number of the last solution; 0 before the first."""
     verdict: str = ''
-    """'good', 'weak' or 'bad'; '' before the first solution."""
+    """The more cautious decision; '' before the first solution."""
     lines: tuple = ()
     """Reasons and next steps."""
     trouble: str = ''
@@ -36,4 +36,6 @@ class WorkerState:
     place: str = ''
     """Where the calibration is saved."""
     judged: str = ''
-    """The verdict in words, sensor by sensor where they differ."""
+    """The decisions in one phrase."""
+    complete: bool = False
+    """Whether each sensor helps and every requested parameter is determined."""

@@ -10,7 +10,7 @@ _STREAM_LEVELS = {'good': OK, 'trouble': WARN, 'silent': ERROR}
 _GROUP_LEVELS = {'determined': OK, 'weak': WARN, 'held': WARN, 'waiting': OK}
 _HAND_LEVELS = {'waiting': OK, 'weak': WARN, 'determined': OK}
 _DIAGNOSIS_LEVELS = {'nothing found': OK, 'off': OK, 'waiting': OK, 'found': WARN, 'unexplained': WARN, 'failed': ERROR}
-_VERDICT_LEVELS = {'': OK, 'good': OK, 'weak': WARN, 'bad': ERROR}
+_DECISION_LEVELS = {'': OK, 'helps': OK, 'unproven': WARN, 'harms': ERROR}
 
 
 def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
@@ -20,7 +20,8 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
         level = max(_STREAM_LEVELS[state.streams.word], WARN if stream_faults else OK)
         found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
     parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
-    level = ERROR if state.faults else max(_VERDICT_LEVELS[state.verdict], WARN if state.trouble and state.verdict else OK)
+    incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
+    level = ERROR if state.faults else max(_DECISION_LEVELS[state.verdict], incomplete)
     found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
     if state.session is not None:
         found.append(make_status(_HAND_LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))

@@ -274,6 +274,7 @@ class CalibrationWorker(threading.Thread):
         self._watch.note_stamping(self.live.stamping)
         result = self.live.result
         verdict, lines = ('', []) if result is None else summary(result, self.hints)
+        judged, complete = ('', False) if result is None else (result.verdict.text, result.verdict.complete)
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
                   f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
@@ -285,7 +286,7 @@ class CalibrationWorker(threading.Thread):
         self.state = WorkerState(groups, self._watch.state(self._looked), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
                                  self.live.status(self.hints), diagnosis,
-                                 str(self.place.calibration), '' if result is None else result.verdict.text)
+                                 str(self.place.calibration), judged, complete)
 
     def _cover(self) -> None:
         """Make the picture anew when there is something new in it."""

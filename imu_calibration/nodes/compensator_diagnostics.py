@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration import trust
-from imu_calibration.calibration.shown import verdict_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
@@ -161,9 +160,8 @@ class CompensatorDiagnostics:
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
-        values |= {'verdict': verdict_text(calibration.verdict, calibration.verdicts)
-                   or 'none', 'left as they come': ', '.join(adopted.used.refused) or 'none',
-                   'standing': trust.standing(calibration), 'date': calibration.conditions.get('date', ''),
+        values |= {'decision': trust.standing(calibration), 'not corrected': ', '.join(adopted.used.refused) or 'none',
+                   'date': calibration.conditions.get('date', ''),
                    'parameters': len(calibration.status), 'not determined': sum(status != DETERMINED for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}
         line, derivative = compensation.slope.line, compensation.slope.derivative

@@ -25,8 +25,8 @@ class CompensatorSettings:
     adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
                          'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
                          symptom='a calibration that comes on the topic is not taken, or displaces the file', live=True)
-    anyway: bool = setting(False, '', 'take calibrations whose verdict is bad or whose proof failed, too',
-                           symptom='the correction may make the readings worse', live=True)
+    anyway: bool = setting(False, '', 'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
+                           symptom='the correction may increase the error of the readings', live=True)
     passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
                                 symptom='uncorrected messages on the corrected topic', live=True)
     target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, '

@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration import files
+from imu_calibration.calibration.decision import BY_DEFINITION
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.named_models import NAMED_MODELS
@@ -162,7 +163,8 @@ class SimulatorNode(Node):
 
     def _publish_truth(self, model, values):
         truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), self.settings.frame_id,
-                            {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': self.settings.seed}})
+                            {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': self.settings.seed}},
+                            **BY_DEFINITION)
         self._truth = self.create_publisher(String, '~/truth', latched_qos())
         self._truth.publish(String(data=calibration_to_text(truth)))
 

@@ -18,10 +18,13 @@ LOWEST = 1e-5
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
     """Return the figure, the rows (largest component of each effect) and what was assumed."""
     budget = result.error_budget()
+    terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
+             if np.any(variance > 0)}
     return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget),
                            label='Error budget of each effect by cause, in tolerances'),
             'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],
-            'rows': _rows(result, budget)}
+            'rows': _rows(result, list(budget.causes.values()), budget.total), 'terms': list(terms),
+            'term_rows': _rows(result, list(terms.values()), result.calibration.sd)}
 
 
 def _effects(result):
@@ -29,11 +32,12 @@ def _effects(result):
     return [(e, model.slices[e.key]) for e in model.effects if np.any(result.calibration.sd[model.slices[e.key]] > 0)]
 
 
-def _rows(result, budget):
+def _rows(result, causes, total):
+    """Return a row per effect: the sd of its largest component by cause, and the total."""
     rows = []
     for effect, part in _effects(result):
         factor, unit = for_people(effect.unit_of(0))
-        parts = [*budget.causes.values(), budget.total]
+        parts = [*causes, total]
         rows.append({'name': f'{effect.sensor} {effect.name.replace("_", " ")}', 'unit': '' if unit == '1' else unit,
                      'cells': [text(float(p[part].max()) * factor, 2) if p[part].max() > 1e-15 else '0' for p in parts],
                      'tolerance': text(result.tolerances[part][0] * factor, 2)})

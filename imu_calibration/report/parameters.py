@@ -5,13 +5,16 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.status import DETERMINED, HELD
+from imu_calibration.calibration.status import DETERMINED, HELD, REPLACEMENT
 from imu_calibration.diagnosis.workflow import DiagnosisResult
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
 USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
        'none': 'belongs to the table or the session, not removed'}
+
+UNSEEN = 'fixed at its prior: its sd would exceed half of the prior sd'
+REPLACED = 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error'
 
 
 def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[str, Any]]:
@@ -55,7 +58,7 @@ def _why(calibration, index, share, needs):
     motion = needs.get(name, '')
     wanted = f'; needs: {motion}' if motion else ''
     if status == HELD:
-        return 'the recording says next to nothing: value and sd are the prior’s' + wanted
+        return (REPLACED if calibration.held_reason.get(name) == REPLACEMENT else UNSEEN) + wanted
     return f'estimated, but its sd is {text(share, 2)} times the tolerance' + wanted
 
 

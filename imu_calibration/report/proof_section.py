@@ -1,7 +1,7 @@
 """The proof in numbers: errors on data that took no part, by sensor and by what the IMU does."""
 
+from imu_calibration.calibration.decision import harmed
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.proof_words import harmed
 from imu_calibration.units import for_people, significant
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.band_misfit import WEIGHTLESS
+from imu_calibration.estimation.covariance_terms import NOISE
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
@@ -60,6 +61,7 @@ def _with_limit(solution, limit):
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
         matrix[place, place] = corner
         return matrix
+    terms = {name: grown(term, limit.level_sd**2 if name == NOISE else 0.0) for name, term in solution.terms.items()}
     return replace(solution, model=model, values=np.insert(solution.values, place, limit.level),
-                   held=np.insert(solution.held, place, False), covariance=grown(solution.covariance, limit.level_sd**2),
+                   held=np.insert(solution.held, place, False), terms=terms,
                    information=grown(solution.information, limit.level_sd**-2))

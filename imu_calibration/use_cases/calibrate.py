@@ -39,12 +39,12 @@ class Calibrated:
 
     @property
     def verdict(self) -> Verdict:
-        """'good', 'weak' or 'bad' with reasons and next steps."""
+        """The decision per sensor with warnings, notes and next steps."""
         return self.result.verdict
 
     @property
     def exit_code(self) -> int:
-        """0 when every requested parameter is determined, nothing was lost and the verdict is not bad, else 3."""
+        """0 when each sensor helps, every requested parameter is determined and nothing was lost, else 3."""
         return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:
@@ -69,7 +69,7 @@ class Calibrated:
         return repr(self.calibration)
 
     def __str__(self):
-        return '\n'.join([str(self.calibration), f'verdict: {self.verdict.text}', *(f'  {line}' for line in summary(self.result)[1])])
+        return '\n'.join([str(self.calibration), *(f'  {line}' for line in summary(self.result)[1])])
 
     def _repr_html_(self):
         from markupsafe import escape

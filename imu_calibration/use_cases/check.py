@@ -30,17 +30,17 @@ class Checked:
 
     @property
     def helps(self) -> bool:
-        """Whether the recording shows that the calibration helps, and harms in no motion."""
+        """Whether the decision on each sensor is `helps`."""
         return self.result.helps
 
     @property
     def exit_code(self) -> int:
-        """0 it helps, 3 it does not or cannot be told."""
+        """0 where the decision on each sensor is `helps`, else 3."""
         return 0 if self.helps else 3
 
     def __str__(self):
         helped = ', '.join(self.result.helped)
-        answer = 'it helps' if self.helps else 'it is not shown to help' + (f' but for the {helped}' if helped else '')
+        answer = 'the calibration helps' if self.helps else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
         return '\n'.join([answer, *(f'  {line}' for line in (*self.result.lines, *self.notes))])
 
     __repr__ = __str__

@@ -9,7 +9,7 @@ from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.measured_noise import with_measured_noise
-from imu_calibration.calibration.trust import Usable, caveats, objections, usable
+from imu_calibration.calibration.trust import caveats, usable
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, SampleBlock
@@ -33,12 +33,14 @@ class Compensated:
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
     refused: dict[str, str] = field(default_factory=dict)
-    """Sensor that was left as it came -> why."""
+    """Sensor that was not corrected -> why."""
+    cautions: tuple[str, ...] = ()
+    """A line for each sensor that was corrected although the decision on it is not `helps`."""
 
     @property
     def exit_code(self) -> int:
-        """0 all is corrected, 3 part of it could not be read, or one sensor was left as it came."""
-        return 3 if self.lost or self.refused else 0
+        """0 all is corrected, 3 part of it could not be read, or the decision on a sensor is not `helps`."""
+        return 3 if self.lost or self.refused or self.cautions else 0
 
     def __repr__(self):
         return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])
@@ -68,8 +70,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     correct_stamps : bool
         Move the stamps back by the calibration's time_offset.
     anyway : bool
-        Also with a calibration whose verdict is bad or whose proof failed. Without it a sensor of which that is so is left as it comes,
-        where the other one is shown to be helped.
+        Also correct a sensor whose decision is `harms`. One whose decision is `unproven` is always corrected, with a warning.
     noise : NoiseFigures or path-like, optional
         noise.yaml of this IMU: the covariances of the corrected readings follow from it where the messages bring none.
     imu_topic, temperature_topic : str, optional
@@ -83,7 +84,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
 
     """
     calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
-    used = Usable(calibration) if anyway else usable(calibration)
+    used = usable(calibration, anyway=anyway)
     calibration, figures = used.calibration, noise_of(noise)
     calibration = calibration if figures is None else with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
@@ -118,8 +119,8 @@ def _in_memory(recording, calibration, transfer, *, late, used):
 
 
 def _outcome(imu, stream, lost, used):
-    against = used.lines or objections(stream.calibration) + caveats(stream.calibration)
-    return Compensated(imu, stream.count, against + stream.warnings(), lost, dict(used.refused))
+    against = [*used.lines, *caveats(stream.calibration)]
+    return Compensated(imu, stream.count, against + stream.warnings(), lost, dict(used.refused), used.cautions)
 
 
 def _corrected(imu, corrected, transfer, late):

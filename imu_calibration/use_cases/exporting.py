@@ -41,8 +41,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     topics : Topics
         Of the bag.
     anyway : bool
-        Also the numbers of a sensor whose verdict is bad or whose proof failed; without it they are those of a data sheet, where the other
-        sensor is shown to be helped.
+        Also the numbers of a sensor whose decision is `harms`; without it they are nominal.
 
     Raises
     ------

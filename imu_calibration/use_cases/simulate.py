@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 
 from imu_calibration import documents, files
+from imu_calibration.calibration.decision import BY_DEFINITION
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.catalogue import Catalogue
@@ -104,7 +105,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     samples = SampleBlock(*run_session(model, values, mover, profile=motion, options=options, seed=seed))
     truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), options.frame_id,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
-                        provenance={'simulated': {'seed': seed, 'profile': profile}})
+                        provenance={'simulated': {'seed': seed, 'profile': profile}}, **BY_DEFINITION)
     return Simulated(samples, mover, truth, motion.duration)
 
 

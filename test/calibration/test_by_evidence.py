@@ -182,7 +182,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     found = investigated(late)
     solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
     question = found.named[0]
-    assert stands_out(solution, question) and not stands_out(replace(solution, covariance=1e9 * solution.covariance), question)
+    assert stands_out(solution, question) and not stands_out(replace(solution, terms={'noise': 1e9 * solution.covariance}), question)
     part = solution.model.slices[question.sensor, question.name]
     doubled = SimpleNamespace(model=SimpleNamespace(slices={(question.sensor, question.name): slice(0, 2)}), held=np.zeros(2, bool),
                               values=np.full(2, solution.values[part.start]), covariance=np.full((2, 2), 1e-12))

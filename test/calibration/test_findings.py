@@ -49,7 +49,7 @@ def solution():
     """Return the solution of a model with both findings."""
     model = SensorModel(accelerometer=('bias', 'matrix', FIRST.name, SECOND.name))
     size = len(model.param_names)
-    return Solution(model, np.linspace(0.1, 1.0, size), 1e-4 * np.eye(size), np.zeros(size, bool), {}, {}, np.eye(size), {})
+    return Solution(model, np.linspace(0.1, 1.0, size), {'noise': 1e-4 * np.eye(size)}, np.zeros(size, bool), {}, {}, np.eye(size), {})
 
 
 def test_an_effect_as_good_as_two_findings_belongs_to_the_first():

@@ -83,7 +83,7 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
     assert_same(found, expected.calibration)
     for sensor, entry in expected.calibration.proof.items():
         assert found.proof[sensor]['after'] == pytest.approx(entry['after'], rel=1e-9)
-    assert any('added to the model' in line and 'accel_quadratic (' in line for line in found.verdict_reasons)
+    assert any('added to the model' in line and 'accel_quadratic (' in line for line in found.notes)
     again = station.question().answer()   # about a session whose model is wide already
     assert again.demand.added == station.answer.demand.added
     assert live.adopt(again.demand)
@@ -141,7 +141,7 @@ def test_what_cannot_join_is_said_and_widens(hidden):
     assert station.live.adopt(answer.demand)
     after = station.live.solve(pending=True).calibration
     assert after.param_names == before.param_names and (after.sd >= before.sd).all() and np.max(after.sd / before.sd) > 1.5
-    lines = [line for line in after.verdict_reasons if 'accel_quadratic' in line or 'offline' in line]
+    lines = [line for line in after.notes if 'accel_quadratic' in line or 'offline' in line]
     assert len(lines) == 2 and 'cannot join the model' in lines[0] and lines[1] == 'next: calibrate the recording offline'
 
 

@@ -76,7 +76,7 @@ def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):
         connection = writer.add_connection('/imu/data_raw', imu.__msgtype__, typestore=store)
         message = imu(header(0, stamp(1, 0), 'imu_link'), quaternion(0.0, 0.0, 0.0, 1.0), cov, vector(0.0, 0.0, 0.0), cov, vector(0.0, 0.0, 9.8), cov)
         writer.write(connection, 10**9, store.serialize_ros1(message, imu.__msgtype__))
-    calibration = random_calibration(1, verdict='good')
+    calibration = random_calibration(1)
     with pytest.raises(InputError, match='rosbags-convert'):
         compensate(tmp_path / 'old.bag', calibration, output=tmp_path / 'new', anyway=True)
 

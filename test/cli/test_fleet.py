@@ -67,12 +67,12 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     assert code == 3
     units = {row['name']: row for row in read_csv(output / 'units.csv')}
     assert list(units) == ['unit_a', 'unit_b', 'unit_c']
-    assert units['unit_c']['verdict'] == units['unit_c']['gyroscope'] == 'refused'
+    assert units['unit_c']['decision'] == units['unit_c']['gyroscope'] == 'refused'
     assert 'unit_c.mcap' in units['unit_c']['error']
     assert '\n' not in units['unit_c']['error']
     assert not (output / 'unit_c').exists()
     page = (output / 'summary.html').read_text()
-    assert 'unit_c' in page and ' units are good</p>' in page and '--accent' in page   # the style of all reports
+    assert 'unit_c' in page and ' of 3 units</p>' in page and '--accent' in page   # the style of all reports
     assert capsys.readouterr().err == ''
 
 
@@ -90,7 +90,7 @@ def test_each_unit_has_its_own_values(recordings, result):
 
 def test_the_summary_is_that_of_the_units(result):
     """Mean and spread of the printed table follow from the values of the units."""
-    units = [row for row in read_csv(result[1] / 'units.csv') if row['verdict'] != 'refused']
+    units = [row for row in read_csv(result[1] / 'units.csv') if row['decision'] != 'refused']
     summary = {row['parameter']: row for row in read_csv(result[1] / 'summary.csv')}
     values = np.array([float(row['gyroscope.matrix.zz']) for row in units])
     found = summary['gyroscope.matrix.zz']
@@ -101,11 +101,11 @@ def test_the_summary_is_that_of_the_units(result):
 
 def test_a_unit_has_the_word_of_each_sensor(result):
     known = read_calibration(result[1] / 'unit_a' / 'calibration.yaml')
-    unit = UnitResult('unit_d', replace(known, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}), 'bad')
+    unit = UnitResult('unit_d', replace(known, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}), 'harms')
     row = next(iter(csv.DictReader(units_csv([unit]).splitlines())))
-    assert (row['verdict'], row['accelerometer'], row['gyroscope']) == ('bad', 'bad', 'good')
+    assert (row['decision'], row['accelerometer'], row['gyroscope']) == ('harms', 'harms', 'helps')
     page = summary_html([unit], summarise([unit]))
-    assert 'bad (accelerometer bad, gyroscope good)' in page and '<span class="tag bad">' in page
+    assert 'accelerometer harms, gyroscope helps' in page and '<span class="tag harms">' in page
 
 
 @pytest.mark.live

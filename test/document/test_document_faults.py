@@ -32,7 +32,8 @@ def calibration():
     """A calibration with something in every part of its document."""
     made = random_calibration(
         3, ('accel_size_effect', 'accel_quadratic', 'accel_thermal_bias', 'accel_saturation'), ('gyro_g_sensitivity', 'gyro_thermal_scale'),
-        gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, verdict='weak', verdict_reasons=('a reason', 'next: a step'),
+        gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, decision={'accelerometer': 'helps', 'gyroscope': 'helps'},
+        decision_reasons={'accelerometer': 'a reason', 'gyroscope': 'another'}, notes=('a note', 'next: a step'),
         proof={'accelerometer': PROOF, 'gyroscope': PROOF | {'unit': 'rad/s'}}, provenance={'software': '1', 'bags': [{'name': 'a', 'sha256': 'b'}]},
         undetermined=({'parameters': {'accelerometer.bias.x': 0.5}, 'needs': 'a motion'},))
     values = made.values.copy()
@@ -79,7 +80,8 @@ KNOWN_TO_WORK = set()
 
 def use(found):
     """Do with a calibration all that a robot does; fails with any error and with any number that is not finite."""
-    against = trust.objections(found), trust.caveats(found), trust.standing(found), outside_conditions(found, np.ones((1, 3)), np.array([25.0]))
+    refused = list(trust.refused_sensors(found, live=True))
+    against = refused, trust.caveats(found), trust.standing(found), outside_conditions(found, np.ones((1, 3)), np.array([25.0]))
     assert '\n' not in ''.join(line for part in against for line in part)
     assert to_mapping(found)
     noise = [found.noise(sensor) for sensor in ('accelerometer', 'gyroscope')]
@@ -102,7 +104,7 @@ def use(found):
 def test_the_document_that_is_damaged_is_whole():
     found = from_mapping(GOOD)
     use(found)
-    assert to_mapping(found).keys() == GOOD.keys() and not trust.objections(found)
+    assert to_mapping(found).keys() == GOOD.keys() and not trust.refused_sensors(found, live=True)
 
 
 @pytest.mark.parametrize('part', sorted({path[:1] for path in PLACES}), ids=lambda path: path[0] if path else 'whole')

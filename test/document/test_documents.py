@@ -103,7 +103,7 @@ def test_the_document_has_the_published_layout():
     (lambda d: d['accelerometer']['bias'].update(value=['a', 'b', 'c']), 'misshapen'),
     (lambda d: d['gyroscope']['effects'].append('magic'), 'magic'),
     (lambda d: d['gyroscope'].update(effects=['bias']), 'matrix'),
-    (lambda d: d['gyroscope']['matrix'].update(value=[[1.0, 0.0, 0.0]] * 3), 'condition'),
+    (lambda d: [d[sensor]['matrix'].update(value=[[1.0, 0.0, 0.0]] * 3) for sensor in ('accelerometer', 'gyroscope')], 'condition'),
     (lambda d: d['covariance']['matrix'][0].__setitem__(0, -1.0), 'negative'),
     (lambda d: d['covariance']['names'].pop(), 'missing'),
 ))

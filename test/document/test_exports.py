@@ -394,7 +394,7 @@ def compare_values(found, calibration, target):
 def test_what_another_program_says_is_weak_unproven_and_of_unknown_certainty():
     calibration = held_by('kalibr', 8)
     found = back_and_forth('kalibr', calibration)
-    assert found.verdict == 'weak' and found.proof == {} and not found.uncertainty_known
+    assert set(found.decisions.values()) == {'unproven'} and found.proof == {} and not found.uncertainty_known
     assert dict(zip(found.param_names, found.status))['gyroscope.matrix.xy'] == 'weak'
     assert dict(zip(found.param_names, found.status))['gyroscope.bias.x'] == 'held'   # Kalibr writes none
     assert 'unknown' in calibration_to_text(found)
@@ -433,7 +433,7 @@ def test_the_verbs_write_whole_files_or_refuse_in_one_line(tmp_path, capsys):
 
 @pytest.mark.parametrize('name', ('json', 'mat'))
 def test_the_whole_document_comes_back_whole_and_always_as_the_same_bytes(name):
-    calibration = random_calibration(9, FURTHER['accelerometer'], FURTHER['gyroscope'], verdict='good')
+    calibration = random_calibration(9, FURTHER['accelerometer'], FURTHER['gyroscope'])
     content = export(calibration, find_target(name)).content
     found = import_file(find_target(name), content, 'file')
     assert calibration_to_text(found) == calibration_to_text(calibration)
@@ -511,9 +511,10 @@ def test_a_file_of_ours_brings_the_frame_back_and_none_where_there_was_none():
 
 
 def test_what_speaks_against_a_calibration_travels_along():
-    bad = random_calibration(3, (), verdict='bad', verdict_reasons=('the recording says nothing',))
-    assert 'its verdict is bad: the recording says nothing' in export(bad, find_target('px4'), anyway=True).content.decode()
-    with pytest.raises(DocumentError, match='the recording says nothing'):
+    bad = random_calibration(3, (), decision=dict.fromkeys(('accelerometer', 'gyroscope'), 'harms'),
+                             decision_reasons={'accelerometer': 'the error grows', 'gyroscope': 'the error grows'})
+    assert 'accelerometer harms: the error grows' in export(bad, find_target('px4'), anyway=True).content.decode()
+    with pytest.raises(DocumentError, match='the error grows'):
         export(bad, find_target('px4'))
-    assert export(bad, find_target('json')).exit_code == 0   # it brings its verdict
-    assert not any('of the calibration' in line for line in export(replace(bad, verdict='good'), find_target('px4')).lines)
+    assert export(bad, find_target('json')).exit_code == 0   # it includes the decisions
+    assert not any('of the calibration' in line for line in export(replace(bad, decision=dict.fromkeys(bad.decision, 'helps')), find_target('px4')).lines)

@@ -1,4 +1,4 @@
-"""No bad calibration is used as a good one: verdict and proof travel in the document, and who corrects looks at them."""
+"""The decision per sensor travels in the document, and whatever applies a calibration follows it."""
 
 from dataclasses import replace
 
@@ -7,88 +7,113 @@ import pytest
 
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.decision import HARMS, HELPS, NO_PROOF, UNPROVEN, decide, most_cautious, reason_of
+from imu_calibration.calibration.document import calibration_from_text, calibration_to_text, from_mapping, to_mapping
+from imu_calibration.calibration.reasons import HAND_AXES
 from imu_calibration.calibration.status import HELD
 from imu_calibration.cli.main import main
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
 from imu_calibration.samples import ImuSamples, SampleBlock
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
 
-PROOF = {'accelerometer': {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8},
-         'gyroscope': {'before': 0.02, 'after': 0.001, 'ci95': [0.03, 0.08], 'unit': 'rad/s', 'windows': 8}}
-GOOD = random_calibration(1, verdict='good', verdict_reasons=('all is well',), proof=PROOF)
+ENTRY = {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8}
+INTERVALS = {HELPS: [0.03, 0.08], UNPROVEN: [0.8, 1.1], HARMS: [1.2, 1.8]}
+PLAIN = random_calibration(1, decision={})
 
 
-def with_proof(**changes):
-    """A good calibration with a changed proof of its gyroscope."""
-    return replace(GOOD, proof=PROOF | {'gyroscope': PROOF['gyroscope'] | changes})
+def proven(accelerometer, gyroscope, **changes):
+    """Return a calibration with the proof for these decisions; None: no entry."""
+    words = {'accelerometer': accelerometer, 'gyroscope': gyroscope}
+    return replace(PLAIN, proof={sensor: ENTRY | {'ci95': INTERVALS[word]} for sensor, word in words.items() if word}, **changes)
 
 
-def test_verdict_and_proof_travel_in_the_document():
-    read = calibration_from_text(calibration_to_text(GOOD))
-    assert (read.verdict, read.verdict_reasons, read.proof) == ('good', ('all is well',), PROOF)
-    assert trust.objections(read) == trust.caveats(read) == []
-    assert trust.standing(read) == 'good, proven on held-out data'
+@pytest.mark.parametrize(('interval', 'word'), [([0.1, 0.999], HELPS), ([0.1, 1.0], UNPROVEN), ([1.0, 2.0], UNPROVEN), ([1.001, 2.0], HARMS)])
+def test_the_decision_follows_from_the_interval(interval, word):
+    assert decide(ENTRY | {'ci95': interval}) is word
+    assert decide(ENTRY | {'ci95': interval, 'windows': 0}) is UNPROVEN and decide(None) is UNPROVEN
+    assert ('likely cause' in reason_of(ENTRY | {'ci95': interval})) == (word is not HELPS) and reason_of(None) == NO_PROOF
+    assert most_cautious([HELPS, word]) is word
 
 
-@pytest.mark.parametrize(('calibration', 'words'), (
-    (replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',)), 'its verdict is bad: the residuals are large'),
-    (replace(GOOD, verdict='bad', verdict_reasons=()), 'its verdict is bad'),
-    (with_proof(after=0.03, ci95=[1.2, 1.8]), 'gyroscope error is 0.03 rad/s with it and 0.02 without'),
-    (with_proof(after=0.019, ci95=[0.8, 1.1]), 'that it helps is not shown'),
-    (with_proof(windows=0), 'on 0 windows'),
-    (replace(GOOD, values=1e3 * GOOD.values), 'more than ten times what is known'),
-), ids=('bad', 'bad without a reason', 'worse', 'not shown', 'nothing held out', 'implausible'))
-def test_what_speaks_against_a_calibration_is_said(calibration, words):
-    assert words in '; '.join(trust.objections(calibration))
-    assert trust.refused_sensors(calibration)
+def test_a_file_without_a_decision_derives_it_and_one_with_a_decision_cannot_hide_its_proof():
+    for words in ((HELPS, HARMS), (UNPROVEN, None)):
+        document = to_mapping(proven(*words))
+        assert 'decision' not in document
+        assert list(from_mapping(document).decisions.values()) == [word or UNPROVEN for word in words]
+        assert from_mapping(document | {'decision': {'gyroscope': 'helps'}}).decisions['gyroscope'] is (words[1] or HELPS)
+        assert from_mapping(document | {'decision': {'accelerometer': 'harms'}}).decisions['accelerometer'] is HARMS
+    with pytest.raises(DocumentError, match='decision.accelerometer'):
+        from_mapping(document | {'decision': {'accelerometer': 'good'}})
 
 
-def test_a_refusal_names_what_insists():
-    with pytest.raises(DocumentError, match='calibrate again') as refusal:
-        trust.usable(replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',)))
-    assert '--anyway' in refusal.value.told({'anyway': '--anyway'}) and '\n' not in str(refusal.value)
+CASES = [(first, second, anyway, live) for first in (HELPS, UNPROVEN, HARMS) for second in (HELPS, UNPROVEN, HARMS)
+         for anyway in (False, True) for live in (False, True)]
 
 
-def test_files_of_earlier_versions_stay_usable_and_say_so():
-    old = calibration_from_text(calibration_to_text(replace(GOOD, verdict='', verdict_reasons=(), proof={})))
-    assert trust.objections(old) == [] and 'carries no verdict' in trust.caveats(old)[0]
-    assert trust.standing(old) == 'no verdict, no proof on held-out data'
+@pytest.mark.parametrize(('first', 'second', 'anyway', 'live'), CASES)
+def test_what_is_applied(first, second, anyway, live):
+    """Offline unproven with a caution, harms with consent; live unproven with consent, harms never."""
+    applied = {HELPS: True, UNPROVEN: anyway or not live, HARMS: anyway and not live}
+    known = proven(first, second)
+    if not applied[first] and not applied[second]:
+        with pytest.raises(DocumentError) as refusal:
+            trust.usable(known, anyway=anyway, live=live)
+        assert (refusal.value.key == 'anyway') == (not live or UNPROVEN in (first, second)) and '\n' not in str(refusal.value)
+        return
+    found = trust.usable(known, anyway=anyway, live=live)
+    assert found.refused.keys() == {sensor for sensor, word in zip(SENSORS, (first, second), strict=True) if not applied[word]}
+    assert len(found.cautions) == sum(applied[word] and word is not HELPS for word in (first, second))
+    assert len(found.lines) == sum(word is not HELPS for word in (first, second))
+    assert (found.calibration is known) == (not found.refused)
 
 
-def test_a_verdict_on_both_is_one_on_each_where_nobody_judged_them_apart():
-    both = replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',))
-    assert all(trust.objections(both, sensor) == ['its verdict is bad: the residuals are large'] for sensor in ('accelerometer', 'gyroscope'))
+def test_by_hand_the_gyroscope_is_not_applied_without_the_accelerometer():
+    gauge = {'axes': HAND_AXES}
+    assert trust.usable(proven(HELPS, HARMS, gauge=gauge)).refused.keys() == {'gyroscope'}
+    with pytest.raises(DocumentError):
+        trust.usable(proven(HARMS, HELPS, gauge=gauge))
 
 
-def test_a_weak_calibration_says_what_is_missing():
-    weak = replace(GOOD, verdict='weak', status=(HELD,) * 2 + GOOD.status[2:])
-    assert trust.caveats(weak) == ['its verdict is weak: 2 of 33 parameters not determined (accelerometer.bias.x, accelerometer.bias.y)']
+def test_parameters_that_are_not_determined_are_named():
+    weak = replace(PLAIN, status=(HELD,) * 2 + PLAIN.status[2:])
+    assert trust.caveats(weak) == ['2 of 33 parameters not determined (accelerometer.bias.x, accelerometer.bias.y)']
+    assert trust.caveats(PLAIN) == []
 
 
-def rest(seconds=8.0):
-    """An IMU on a table that does nothing."""
-    from worlds.live_sessions import make_session
-    return make_session(3, seconds=seconds)
+def test_a_document_with_one_ill_conditioned_sensor_loads_for_the_other():
+    """The matrix of condition number 33 is not applied, not even with consent."""
+    document = to_mapping(proven(HELPS, HELPS))
+    document['accelerometer']['matrix']['value'] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.03]]
+    found = from_mapping(document)
+    assert found.decisions == {'accelerometer': HARMS, 'gyroscope': HELPS} and 'condition number' in found.decision_reasons['accelerometer']
+    np.testing.assert_array_equal(found.value('gyroscope', 'matrix'), PLAIN.value('gyroscope', 'matrix'))
+    np.testing.assert_array_equal(found.value('accelerometer', 'matrix'), np.eye(3))
+    assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions
+    document['gyroscope']['matrix']['value'] = np.zeros((3, 3)).tolist()
+    with pytest.raises(DocumentError, match='condition number'):
+        from_mapping(document)
 
 
-def test_a_rest_in_one_attitude_is_bad():
-    from worlds.live_sessions import OPTIONS, TABLE
-    imu, joints, _, _ = rest()
+def test_a_rest_in_one_attitude_is_unproven():
+    from worlds.live_sessions import OPTIONS, TABLE, make_session
+    imu, joints, _, _ = make_session(3, seconds=8.0)
     found = calibrate([lambda: iter([SampleBlock(imu, joints)])], TABLE, OPTIONS).calibration
-    assert found.verdict == 'bad' and 'says nothing about the accelerometer' in found.verdict_reasons[0]
-    assert calibration_from_text(calibration_to_text(found)).verdict == 'bad'
+    assert set(found.decisions.values()) == {UNPROVEN}
+    assert any('does not determine the accelerometer' in line for line in found.notes)
+    assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions
 
 
-def test_compensate_refuses_a_bad_calibration_unless_told(tmp_path, capsys):
+@pytest.mark.parametrize(('words', 'plain', 'insisted'), [((HARMS, HARMS), 1, 3), ((UNPROVEN, HELPS), 3, 3), ((HELPS, HARMS), 3, 3), ((HELPS, HELPS), 0, 0)])
+def test_exit_codes_of_compensate(words, plain, insisted, tmp_path, capsys):
     imu = ImuSamples(10**18 + 10_000_000 * np.arange(300), np.tile([0.0, 0.0, 9.8], (300, 1)), np.zeros((300, 3)), 'imu_link')
     write_session(tmp_path / 'drive', imu)
-    (tmp_path / 'bad.yaml').write_text(calibration_to_text(replace(GOOD, verdict='bad', verdict_reasons=('a reason',))))
-    command = ['compensate', str(tmp_path / 'drive'), '--calibration', str(tmp_path / 'bad.yaml'), '--output', str(tmp_path / 'out')]
-    assert main(command) == 1
+    (tmp_path / 'known.yaml').write_text(calibration_to_text(proven(*words)))
+    command = ['compensate', str(tmp_path / 'drive'), '--calibration', str(tmp_path / 'known.yaml'), '--output']
+    assert main([*command, str(tmp_path / 'plain')]) == plain
     error = capsys.readouterr().err
-    assert 'its verdict is bad: a reason' in error and '(--anyway)' in error and error.count('\n') == 1 and not (tmp_path / 'out').exists()
-    assert main([*command, '--anyway']) == 0
-    assert 'note: its verdict is bad: a reason' in capsys.readouterr().out
+    assert ('--anyway' in error and error.count('\n') == 1) == (plain == 1) and (tmp_path / 'plain').exists() == (plain != 1)
+    assert main([*command, str(tmp_path / 'insisted'), '--anyway']) == insisted
+    assert capsys.readouterr().out.count('note: ') == sum(word is not HELPS for word in words)

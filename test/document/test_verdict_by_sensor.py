@@ -1,4 +1,4 @@
-"""A sensor that a recording cannot help is left as it comes, and the other one is corrected: on a vertical shaft the accelerometer sees gravity along one axis."""
+"""A sensor that the calibration does not help is not corrected, and the other one is: on a vertical shaft gravity acts along one axis of the accelerometer."""
 
 from dataclasses import replace
 
@@ -8,13 +8,11 @@ import pytest
 import imu_calibration as imu
 from imu_calibration import files
 from imu_calibration.calibration import trust
+from imu_calibration.calibration.decision import HELPS
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.nominal import with_nominal
-from imu_calibration.calibration.reasons import HAND_AXES
-from imu_calibration.calibration.verdict import grave_reasons
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.errors import DocumentError
 from imu_calibration.exports.export import export
 from imu_calibration.exports.registry import find_target
 from imu_calibration.reference.table import Table
@@ -30,7 +28,7 @@ VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 
 PROOF = {'accelerometer': {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8},
          'gyroscope': {'before': 0.02, 'after': 0.001, 'ci95': [0.03, 0.08], 'unit': 'rad/s', 'windows': 8}}
 HARMS = {'after': 0.3, 'ci95': [1.2, 1.8]}
-GOOD = random_calibration(1, verdict='good', verdicts=dict.fromkeys(SENSORS, 'good'), verdict_reasons=('all is well',), proof=PROOF)
+GOOD = random_calibration(1, proof=PROOF)
 
 
 @pytest.fixture(scope='module')
@@ -52,45 +50,44 @@ def harmed(sensor, **changes):
     return replace(GOOD, proof=PROOF | {sensor: PROOF[sensor] | HARMS}, **changes)
 
 
-def test_each_sensor_has_its_own_word_and_the_worst_is_that_of_both(yaw):
+def test_each_sensor_has_its_own_decision(yaw):
+    """The accelerometer, whose errors are below what one attitude shows, is not helped."""
     calibration = yaw.calibration
-    assert calibration.verdict == yaw.verdict.word == 'bad' and calibration.verdicts == {'accelerometer': 'bad', 'gyroscope': 'weak'}
-    assert {reason.sensors for reason in grave_reasons(calibration)} == {('accelerometer',)}
+    assert calibration.decisions['gyroscope'] is HELPS and calibration.decisions['accelerometer'] is not HELPS and yaw.exit_code == 3
     read = calibration_from_text(calibration_to_text(calibration))
-    assert read.verdicts == calibration.verdicts and trust.refused_sensors(read).keys() == {'accelerometer'}
-    assert trust.objections(read, 'accelerometer') and not trust.objections(read, 'gyroscope') and trust.objections(read)
-    assert yaw.exit_code == 3
+    assert read.decisions == calibration.decisions
     for text in (str(yaw), yaw.report, trust.standing(read), repr(read)):
-        assert 'accelerometer bad, gyroscope weak' in text
-    assert 'compensation corrects the gyroscope with it, and leaves the accelerometer as it comes' in str(yaw)
-    assert 'Compensation corrects the gyroscope with it' in yaw.report
+        assert f'accelerometer {calibration.decisions["accelerometer"]}, gyroscope helps' in text.replace('Accelerometer', 'accelerometer')
 
 
 def test_compensate_corrects_the_one_and_leaves_the_other(yaw, block, tmp_path, capsys):
-    before, after = block.imu, imu.compensate(block, yaw.calibration)
+    known = replace(yaw.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'})
+    values = known.values.copy()
+    values[known.model.part('accelerometer', Role.OFFSET)] = 0.1
+    known = replace(known, values=values)
+    before, after, whole = block.imu, imu.compensate(block, known), imu.compensate(block, known, anyway=True)
     np.testing.assert_array_equal(after.imu.force_s, before.force_s)
-    whole = imu.compensate(block, yaw.calibration, anyway=True)
     np.testing.assert_allclose(after.imu.rate_s, whole.imu.rate_s, rtol=0, atol=1e-12)
     assert np.abs(after.imu.rate_s - before.rate_s).max() > 1e-3 and np.abs(whole.imu.force_s - before.force_s).max() > 1e-4
-    assert after.refused.keys() == {'accelerometer'} and after.warnings[0].startswith('the accelerometer is left as it comes: its verdict is bad')
-    assert not whole.refused and whole.exit_code == 0
+    assert after.refused.keys() == {'accelerometer'} and after.warnings[0].startswith('the accelerometer is not corrected: harms')
+    assert not whole.refused and len(whole.cautions) == 1 and whole.exit_code == 3
     write_session(tmp_path / 'bag', block.imu, block.joints)
-    yaw.save(tmp_path, report=False)
+    files.write_text(tmp_path / 'calibration.yaml', calibration_to_text(known))
     assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]) == 3
     told = capsys.readouterr().out
-    assert told.count('the accelerometer is left as it comes') == 1 and 'written' in told
+    assert told.count('the accelerometer is not corrected') == 1 and 'written' in told
 
 
-def test_other_programs_get_numbers_of_a_data_sheet_for_the_sensor_that_is_refused(tmp_path, capsys):
-    known = harmed('accelerometer', verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'})
+def test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused(tmp_path, capsys):
+    known = harmed('accelerometer')
     whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
     plain = export(with_nominal(known, ['accelerometer']), find_target('px4'), anyway=True)
     assert found.numbers == plain.numbers != whole.numbers and found.numbers.keys() == whole.numbers.keys()
-    assert any('the accelerometer is left as it comes' in line for line in found.lines) and found.exit_code == 3 and whole.exit_code == 0
+    assert any('the accelerometer is not corrected' in line for line in found.lines) and found.exit_code == 3 and whole.exit_code == 0
     files.write_text(tmp_path / 'calibration.yaml', calibration_to_text(known))
     command = ['export', str(tmp_path / 'calibration.yaml'), '--to', 'px4', '--output', str(tmp_path / 'px4.params')]
     assert [main([*command, *more]) for more in ([], ['--anyway'])] == [3, 0]
-    assert 'note: of the calibration: the accelerometer is left as it comes' in capsys.readouterr().out
+    assert 'note: of the calibration: the accelerometer is not corrected' in capsys.readouterr().out
 
 
 def test_what_the_refused_sensor_would_correct_goes_as_well():
@@ -111,34 +108,12 @@ def test_the_covariance_of_what_is_left_alone_is_that_of_a_data_sheet():
         np.testing.assert_array_equal(found.covariance[kept, kept], GOOD.covariance[was, was])
 
 
-@pytest.mark.parametrize(('calibration', 'refused'), (
-    (GOOD, set()),
-    (harmed('gyroscope'), {'gyroscope'}),
-    (harmed('accelerometer'), {'accelerometer'}),
-    (harmed('accelerometer', gauge={'axes': HAND_AXES}), set(SENSORS)),
-    (harmed('gyroscope', gauge={'axes': HAND_AXES}), {'gyroscope'}),
-    (replace(GOOD, proof={'gyroscope': PROOF['gyroscope'] | HARMS}), set(SENSORS)),
-    (replace(GOOD, verdict='bad', verdicts={}), set(SENSORS)),
-    (replace(GOOD, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}), {'accelerometer'}),
-    (replace(GOOD, verdict='bad'), set(SENSORS)),
-), ids=('nothing', 'gyroscope', 'accelerometer', 'by hand the axes', 'by hand gyroscope', 'the other not proven', 'judged together', 'judged apart',
-        'of neither'))
-def test_who_is_refused(calibration, refused):
-    assert trust.refused_sensors(calibration).keys() == refused
-    if refused == set(SENSORS):
-        with pytest.raises(DocumentError, match='against this one speaks'):
-            trust.usable(calibration)
-    else:
-        assert trust.usable(calibration).refused.keys() == refused
-        assert (trust.usable(calibration).calibration is calibration) == (not refused)
-
-
 def test_check_says_which_sensor_it_helps(yaw, block):
     values = yaw.calibration.values.copy()
     values[yaw.calibration.model.part('accelerometer', Role.OFFSET)] += 0.1
     found = imu.check(block, replace(yaw.calibration, values=values), Table.from_mapping(VERTICAL))
-    assert str(found).splitlines()[0] == 'it is not shown to help but for the gyroscope' and found.exit_code == 3
-    assert any(line.startswith('gyroscope error on data that took no part') for line in found.result.lines)
+    assert list(found.result.helped) == ['gyroscope'] and found.exit_code == 3 and str(found).splitlines()[0] == 'it helps the gyroscope only'
+    assert any(line.startswith('gyroscope helps: ') for line in found.result.lines)
 
 
 @pytest.mark.real_data
@@ -153,9 +128,8 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     middle = int(whole[0].stamp_ns[len(whole[0]) // 2])
     first, second = (SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole)) for early in (True, False))
     found = imu.calibrate(first, table)
-    assert found.calibration.verdicts == {'accelerometer': 'bad', 'gyroscope': 'weak'} and found.exit_code == 3
-    used = trust.usable(found.calibration)
-    assert used.refused.keys() == {'accelerometer'}
+    assert found.calibration.decisions['gyroscope'] is HELPS and found.calibration.decisions['accelerometer'] is not HELPS and found.exit_code == 3
+    used = trust.usable(replace(found.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}))
     here = imu.check(second, found.calibration, table)
     assert list(here.result.helped) == ['gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
     left = imu.check(second, used.calibration, table).proof

@@ -1,4 +1,4 @@
-"""Values that only misfit gives are held and named; values of effects that nobody asked for shrink; weak ones are applied where that helps."""
+"""Values that only misfit gives are held and named; values of effects that nobody asked for shrink."""
 
 from dataclasses import replace
 
@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.compensation.compensate import invertible_values
-from imu_calibration.compensation.weak_values import applied_values
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.named_models import parse_reference
 from imu_calibration.effects.sensor_model import SensorModel
@@ -94,33 +92,6 @@ def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
         moved.append(np.linalg.norm(after.values[part]) / np.linalg.norm(before.values[part]))
         assert np.abs((after.values - values) / after.sd).max() < 4.5
     assert moved[0] < 0.7 and moved[1] > 0.99
-
-
-def test_weak_values_are_applied_where_that_lowers_the_expected_error():
-    """Below one standard deviation from the prior a weak value goes there, and what is correlated with it follows; all else stays."""
-    calibration = calibrated_document()
-    weak, other = calibration.param_names.index('accelerometer.bias.x'), calibration.param_names.index('accelerometer.matrix.xy')
-    covariance = np.diag(calibration.sd**2)
-    covariance[weak, weak], covariance[weak, other] = 0.25, 0.5 * calibration.sd[other] * 0.9
-    covariance[other, weak] = covariance[weak, other]
-    status = tuple('weak' if k == weak else 'determined' for k in range(len(calibration.values)))
-    for size, applied in ((0.2, 0.0), (1.2, 1.2)):
-        values = calibration.values.copy()
-        values[weak] = size
-        given = replace(calibration, values=values, covariance=covariance, status=status)
-        found = applied_values(given)
-        assert found[weak] == pytest.approx(applied, abs=1e-12)
-        follows = covariance[other, weak] / covariance[weak, weak] * (applied - size)
-        assert found[other] == pytest.approx(values[other] + follows, abs=1e-15)
-        inverted, used = invertible_values(given)
-        assert used[inverted.slices['accelerometer', 'bias']][0] == found[weak]
-
-
-def calibrated_document():
-    """Return a Calibration of a clean session."""
-    import imu_calibration as imu
-    pair = make_pair(None, 11)
-    return imu.calibrate(pair.first.block, Table.from_mapping(pair.table), model_as_asked=True).calibration
 
 
 def test_options_know_what_is_there_unasked():

@@ -168,8 +168,8 @@ def test_a_drift_shows_beside_noise_that_was_taken_too_large():
         return Waves(np.arange(3), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
 
     every = {'gyroscope': [slice(0, 3)]}
-    assert np.all(errors_of_waves(waves(0.33), 3, groups=every)[0].added_variance > 1.0)
-    assert not errors_of_waves(waves(1.0), 3, groups=every)[0].added_variance.any()
+    assert np.all(errors_of_waves(waves(0.33), 3, groups=every)[0].drift_variance > 1.0)
+    assert not errors_of_waves(waves(1.0), 3, groups=every)[0].drift_variance.any()
 
 
 def test_parts_that_ask_for_more_than_noise_explains_widen_by_half_more_than_they_show():

@@ -82,7 +82,7 @@ def solution(information, model=MODEL):
     """Return a Solution with this information of the data and the prior's."""
     sd = make_prior(model).sd
     covariance = np.linalg.inv(information + np.diag(sd**-2.0))
-    return Solution(model, model.start(), covariance, np.zeros(len(sd), bool), NOISE, {}, information, {})
+    return Solution(model, model.start(), {'noise': covariance}, np.zeros(len(sd), bool), NOISE, {}, information, {})
 
 
 def test_the_motion_that_is_needed_is_the_one_that_helps_most_with_the_sd_it_will_have():

@@ -13,7 +13,7 @@ from imu_calibration.nodes.compensator_settings import CompensatorSettings
 
 from worlds.compensation_cases import random_calibration
 
-GOOD = random_calibration(1, verdict='good', verdict_reasons=('all is well',), frame_id='imu_link')
+GOOD = random_calibration(1, frame_id='imu_link')
 SETTINGS = CompensatorSettings()
 
 
@@ -24,19 +24,29 @@ def test_another_sensor_does_not_take_the_place_of_this_one():
         adopt(calibration_to_text(replace(GOOD, frame_id='another_link')), 'the topic', SETTINGS, frames=None, before=before)
 
 
-def test_what_speaks_against_itself_is_refused_unless_told():
-    text = calibration_to_text(replace(GOOD, verdict='bad', verdict_reasons=('the residuals are large',)))
-    with pytest.raises(DocumentError, match='the residuals are large'):
-        adopt(text, 'a file', SETTINGS, frames=None)
-    assert 'its verdict is bad' in adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None).caveats[0]
+HELPS = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
+UNPROVEN, HARMS = ({'after': 0.1, 'ci95': [0.8, 1.2]}, {'after': 0.2, 'ci95': [1.5, 2.5]})
 
 
-def test_a_refused_sensor_is_left_as_it_comes_beside_one_that_is_shown_to_be_helped():
-    helps = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
-    text = calibration_to_text(replace(GOOD, proof={'accelerometer': helps | {'after': 0.2, 'ci95': [1.5, 2.5]}, 'gyroscope': helps}))
+def test_an_unproven_sensor_needs_consent_and_a_harmful_one_is_never_corrected():
+    insisting = replace(SETTINGS, anyway=True)
+    for change, refused in ((UNPROVEN, set()), (HARMS, {'accelerometer'})):
+        text = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | change, 'gyroscope': HELPS}))
+        assert adopt(text, 'a file', SETTINGS, frames=None).used.refused.keys() == {'accelerometer'}
+        found = adopt(text, 'a file', insisting, frames=None)
+        assert found.used.refused.keys() == refused and len(found.caveats) == 1
+    both = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | HARMS, 'gyroscope': HELPS | HARMS}))
+    for settings in (SETTINGS, insisting):
+        with pytest.raises(DocumentError) as refusal:
+            adopt(both, 'a file', settings, frames=None)
+        assert refusal.value.key is None
+
+
+def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
+    text = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | UNPROVEN, 'gyroscope': HELPS}))
     adopted, whole = (adopt(text, 'a file', replace(SETTINGS, anyway=flag), frames=None) for flag in (False, True))
-    assert adopted.used.refused.keys() == {'accelerometer'} and adopted.caveats[0].startswith('the accelerometer is left as it comes: on 12 windows')
-    assert not whole.used.refused and 'that it helps is not shown' in whole.caveats[0] and adopted.says_more_than(whole)
+    assert adopted.used.refused.keys() == {'accelerometer'} and adopted.caveats[0].startswith('the accelerometer is not corrected: unproven')
+    assert not whole.used.refused and whole.caveats[0].startswith('accelerometer unproven') and adopted.says_more_than(whole)
     sample = (0, 0.1, 0.2, 0.3, 1.0, 2.0, 9.0)
     corrected, both = (each.compensation.correct(*sample) for each in (adopted, whole))
     np.testing.assert_allclose(corrected[3:], sample[4:], rtol=0, atol=1e-12)

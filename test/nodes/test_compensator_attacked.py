@@ -30,7 +30,7 @@ from ros.one_process import OneProcess  # noqa: E402
 pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
-GOOD, OTHER = (random_calibration(seed, verdict='good', proof=PROOF) for seed in (1, 2))
+GOOD, OTHER = (random_calibration(seed, proof=PROOF) for seed in (1, 2))
 GOOD_TEXT, OTHER_TEXT = map(calibration_to_text, (GOOD, OTHER))
 WORSE = {sensor: part | {'after': 0.2, 'ci95': [1.5, 2.5]} for sensor, part in PROOF.items()}
 MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
@@ -67,8 +67,8 @@ def damaged(before, after):
 
 
 REFUSED = {
-    'bad': (calibration_to_text(replace(OTHER, verdict='bad', verdict_reasons=('residuals in motion are 40 times the noise',))), 'its verdict is bad: residuals'),
-    'disproved': (calibration_to_text(replace(OTHER, proof=WORSE)), 'that it helps is not shown'),
+    'unproven': (calibration_to_text(replace(OTHER, proof={})), 'unproven'),
+    'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'accelerometer harms: error'),
     'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'noise_sd'),
     'brackets': ('[' * 200_000, 'YAML|levels'),
     'aliases': ('a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]', 'aliases'),
@@ -91,21 +91,20 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
         assert bench.heard('was refused', 'error')
         assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
     publisher.publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.lines()[STATUS][1].endswith('(good, proven on held-out data)'), 'the good one')
-    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (good, proven on held-out data) taken over') == 1
+    bench.until(lambda: bench.lines()[STATUS][1].endswith('(helps)'), 'the good one')
+    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (helps) taken over') == 1
     publisher.publish(String(data=OTHER_TEXT + '\n'))   # another document that says the same
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT + '\n'), 'the same again')
     assert bench.heard('taken over') == 2   # the file's and the other one's
     assert node.set_parameters([Parameter('anyway', value=True)])[0].successful
-    publisher.publish(String(data=REFUSED['bad'][0]))
-    bench.until(lambda: node.adopted.version == version_of(REFUSED['bad'][0]), 'the bad one, since somebody insists')
-    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'its verdict is bad' in bench.lines()[STATUS][1], 'a warning all the same')
+    publisher.publish(String(data=REFUSED['unproven'][0]))
+    bench.until(lambda: node.adopted.version == version_of(REFUSED['unproven'][0]), 'the unproven one, with consent')
+    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'accelerometer unproven' in bench.lines()[STATUS][1], 'a warning all the same')
     assert node.set_parameters([Parameter('anyway', value=False)])[0].successful
-    half = calibration_to_text(replace(OTHER, verdict='bad', verdicts={'accelerometer': 'bad', 'gyroscope': 'good'}, 
-                                       proof=PROOF | {'accelerometer': WORSE['accelerometer']}))
+    half = calibration_to_text(replace(OTHER, proof=PROOF | {'accelerometer': WORSE['accelerometer']}))
     publisher.publish(String(data=half))
-    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'the accelerometer is left as it comes' in bench.lines()[STATUS][1], 'a word on the sensor that is left')
-    assert bench.figure(STATUS, 'left as they come') == 'accelerometer' and node.adopted.version == version_of(half)
+    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'the accelerometer is not corrected' in bench.lines()[STATUS][1], 'a word on the sensor that is left')
+    assert bench.figure(STATUS, 'not corrected') == 'accelerometer' and node.adopted.version == version_of(half)
     answer = bench.call('/compensator_node/reload')
     assert answer.success and version_of(GOOD_TEXT) in answer.message
 
@@ -160,7 +159,7 @@ def test_whatever_a_message_does_the_stream_goes_on(bench, place, monkeypatch):
 
 def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(compensator_diagnostics, 'COLD', 1.5)
-    warm = random_calibration(3, ('accel_thermal_bias',), verdict='good', proof=PROOF)
+    warm = random_calibration(3, ('accel_thermal_bias',), proof=PROOF)
     (tmp_path / 'warm.yaml').write_text(calibration_to_text(warm))
     node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'warm.yaml')})
     publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)

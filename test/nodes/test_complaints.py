@@ -56,7 +56,7 @@ def test_memory_stays_bounded_whatever_is_wrong(now):
 
 def test_figures_that_are_not_known_are_left_out_and_no_status_is_stale():
     group = GroupState('accelerometer', 'bias', 'held', 'accelerometer.bias.x', float('nan'), 0.01, 'm/s^2', 'turn it over')
-    for status in statuses_of(WorkerState(groups=[group], verdict='bad', faults=('no disk',))):
+    for status in statuses_of(WorkerState(groups=[group], verdict='harms', faults=('no disk',))):
         assert all(value.value != 'nan' for value in status.values) and 'nan' not in status.message
         assert status.level != DiagnosticStatus.STALE
 
@@ -73,11 +73,11 @@ def test_the_guide_says_every_change_once(now):
     guide = CalibrationGuide({'imu': Topic(), 'joints': Topic()}, 'the command that saves', 'window', clock=lambda: now[0])
     counted = StreamState('good', 'Imu messages come', {}, (), ('imu', 'joints'), stamping=StampLine(COUNTED, 5e6, 0.0, 3.5e7, 8.0))
     states = [WorkerState(), WorkerState(streams=StreamState('good', '', {}, ('joints',), ('imu',))), WorkerState(streams=counted),
-              WorkerState(streams=counted, gathered=3, verdict='weak', lines=('bias: known less well', 'next: turn about x')),
-              WorkerState(streams=counted, gathered=5, verdict='weak', lines=('bias: known less well', 'next: turn about y')),
-              WorkerState(streams=counted, gathered=8, verdict='good', lines=('all is well',)),
-              WorkerState(streams=counted, gathered=8, verdict='good', diagnosis=DiagnosisState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
-              WorkerState(streams=counted, gathered=9, verdict='bad', lines=('residuals are large',))]
+              WorkerState(streams=counted, gathered=3, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about x')),
+              WorkerState(streams=counted, gathered=5, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about y')),
+              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, lines=('all is well',)),
+              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, diagnosis=DiagnosisState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
+              WorkerState(streams=counted, gathered=9, verdict='harms', judged='harms', lines=('residuals are large',))]
     said = []
     for state in states:
         for _ in range(3):
@@ -86,6 +86,6 @@ def test_the_guide_says_every_change_once(now):
     assert [line for _, line in said] == [
         'Imu messages come on /imu from /driver, reliable', 'JointState messages come on /imu from /driver, reliable',
         'Imu: stamps are those of arrival, about 8 samples at once; regular times at 200 Hz are drawn through them', 'first window gathered',
-        'verdict: weak: bias: known less well', 'next: turn about x', 'next: turn about y', 'verdict: good; save it with `the command that saves`',
-        'diagnosis: the gyroscopes feel gravity', 'verdict: bad: residuals are large']
+        'unproven; bias: known less well; next: turn about x', 'next: turn about x', 'next: turn about y', 'helps, every parameter is determined; save it with `the command that saves`',
+        'diagnosis: the gyroscopes feel gravity', 'harms; residuals are large']
     assert said[-1][0] == 'warning'

@@ -169,7 +169,7 @@ def test_a_compensator_shows_what_it_does(bench, tmp_path):
     from msg_adapters.imu import FIELDS, parse_imu
 
     from worlds.compensation_cases import random_calibration
-    calibration = random_calibration(1, verdict='good', frame_id='imu_link')
+    calibration = random_calibration(1, frame_id='imu_link')
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibration))
     node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml'), 'foxglove_port': 0, 'public_executor': True,
                                          'covariance_rate': 0.0})

@@ -166,7 +166,7 @@ def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
         if not starts(command) and PLANNER not in command:
             ask(terminals, command)
     compensator.wait('calibration [0-9a-f]{12} from topic /imu/calibration|was refused')
-    assert 'verdict: ' in (home[0] / 'ws' / 'calibration.yaml').read_text()
+    assert 'decision:' in (home[0] / 'ws' / 'calibration.yaml').read_text()
     for terminal in (simulator, calibrator, compensator):
         assert terminal.interrupt() == 0, terminal.shown()
         assert 'Traceback' not in terminal.shown(), terminal.shown()

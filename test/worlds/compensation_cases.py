@@ -28,7 +28,8 @@ def random_calibration(seed=0, accelerometer=('accel_size_effect',), gyroscope=(
     spread = rng.normal(0.0, sd / np.sqrt(len(values)), (len(values), len(values)))
     statistics = {sensor: {'noise_sd': [level, 1.1 * level, 0.9 * level]} for sensor, level in NOISE.items()}
     conditions = {'largest_rate': 3.0, 'largest_force': 12.0, 'temperature_range_c': None}
-    fields = {'frame_id': 'imu_link', 'statistics': statistics, 'conditions': conditions, **fields}
+    fields = {'frame_id': 'imu_link', 'statistics': statistics, 'conditions': conditions,
+              'decision': {'accelerometer': 'helps', 'gyroscope': 'helps'}, **fields}
     return Calibration(model, values, spread @ spread.T, ('determined',) * len(values), **fields)
 
 

@@ -8,6 +8,7 @@ from imu_calibration.by_hand.by_evidence import solve_by_evidence
 from imu_calibration.by_hand.calibrate import gather_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.covariance_terms import HELD, of_fit
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES
 from worlds.physics_hand import hold_and_turn, warmed_up
@@ -36,9 +37,8 @@ def errors(world, seed, **options):
         if not any(effect.sensor == sensor and effect.time_constant for effect in hand.model.extras):   # a bias beside a drift is that of the start, else a mean
             truth[part] += moved[sensor]
     places = [hand.param_names.index(name) for name in PARAM_NAMES[:21]]
-    own = [hand.model.param_names.index(name) for name in PARAM_NAMES[:21]]
-    noise_alone = hand.sd[places]**2 - hand.model_error.added_variance[own]
-    grown = hand.model_error.factor[own] * hand.sd[places] / np.sqrt(np.maximum(noise_alone, 1e-30))
+    fit = of_fit(hand.terms) + hand.terms[HELD]
+    grown = hand.sd[places] / np.sqrt(np.maximum(np.diag(fit)[places], 1e-30))
     off, sd = hand.values[places] - truth[:21], hand.sd[places]
     return {group: (off[part], sd[part], grown[part]) for group, part in GROUPS.items()}
 

@@ -13,6 +13,7 @@ import numpy as np
 from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.covariance_terms import HELD, of_fit
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
@@ -59,8 +60,7 @@ def calibrated(session, options=OPTIONS):
 
 def base_sd(solution):
     """Return the standard deviations that noise alone gives, shape (n_params,)."""
-    error = solution.model_error
-    return np.sqrt(np.diag(solution.covariance) - error.added_variance) / error.factor
+    return np.sqrt(np.diag(of_fit(solution.terms) + solution.terms[HELD]))
 
 
 def errors_in_sd(found):

@@ -33,7 +33,8 @@ def as_solution(hand: HandCalibration) -> Solution:
         noise[sensor] = replace(hand.poses.noise[sensor], offset_sd=hand.statistics[f'{scatter}_scatter_sd'])
         rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
         chi2[sensor] = {'mean': None}
-    return Solution(model, hand.values[order], hand.covariance[np.ix_(order, order)], held, noise, chi2, information, rms)
+    terms = {name: term[np.ix_(order, order)] for name, term in hand.terms.items()}
+    return Solution(model, hand.values[order], terms, held, noise, chi2, information, rms)
 
 
 def _rates_left(hand):
