@@ -31,6 +31,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
                         '--calibration contains; at most three minutes')
     parser.add_argument('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')
+    parser.add_argument('--around', metavar='NAME=DEG,...', default='', help='pose where the motion begins and that it keeps near, every '
+                        'joint (m where it slides)')
+    parser.add_argument('--reach', metavar='DEG', type=float, help='angle to either side of that pose that joints keep to; '
+                        'sliding joints stay')
     parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
     parser.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
@@ -60,7 +64,8 @@ def run(options: Namespace) -> int:
             told = max(told, 100 * share)
         made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate, progress=progress,
                     with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
-                    diagnosis=options.diagnosis, **{name: getattr(options, name) for name in CHOICES})
+                    diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach,
+                    **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
     return made.exit_code
@@ -76,6 +81,14 @@ def _run_by_hand(options):
         print(fill(line, 96, subsequent_indent='    '))
     print(f'written: plan.yaml in {folder}')
     return made.exit_code
+
+
+def _pose(text):
+    """Return joint -> number of 'NAME=NUMBER,...'."""
+    try:
+        return {name.strip(): float(value) for name, value in (part.split('=') for part in text.split(',') if part)}
+    except ValueError:
+        raise InputError(f"a pose must be NAME=DEG,..., got '{text}'; name every joint once") from None
 
 
 def _stand(options):

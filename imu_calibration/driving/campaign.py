@@ -79,6 +79,8 @@ class Campaign:
     settings : CampaignSettings
     make_separator : callable, optional
         Returns a planner of the motions that tell a Suspect from its mates, or raises an ImuCalibrationError when there are none.
+    first : callable, optional
+        Returns the first motion from a position, None for none.
     unwind : callable, optional
         Returns the motion that turns wound joints back from a position, None if none is needed; driven before the campaign ends.
 
@@ -86,8 +88,10 @@ class Campaign:
 
     def __init__(self, planner: MotionPlanner, settings: CampaignSettings = CampaignSettings(),
                  make_separator: Callable[[Suspect], MotionPlanner] | None = None, *,
+                 first: Callable[[np.ndarray], Any] = lambda position: None,
                  unwind: Callable[[np.ndarray], Any] = lambda position: None):
         self.planner, self.settings, self._make_separator, self._unwind = planner, settings, make_separator, unwind
+        self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: MotionPlanner | None = None
         self.findings: list[Suspect] | None = None
         """What the last diagnosis named, the strongest first; None before the first."""
@@ -141,6 +145,9 @@ class Campaign:
             Seconds since the first motion began.
 
         """
+        first, self._first = self._first, None
+        if first is not None and (motion := first(position)) is not None:
+            return Decision(motion, why='the first motion is small and slow')
         decision = self._decide(position, elapsed)
         if decision.motion is None and not decision.diagnose and (motion := self._unwind(position)) is not None:
             return Decision(motion, why=f'{decision.why}; before the end, endless joints are unwound')

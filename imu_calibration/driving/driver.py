@@ -58,7 +58,11 @@ class DriverSettings:
                                    'too small: what swings out is measured', live=True)
     settling_patience: float = setting(20.0, 's', 'joints that do not come to rest for so long stop everything', (0.5, 600.0),
                                        'too small: a soft arm is called restless', live=True)
-    first_speed: float = setting(0.3, '1', 'share of its speed at which the first motion after a start is made', (0.01, 1.0),
+    first_reach: float = setting(0.1, 'rad', 'the very first motion turns each joint by at most this and back; 0: none', (0.0, 1.0),
+                                 'too small: a wrong sign or joint is not noticed', live=True)
+    first_reach_m: float = setting(0.01, 'm', 'the same for a joint that slides', (0.0, 0.5), 'as above', live=True)
+    first_speed: float = setting(0.3, '1', 'share of its speed at which motions after a start are made, up to the first one that is larger '
+                                 'than first_reach', (0.01, 1.0),
                                  'too large: a wrong table is noticed at full speed', live=True)
 
 
@@ -96,6 +100,11 @@ class Driver:
         self.tolerance = np.where(self.limits.turns, settings.following_tolerance, settings.following_tolerance_m)
 
     @property
+    def first_reach(self) -> np.ndarray:
+        """Excursion of the first motion, rad or m, shape (n_joints,)."""
+        return np.where(self.limits.turns, self.settings.first_reach, self.settings.first_reach_m)
+
+    @property
     def is_driving(self) -> bool:
         """Whether joints may be in motion at the driver's word."""
         return self.state in (DriveState.MOVING, DriveState.SETTLING)
@@ -124,7 +133,7 @@ class Driver:
         return min(self._time - self._stopped[0], self._heard - self._stopped[1]) < self.settings.stall_patience
 
     def is_silent(self, now: float) -> bool:
-        """Whether nothing was heard of the joints for too long, by a steady clock."""
+        """Whether no joint state has come for too long, by a steady clock."""
         return now - self._heard > self.settings.silence
 
     def stamp_fault(self, now: float) -> str:
@@ -152,11 +161,7 @@ class Driver:
         now : float
             Seconds of a steady clock.
 
-        Raises
-        ------
-        InputError
-            When nothing may move at present, or the motion goes beyond a limit.
-
+        Raises an InputError when nothing may move at present, or the motion goes beyond a limit.
         """
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
             raise InputError(f'a motion may begin where the joints rest and nothing is wrong, the state is {self.state}: {self.reason}; '
@@ -167,7 +172,8 @@ class Driver:
             raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
-        self._watch, self._slow = PathWatch(self.position, points, self.tolerance), False
+        is_small = np.all(np.abs(points.position - self.position) <= self.first_reach + STILL * self.tolerance)
+        self._watch, self._slow = PathWatch(self.position, points, self.tolerance), self._slow and bool(is_small)
         self.motions += 1
         self._become(DriveState.MOVING, words)
         return points
@@ -251,7 +257,7 @@ class Driver:
         return True
 
     def wait(self, why: str) -> None:
-        """Rest until the next motion is asked for."""
+        """Rest until the next motion is requested."""
         self._watch = None
         self._become(DriveState.IDLE, why)
 

@@ -30,7 +30,11 @@ class TopicCommand:
 
     def __init__(self, node: Node):
         self._publisher = node.create_publisher(JointTrajectory, 'joint_trajectory', output_qos(DEPTH))
-        self.name = self._publisher.topic_name
+        self.name = self.topic_name = self._publisher.topic_name
+        self.action_name = f'{self.topic_name.rpartition("/")[0]}/follow_joint_trajectory'
+        """Action of the same controller, by the convention of ros2_control."""
+        self.goals: set[bytes] = set()
+        """Goals of this node; none."""
 
     @property
     def is_heard(self) -> bool:
@@ -66,7 +70,10 @@ class ActionCommand:
         self._topic, self._action, self._client, self._refused = TopicCommand(node), action_type, client, refused
         self._handle: Any = None
         self._number = 0
-        self.name = 'follow_joint_trajectory'
+        self.name = self.action_name = 'follow_joint_trajectory'
+        self.topic_name = self._topic.name
+        self.goals: set[bytes] = set()
+        """Identifiers of the goals of this node."""
 
     @property
     def is_heard(self) -> bool:
@@ -90,6 +97,7 @@ class ActionCommand:
             handle.cancel_goal_async()
 
     def _answered(self, number: int, handle: Any) -> None:
+        self.goals.add(bytes(handle.goal_id.uuid))
         if number != self._number:   # stopped before the server had answered
             if handle.accepted:
                 handle.cancel_goal_async()

@@ -27,19 +27,20 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect
-from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
+from imu_calibration.driving.driver import Driver, DriverSettings
 from imu_calibration.driving.separating import separator_of
 from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
-from imu_calibration.nodes.diagnostics import ERROR as ERROR_LEVEL
-from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, watch_inputs
 from imu_calibration.nodes.joint_commands import make_command
 from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.other_drivers import OtherDrivers
 from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.planner_settings import PlannerNodeSettings
+from imu_calibration.nodes.planner_settings import PlannerNodeSettings, restricted_limits
+from imu_calibration.nodes.planner_status import drive_statuses
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
@@ -47,7 +48,7 @@ from imu_calibration.nodes.timers import every
 from imu_calibration.planning.noise import expected_noise, require_grade
 from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
-from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.reference.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file
 from msg_adapters.joint_state import joint_row
@@ -57,7 +58,6 @@ PERIOD = 0.1
 """Seconds between two looks at the clock."""
 ANSWER_PATIENCE = 60.0
 """Seconds to wait for a solution, and for a diagnosis that has begun."""
-_LEVELS = {DriveState.STOPPED: ERROR_LEVEL}
 
 
 class PlannerNode(Node):
@@ -86,8 +86,10 @@ class PlannerNode(Node):
         self._names = tuple(self._table.joint_names)
         self.driver, self._is_placed = Driver(self._names, limits_of(self._table), driver_settings), False
         self._command = make_command(self, settings.command, self._refused)
+        self._others = OtherDrivers(self, self._command)
         self.worker = PlannerWorker(self.driver, self._make_campaign,
-                                    peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say),
+                                    peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say,
+                                                self._others.found),
                                     lock=self._lock)
         self.worker.stamp = lambda: self._stamp
         # All that wait at once: one by one they would wait in line while a plan is made, and the motion begin where the joints were before.
@@ -103,7 +105,7 @@ class PlannerNode(Node):
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-                               f'nothing moves before ~/start; limits: {self._limit_words()}')
+                               f'{NOT_CHECKED}; nothing moves before ~/start; limits: {self._limit_words()}')
         for line in range_warnings(self._table):
             self.get_logger().warning(line)
 
@@ -132,7 +134,9 @@ class PlannerNode(Node):
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
         planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate,
                                options=self._options, limits=self.driver.limits, calibration=self._latest())
-        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise), unwind=planner.unwinding)
+        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise),
+                        first=lambda position: planner.probe(position, self.driver.first_reach),
+                        unwind=planner.unwinding)
 
     def _make_separator(self, suspect: Suspect, noise: dict) -> MotionPlanner:
         calibration = self._latest()
@@ -268,13 +272,15 @@ class PlannerNode(Node):
             return False, trouble
         if not self._command.is_heard:
             return False, f'nobody listens to {self._command.name}: start the controller, or remap joint_trajectory'
+        if other := self._others.found():
+            return False, other
         if not self._calibrator['solve'].service_is_ready():
             return False, f'nobody takes the windows: {self._calibrator["solve"].srv_name} is not there; start calibration_node'
         if not self._is_placed:
-            self.driver.limits, self._is_placed = self.driver.limits.wound(self.driver.position, self.settings.max_turns), True
+            self.driver.limits, self._is_placed = restricted_limits(self.driver.limits, self.driver.position, self.settings), True
         self.worker.go(motions)
         what = 'one motion, then it rests' if motions > 0 else \
-            'plans and moves until every parameter is within its tolerance; the first motion is slow'
+            'plans and moves until every parameter is within its tolerance; the first motion is small, the first large one slow'
         return True, f'{what}; limits: {self._limit_words()}'
 
     def _limit_words(self) -> str:
@@ -300,23 +306,9 @@ class PlannerNode(Node):
             say(self.get_logger(), level, line)
 
     def _statuses(self) -> list:
-        driver, worker = self.driver, self.worker
         if self._driven is not None:   # again, since calibration_node's picture begins with clearing everything
             self._coverage.publish(self._driven)
-        name, excess = worker.worst
-        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
-                  'it takes [s]': f'{worker.seconds:.1f}',
-                  'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside, 'furthest outside': name,
-                  'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name,
-                  'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
-        if worker.campaign is not None and worker.campaign.findings is not None:
-            values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
-                       'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),
-                       'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating,
-                       'told apart': ' '.join(worker.campaign.told_apart)}
-        faults = self._joints.faults() + self._calibrations.faults()
-        text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
-        return [make_status(_LEVELS.get(driver.state, WARN if faults else OK), 'drive', text, values=values)]
+        return drive_statuses(self.driver, self.worker, self._command.name, faults=self._joints.faults() + self._calibrations.faults())
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from imu_calibration.constants import DEG
+from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.settings import setting
 from imu_calibration.simulation.sensor_noise import GRADES
 
@@ -28,5 +32,14 @@ class PlannerNodeSettings:
     max_turns: float = setting(1.0, '1', 'turns of an endless joint to either side of its position at the first start, unwound at the end; '
                                '0: unlimited, for slip rings', (0.0, 1e4), 'too large: cables are wound up; too small: slow plans',
                                fixed='the range of every joint is set at the first start')
+    reach_deg: float = setting(0.0, 'deg', 'angle to either side of its position at the first start that each joint keeps to; '
+                               'joints that slide stay; 0: the whole range', (0.0, 3600.0), 'too large: collisions',
+                               fixed='the range of every joint is set at the first start')
     calibration_node: str = setting('calibration_node', '', 'name of the node that takes the windows',
                                     symptom='~/start says that nobody calibrates')
+
+
+def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: PlannerNodeSettings) -> MotionLimits:
+    """Return the limits of the joints with what `max_turns` and `reach_deg` leave of them about a position."""
+    limits = limits.wound(position, settings.max_turns)
+    return limits.around(position, np.where(limits.turns, settings.reach_deg * DEG, 0.0)) if settings.reach_deg else limits

@@ -38,6 +38,8 @@ class Peers:
     """Stops the joints."""
     say: Callable[[str, str], None]
     """Tells a person (level, line)."""
+    obstacle: Callable[[], str] = lambda: ''
+    """Returns why nothing may be sent at present, '' for nothing."""
 
 
 class PlannerWorker(threading.Thread):
@@ -194,6 +196,8 @@ class PlannerWorker(threading.Thread):
             self._peers.say(INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
         self._wait_for_rest()   # somebody may have turned the joints while the plan was made
+        if obstacle := self._peers.obstacle():
+            raise InputError(obstacle)
         with self._lock:
             if not self._wanted:   # stopped meanwhile
                 return

@@ -33,7 +33,7 @@ from imu_calibration.planning.situation import Situation
 from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
-from imu_calibration.simulation.motion_builder import Segment
+from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 DONE = 'all that was wanted is reached'
 STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
@@ -147,6 +147,20 @@ class Planner:
         self._belief.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
         return NextMotion(motion, f'it gains most per second for {", ".join(missing[:3])}', motion.seconds_from(position), missing)
+
+    def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
+        """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""
+        if not np.any(reach):
+            return None
+        repertoire = self.situation.repertoire
+        limits = repertoire.limits
+        room = np.stack([position - limits.lower, limits.upper - position])
+        away = np.where(room[1] >= room[0], 1.0, -1.0) * np.clip(room.max(axis=0), 0.0, reach)
+        builder = MotionBuilder(len(position), limits=limits, start=position)
+        for place in (position + away, position):
+            builder.move_to(place)
+        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.asarray(position, float), tuple(builder.segments),
+                             'a small motion of every joint and back', limits)
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
         """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""

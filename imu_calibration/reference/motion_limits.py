@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.constants import DEG
+from imu_calibration.errors import InputError
 from imu_calibration.reference.joint import Joint
 from imu_calibration.reference.table import Table
 
 USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
 """Speed and acceleration of joints that turn, and of those that slide, whose description says nothing: rad/s, rad/s^2; m/s, m/s^2."""
+NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
+"""Stated wherever a plan is printed, saved or driven."""
 DEFAULT = 'default'
 """Origin of a limit that no description gives."""
 RADIANS = 2 * np.pi
@@ -47,11 +50,28 @@ class MotionLimits:
 
     def wound(self, position: np.ndarray, turns: float) -> 'MotionLimits':
         """Return the limits with endless joints restricted to so many turns to either side of a position; zero turns: unrestricted."""
-        if not turns:
-            return self
-        reach = 2 * np.pi * turns
-        return replace(self, lower=np.where(self.endless, position - reach, self.lower),
-                       upper=np.where(self.endless, position + reach, self.upper))
+        return self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf)) if turns else self
+
+    def around(self, position: np.ndarray, reach: np.ndarray) -> 'MotionLimits':
+        """
+        Return the limits restricted to a neighbourhood of a position.
+
+        Parameters
+        ----------
+        position, reach : ndarray, shape (n_joints,)
+            Center and distance to either side, rad or m.
+
+        Raises
+        ------
+        InputError
+            When the position is outside the limits.
+
+        """
+        lower, upper = np.maximum(self.lower, position - reach), np.minimum(self.upper, position + reach)
+        if np.any(lower > upper):
+            raise InputError(f'the pose must lie within the range of every joint, joint number {int(np.argmax(lower - upper)) + 1} is '
+                             'outside; choose another pose')
+        return replace(self, lower=lower, upper=upper)
 
     def hold(self, position: np.ndarray, margin: float = 1e-9) -> bool:
         """Whether every position, shape (..., n_joints), lies within the range."""

@@ -16,7 +16,7 @@ from imu_calibration.by_hand.hand_plan import HandPlan, hand_plan_to_mapping, pl
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.calibration.calibrate import calibration_of_saved
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.named_models import BASE, parse_effects
 from imu_calibration.effects.sensor_model import SensorModel
@@ -25,7 +25,7 @@ from imu_calibration.planning.document import plan_to_mapping, trajectory_to_map
 from imu_calibration.planning.noise import expected_noise
 from imu_calibration.planning.planner import Plan, make_planner
 from imu_calibration.planning.separation import make_separator
-from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.reference.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.drawing import Drawing
@@ -35,8 +35,6 @@ LONGEST_SEPARATION = 180.0
 """Time that a plan takes at most to tell effects apart, s."""
 ACCUMULATOR = '.npz'
 """Ending of what a live session saves beside its calibration."""
-NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
-"""Stated wherever a plan is printed, saved or driven."""
 START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
@@ -109,7 +107,8 @@ class Planned:
 
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
          separate: Sequence[str] = (), diagnosis: str | PathLike | Mapping[str, Any] | None = None,
-         longest: float = LONGEST_SEPARATION, progress: Callable[[float], None] | None = None, with_bound: bool = True,
+         around: Mapping[str, float] | None = None, reach: float | None = None, longest: float = LONGEST_SEPARATION,
+         progress: Callable[[float], None] | None = None, with_bound: bool = True,
          **choices: Any) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
@@ -128,6 +127,10 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         Effects to be told apart, the one that `calibration` contains first: the plan is for that instead of the tolerances.
     diagnosis : path-like or mapping, optional
         diagnosis.json or its content, of which the first finding with others that would do as well is taken.
+    around : mapping, optional
+        Joint -> position, degrees (m where it slides), of every joint: the motion keeps to `reach` about this pose, where it begins.
+    reach : float, optional
+        Degrees to either side; joints that slide stay.
     longest : float
         Time that telling apart may take, s.
     progress : callable, optional
@@ -145,6 +148,9 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     """
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
     noise = expected_noise(options.noise, grade, imu_rate)
+    limits, start = limits_of(table), None
+    if around or reach is not None:
+        limits, start = _neighbourhood(table, around or {}, reach)
     known = _known(calibration, table, options)
     causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
     if causes:
@@ -152,17 +158,28 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
             raise InputError('effects are told apart beside the calibration of the diagnosis that found the first, none was given; give it',
                              key='calibration')
         owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
-        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options, sizes=sizes)
+        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options, sizes=sizes, limits=limits)
     else:
-        planner = make_planner(table, noise=noise, rate=imu_rate, options=options, calibration=known)
+        planner = make_planner(table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=known)
     provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                   'known': Path(calibration).name if isinstance(calibration, (str, PathLike)) else 'a calibration' if known else 'nothing'}
-    provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits_of(table)))}
+    provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
     if warnings := range_warnings(table):
         provenance['warnings'] = '; '.join(warnings)
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
-    return Planned(planner.plan(progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+    return Planned(planner.plan(start, progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+
+
+def _neighbourhood(table, around, reach):
+    """Return the limits that keep to `reach` about a pose, and the pose."""
+    names = table.joint_names
+    if reach is None or reach <= 0 or set(around) != set(names):
+        raise InputError(f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
+                         f'and {", ".join(around) or "no joint"}; give both')
+    limits = limits_of(table)
+    position = np.where(limits.turns, DEG, 1.0) * [around[name] for name in names]
+    return limits.around(position, np.where(limits.turns, reach * DEG, 0.0)), position
 
 
 def _known(calibration, table, options):

@@ -13,6 +13,7 @@ from imu_calibration.planning.planner import NextMotion, make_planner
 from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import table_from_urdf
+from imu_calibration.resources import config_file
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 from imu_calibration.simulation.sensor_noise import GRADES
 
@@ -104,3 +105,16 @@ def test_a_plan_without_limits_warns_and_exits_with_3(tmp_path, capsys):
         assert 'not collisions' in texts[-1] and 'not collisions' in (tmp_path / str(k) / 'plan.yaml').read_text()
     assert codes == [3, 0]
     assert 'outer, inner' in texts[0] and 'every joint must have a range' in texts[0] and 'every joint must' not in texts[1]
+
+
+def test_a_plan_keeps_to_the_neighbourhood_of_a_pose(tmp_path, capsys):
+    pose = dict(outer=20.0, middle=-60.0, inner=100.0)
+    arm = ['plan', '--table', str(config_file('table_simulated.yaml')), '--no-bound', '--no-report', '--output', str(tmp_path / 'out')]
+    assert main([*arm, '--around', 'outer=20', '--reach', '15']) == 1   # every joint, or it is no pose
+    assert main([*arm, '--reach', '15']) == main([*arm, '--around', 'outer:20']) == 1
+    assert len(capsys.readouterr().err.splitlines()) == 3
+    assert main([*arm, '--around', ','.join(f'{name}={value}' for name, value in pose.items()), '--reach', '15']) in (0, 3)
+    trajectory = yaml.safe_load((tmp_path / 'out/trajectory.yaml').read_text())
+    away = np.degrees([point['positions'] for point in trajectory['points']]) - [pose[name] for name in trajectory['joint_names']]
+    assert 5.0 < np.abs(away).max() <= 15.0 + 1e-4
+    assert 'inner: endless, here 85 to 115 deg' in yaml.safe_load((tmp_path / 'out/plan.yaml').read_text())['provenance']['limits']

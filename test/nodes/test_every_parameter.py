@@ -14,7 +14,7 @@ from imu_calibration.settings import describe  # noqa: E402
 from ros.live_station import ROOT, TABLE, Station  # noqa: E402
 from ros.planner_bench import PlannerBench  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 SAMPLE = ROOT / 'bags' / 'sample_session'
 START = {'simulator_node': {'profile': 'none', 'table_file': TABLE}, 'bag_player_node': {'bag': SAMPLE, 'wait_for_subscribers': 100},
          'planner_node': {'table_file': TABLE}, 'calibration_node': {'table_file': TABLE}, 'compensator_node': {}}

@@ -2,14 +2,21 @@
 
 import time
 
+import numpy as np
 import pytest
 
 from imu_calibration.driving.driver import DriveState
 
 pytest.importorskip('rclpy')
+from action_msgs.msg import GoalStatus, GoalStatusArray  # noqa: E402
+from rclpy.qos import qos_profile_action_status_default  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory  # noqa: E402
+
+from imu_calibration.nodes.other_drivers import OtherDrivers  # noqa: E402
+
 from ros.planner_bench import PlannerBench  # noqa: E402
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.live
 
 
 @pytest.fixture
@@ -81,10 +88,66 @@ def test_an_exception_in_a_callback_stops_the_joints_and_the_node_goes_on(bench,
 
 
 def test_stamps_that_stand_still_are_a_fault_within_the_silence(bench):
-    table = bench(silence=0.4, stall_patience=60.0).moving()
+    table = bench(silence=3.0, stall_patience=60.0).moving()
     began = time.monotonic()
     table.looks(lambda: table.planner.driver.state is DriveState.STOPPED, 'the stop', elapsed=0.0)
-    assert time.monotonic() - began >= 0.4 and 'stamps of the joint states' in table.planner.driver.reason
+    assert time.monotonic() - began >= 3.0 and 'stamps of the joint states' in table.planner.driver.reason
     table.looks(lambda: not table.trajectories[-1].points, 'the empty trajectory', elapsed=0.0)
     answer = table.ask('start', elapsed=0.0)
     assert not answer.success and 'stamps of the joint states' in answer.message
+
+
+def test_a_second_publisher_of_trajectories_keeps_the_joints_from_being_driven(bench):
+    table = bench()
+    table.looks(lambda: table.planner.driver.position is not None, 'the joints')
+    other = table.node.create_publisher(JointTrajectory, 'joint_trajectory', 10)
+    table.looks(lambda: table.node.count_publishers('joint_trajectory') == 2, 'the other driver')
+    for what in ('start', 'next'):
+        answer = table.ask(what)
+        assert not answer.success and '/tester' in answer.message, answer.message
+    table.node.destroy_publisher(other)
+    table.looks(lambda: not table.planner._others.found(), 'its end')
+    assert table.ask('next').success
+
+
+def test_a_goal_of_another_client_keeps_the_joints_from_being_driven(bench):
+    table = bench()
+    table.looks(lambda: table.planner.driver.position is not None, 'the joints')
+    controller = table.node.create_publisher(GoalStatusArray, 'follow_joint_trajectory/_action/status', qos_profile_action_status_default)
+    goal = GoalStatus(status=GoalStatus.STATUS_EXECUTING)
+    goal.goal_info.goal_id.uuid = [7] * 16
+    controller.publish(GoalStatusArray(status_list=[goal]))
+    table.looks(table.planner._others.found, 'the status')
+    answer = table.ask('start')
+    assert not answer.success and '/follow_joint_trajectory must have no active goal' in answer.message
+    table.planner._command.goals.add(bytes([7] * 16))   # a goal of its own
+    assert not table.planner._others.found()
+    table.planner._command.goals.clear()
+    goal.status = GoalStatus.STATUS_SUCCEEDED
+    controller.publish(GoalStatusArray(status_list=[goal]))
+    table.looks(lambda: not table.planner._others.found(), 'the end of the goal')
+    assert table.ask('next').success
+
+
+def test_another_driver_that_appears_later_stops_before_the_next_motion(bench, monkeypatch):
+    answers = ['']   # at ~/next
+    monkeypatch.setattr(OtherDrivers, 'found', lambda self: answers.pop() if answers else 'there is /rival')
+    table = bench(first_reach=0.0)
+    table.looks(lambda: table.planner.driver.position is not None, 'the joints')
+    assert table.ask('next').success
+    table.looks(lambda: table.planner.driver.state is DriveState.STOPPED, 'the stop')
+    assert '/rival' in table.planner.driver.reason and not any(message.points for message in table.trajectories)
+
+
+def test_the_first_motion_is_small_and_slow_and_says_that_collisions_are_not_checked(bench):
+    table = bench(reach_deg=30.0)
+    assert table.heard('not collisions', 'info') == 1
+    table.position[:] = 0.5, -0.2
+    table.moving()
+    points = next(message.points for message in table.trajectories if message.points)
+    position = np.array([point.positions for point in points]) - table.position
+    np.testing.assert_allclose(np.abs(position).max(axis=0), 0.1, atol=1e-9)
+    np.testing.assert_allclose(position[-1], 0.0, atol=1e-9)
+    assert np.abs([point.velocities for point in points]).max() <= 0.3 * np.radians(100.0)
+    limits = table.planner.driver.limits
+    np.testing.assert_allclose([limits.lower, limits.upper], np.add.outer(np.radians([-30, 30]), table.position))

@@ -58,7 +58,7 @@ class Goal:
     """Stands for a goal handle."""
 
     def __init__(self, accepted=True):
-        self.accepted, self.cancelled, self.ended = accepted, 0, Future()
+        self.accepted, self.cancelled, self.ended, self.goal_id = accepted, 0, Future(), SimpleNamespace(uuid=bytes(16))
 
     def cancel_goal_async(self):
         self.cancelled += 1

@@ -35,7 +35,7 @@ NOBLE = {
     'ros2cli': 'ros-jazzy-ros2cli', 'ros2doctor': 'ros-jazzy-ros2doctor', 'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
     'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs', 'sensor_msgs': 'ros-jazzy-sensor-msgs', 'std_msgs': 'ros-jazzy-std-msgs', 'std_srvs': 'ros-jazzy-std-srvs',
     'geometry_msgs': 'ros-jazzy-geometry-msgs', 'nav_msgs': 'ros-jazzy-nav-msgs', 'tf2_msgs': 'ros-jazzy-tf2-msgs',
-    'builtin_interfaces': 'ros-jazzy-builtin-interfaces', 'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
+    'action_msgs': 'ros-jazzy-action-msgs', 'builtin_interfaces': 'ros-jazzy-builtin-interfaces', 'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
 }
 """Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
 EXTRAS = {'dask', 'foxglove'}
