@@ -49,9 +49,9 @@ class Belief:
         total = np.zeros_like(self.covariance)
         for window in windows:
             first = self.size
+            total[:self.size, :self.size] += window.within
             for sensor in SENSORS:
                 noise = self.noise[sensor]
-                total[:self.size, :self.size] += window.within[sensor]
                 rows = np.zeros((3, len(total)))
                 rows[:, :self.size] = window.means[sensor]
                 for number in range(3 * len(noise.bias_processes)):
@@ -106,7 +106,7 @@ def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise
         Sensor -> NoiseModel.
 
     """
-    total = np.sum([window.within[sensor] for window in windows for sensor in SENSORS], axis=0)
+    total = np.sum([window.within for window in windows], axis=0)
     for sensor in SENSORS:
         model = noise[sensor]
         variance = np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
@@ -127,13 +127,13 @@ def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share
     distance to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g is at least half the window's
     own length. A larger covariance says less: with every G_j replaced by its bound the means are independent, and information adds up.
     """
-    total = np.zeros_like(window.within[SENSORS[0]])
+    total = window.within.copy()
     for sensor in SENSORS:
         model = noise[sensor]
         floor = share * sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
         variance = window.variance[sensor] + model.offset_sd**2 + floor
         rows = window.means[sensor]
-        total += window.within[sensor] + rows.T @ (rows / variance[:, None])
+        total += rows.T @ (rows / variance[:, None])
     return total
 
 

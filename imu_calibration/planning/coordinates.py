@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.forward_equations import all_arms, coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 
@@ -35,6 +36,8 @@ class Coordinates:
         start = model.start() if values is None else np.asarray(values, float)
         self.values = np.where(np.isfinite(start), start, 0.0)
         self.model, self.tolerances = model.at(self.values), np.asarray(tolerances, float)
+        # At a fixed point the derivative of a lag needs no columns for each arm: a third of the columns of an arm with seven joints.
+        self.folded = replace(self.model, folded_arms=all_arms(self.model, self.values))
         prior = make_prior(model)
         self.prior_sd = prior.sd
         self.wanted = model.requested & ~fixed_parameters(model)
@@ -57,7 +60,7 @@ class Coordinates:
     @cached_property
     def slopes(self) -> dict[str, np.ndarray]:
         """Sensor -> derivative of the coefficients of the columns by z, shape (n_columns, 3, n)."""
-        return {sensor: np.einsum('cap,pq->caq', coefficient_jacobian(self.model, sensor, self.values) * self.units, self.basis)
+        return {sensor: np.einsum('cap,pq->caq', coefficient_jacobian(self.folded, sensor, self.values) * self.units, self.basis)
                 for sensor in SENSORS}
 
     def sd(self, covariance: np.ndarray) -> np.ndarray:

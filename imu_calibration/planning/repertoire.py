@@ -28,8 +28,8 @@ SPEEDS = (1.0, 0.5)
 """Spins, as shares of the largest speed."""
 LARGEST_SWING = {True: 120.0 * DEG, False: 0.3}
 """Amplitude of a swing of a joint that turns, rad, or slides, m, at most."""
-REST_PLACES, SPIN_PLACES, SWING_PLACES = 20, 4, 3
-"""Places for rests; for spins and for swings of each joint."""
+REST_PLACES, SPIN_PLACES, SWING_PLACES, TOGETHER_PLACES = 20, 4, 3, 2
+"""Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain with at most three joints."""
 
 
 class Repertoire:
@@ -71,13 +71,13 @@ class Repertoire:
         for joint in moving:
             for place in self._subset(SPIN_PLACES, int(joint)):
                 for share in SPEEDS:
-                    for sense in (1.0, -1.0):
-                        for seconds in SPIN_TIME:
-                            rates = np.zeros(len(self.names))
-                            rates[joint] = sense * share * self.limits.speed[joint]
-                            made = self._whole_turns(place, rates, seconds) if self.limits.endless[joint] else self._sweep(place, rates)
-                            if made:
-                                yield MotionKind.SPIN, *made
+                    rates = np.zeros(len(self.names))
+                    rates[joint] = share * self.limits.speed[joint]
+                    if self.limits.endless[joint]:
+                        yield from ((MotionKind.SPIN, *self._whole_turns(place, sense * rates, seconds))
+                                    for sense in (1.0, -1.0) for seconds in SPIN_TIME)
+                    elif made := self._sweep(place, rates):
+                        yield MotionKind.SPIN, *made
 
     def _swings(self):
         for joint in np.flatnonzero(self.limits.upper > self.limits.lower):
@@ -93,21 +93,22 @@ class Repertoire:
         pairs = [pair for pair in combinations(moving, 2)][-6:]
         sets = [*pairs, *([tuple(moving)] if len(moving) > 2 else [])]
         for number, joints in enumerate(sets):
-            for place in self._subset(2, number + 2):
+            for place in self._subset(TOGETHER_PLACES, number + 2):
                 frequency = np.full(len(self.names), 0.5)
                 frequency[list(joints)] = 0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)[:len(joints)]
                 for seconds in SWING_TIME:
                     yield MotionKind.TOGETHER, *self._swing(place, np.isin(np.arange(len(self.names)), joints), frequency, seconds)
         for pair in pairs:
             if self.limits.endless[list(pair)].all():
-                for place in self._subset(2, sum(pair)):
+                for place in self._subset(TOGETHER_PLACES, sum(pair)):
                     for sense in (1.0, -1.0):
                         rates = np.zeros(len(self.names))
                         rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array([1.0, sense])
                         yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
-        """Return some of the places, others for other motions."""
+        """Return some of the places, others for other motions; fewer of a long chain, whose moves between places are as many as their square."""
+        count = max(1, min(count, 3 * count // len(self.names)))
         some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
         return self.spread[np.unique(some)]
 
@@ -125,12 +126,11 @@ class Repertoire:
         return place, self._spun(place, rates, held), f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
 
     def _sweep(self, place, rates):
-        """Turn a joint with ends at a constant rate one way and back, as far as it goes; None where it is too short for a window."""
+        """Turn a joint with ends at a constant rate up and back, as far as it goes; None where it is too short for a window."""
         joint = int(np.argmax(np.abs(rates)))
         lower, upper = self.limits.lower[joint], self.limits.upper[joint]
-        sense = np.sign(rates[joint])
         start = place.copy()
-        start[joint] = lower + 0.02 * (upper - lower) if sense > 0 else upper - 0.02 * (upper - lower)
+        start[joint] = lower + 0.02 * (upper - lower)
         there = np.stack([rates, -rates])
         for share in (1.0, 0.6, 0.35, 0.2, 0.1):
             held = self._longest(start, share * there, joint)
@@ -164,8 +164,8 @@ class Repertoire:
         reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
                  np.array([LARGEST_SWING[bool(turning)] for turning in self.limits.turns])]
         largest = unit * np.minimum.reduce(reach)
-        away, amplitude = largest * most[0], 0.99 * largest   # the largest values are between the moments that were looked at
-        middle = np.where(self.limits.endless, place, np.clip(place, self.limits.lower + away, self.limits.upper - away))
+        amplitude = 0.99 * largest   # the largest values are between the instants of `motion`
+        middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
         builder = self._builder(middle)
         builder.swing(amplitude, frequency, seconds)
         far = ', '.join(f'{name} by {value:.0f}° at {hertz:.2g} Hz' if turning else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'

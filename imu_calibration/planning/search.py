@@ -24,7 +24,7 @@ class Offers:
         self.places = situation.repertoire.place_of
         self.seconds = situation.seconds + situation.way_seconds[place, self.places]
         size = belief.size
-        self.information = situation.information + situation.way_information[place, self.places]
+        self.information = situation.information + situation.way_information(place)
         self.possible = self.seconds > 0
         after = belief.after(self.information, self.seconds)
         before = situation.goal.left(belief.known[None], margin)[0]

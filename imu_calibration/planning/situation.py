@@ -89,11 +89,11 @@ class Situation:
         seconds = np.array([sum(segment.duration for segment in way) for way in self.ways.values()])
         return seconds.reshape((len(self.repertoire.places),) * 2)
 
-    @cached_property
-    def way_information(self) -> np.ndarray:
-        """What each move says about z and the biases, shape (n_places, n_places, m, m)."""
-        belief, count = self.belief(), len(self.repertoire.places)
-        return np.array([[belief.information_of(self.way_windows[a, b]) for b in range(count)] for a in range(count)])
+    def way_information(self, place: int) -> np.ndarray:
+        """Return the information about z and the biases in the move from a place to each motion, shape (k, m, m)."""
+        belief, targets = self.belief(), self.repertoire.place_of
+        found = np.array([belief.information_of(self.way_windows[place, b]) for b in range(len(self.repertoire.places))])
+        return found[targets]
 
     def belief(self, known: np.ndarray | None = None) -> Belief:
         """Return the belief before any motion, with information about z beside the prior."""

@@ -21,6 +21,8 @@ SAMPLING = 16.0
 """Instants per second at which columns are taken: a turn at 300 deg/s has 19."""
 LEAST_INSTANTS = 4
 """Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion."""
+BLOCK = 8192
+"""Instants whose columns are held in memory at a time."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
 """Segment -> window; everything else is dynamic."""
 
@@ -39,8 +41,8 @@ class PlannedWindow:
     """Sensor -> rows of the means, shape (3, n)."""
     variance: dict[str, np.ndarray]
     """Sensor -> variance of the means beside the bias in the middle of the window, shape (3,)."""
-    within: dict[str, np.ndarray]
-    """Sensor -> information of what varies within, for the noise of that sensor, shape (n, n)."""
+    within: np.ndarray
+    """Information of the samples about their means, of both sensors together, shape (n, n)."""
 
 
 class WindowPredictor:
@@ -69,17 +71,19 @@ class WindowPredictor:
         """Return the windows of each of several motions, a tuple of segments each."""
         cuts = [list(self._cut(segments)) for segments in motions]
         flat = [cut for one in cuts for cut in one]
-        if not flat:
-            return [[] for _ in cuts]
-        motion = JointMotion.joined([cut[0] for cut in flat])
-        edges = np.cumsum([0] + [len(cut[0]) for cut in flat])
-        model = self.coordinates.model
+        blocks = np.cumsum([len(cut[0]) for cut in flat]) // BLOCK
+        wander = cache(self._wander)   # many motions last equally long, at least a move and its way back
+        windows = iter([window for block in np.unique(blocks)
+                        for window in self._windows([flat[k] for k in np.flatnonzero(blocks == block)], wander)])
+        return [[next(windows) for _ in one] for one in cuts]
+
+    def _windows(self, cuts, wander):
+        motion = JointMotion.joined([cut[0] for cut in cuts])
+        edges = np.cumsum([0] + [len(cut[0]) for cut in cuts])
+        model = self.coordinates.folded
         temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
         designs = {sensor: columns(model, sensor, self.table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
-        wander = cache(self._wander)   # many motions last as long as others, forth and back at the least
-        windows = iter([self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander)
-                        for cut, a, b in zip(flat, edges, edges[1:], strict=False)])
-        return [[next(windows) for _ in one] for one in cuts]
+        return [self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander) for cut, a, b in zip(cuts, edges, edges[1:], strict=False)]
 
     def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
         """Yield (motion at some instants, kind, middle, length with what settles, seconds of data) of each window."""
@@ -101,11 +105,10 @@ class WindowPredictor:
     def _window(self, cut, designs, wander_of):
         motion, kind, middle, length, seconds = cut
         samples, count = seconds * self.rate, len(motion)
-        means, variance, within = {}, {}, {}
+        means, variance, within = {}, {}, np.zeros((self.coordinates.size,) * 2)
         for sensor, design in designs.items():
             slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
             means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
-            within[sensor] = np.zeros((slope.shape[2],) * 2)
             reference = noise.reference.variance([kind], np.array([seconds]))[0]
             wander, turned = wander_of(sensor, count, seconds)
             rows, ones = turned.T @ design, turned.sum(axis=0)
@@ -116,5 +119,5 @@ class WindowPredictor:
                 centred = (rows - np.outer(ones, mean)) @ slope[:, axis]
                 variance[sensor][axis] += reference
                 means[sensor][axis] = mean @ slope[:, axis]
-                within[sensor] += centred.T @ (centred * weight[:, None])
+                within += centred.T @ (centred * weight[:, None])
         return PlannedWindow(middle, length, samples, means, variance, within)

@@ -22,8 +22,12 @@ from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import DONE, make_planner
 from imu_calibration.planning.separation import make_separator
+from imu_calibration.planning import windows
+from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.windows import SAMPLING, WindowPredictor
+from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
+from imu_calibration.reference.urdf import table_from_urdf
 from imu_calibration.resources import config_file
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -35,6 +39,7 @@ from imu_calibration.use_cases.plan import class_in
 from imu_calibration.use_cases.stand import table_of
 from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 
+from worlds.arms import SEVEN_AXES
 from worlds.live_sessions import TABLE, make_session
 from worlds.random_tables import random_table
 
@@ -238,7 +243,7 @@ def tight(folder):
 
 
 def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
-    """Against the dense covariance of the samples: what varies within, the mean, and how certain that is."""
+    """Against the dense covariance of the samples: information of both sensors, the mean, and its variance."""
     model = choose_model(CalibrationOptions(), table)
     noise = noise_of_grade(GRADES['navigation'].noise, 100.0)
     coordinates = Coordinates(model, tolerances_of(model))
@@ -249,14 +254,34 @@ def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
                     for of in (noise, {s: replace(own, bias_processes=()) for s, own in noise.items()}))
     count = int(np.ceil(found.length * SAMPLING))
     offsets = ((np.arange(count) + 0.5) / count - 0.5) * found.length
-    own, process = noise['accelerometer'], noise['accelerometer'].bias_processes[0]
-    wander = [[process.sd**2 * (np.exp(-abs(a - b) / process.time) - np.exp(-(abs(a) + abs(b)) / process.time)) for b in offsets] for a in offsets]
-    inverse = np.linalg.inv(np.diag(np.full(count, own.low_variance[0] * count / found.samples)) + wander)
     motion = Profile('', segments).at(offsets + found.length / 2)
-    design = columns(model, 'accelerometer', table, motion=motion)
-    slope = coordinates.slopes['accelerometer']
-    total = sum(slope[:, axis].T @ design.T @ inverse @ design @ slope[:, axis] for axis in range(3))
-    mean = found.means['accelerometer']
-    np.testing.assert_allclose(found.variance['accelerometer'], 1 / inverse.sum(), rtol=1e-9)
-    np.testing.assert_allclose(found.within['accelerometer'] + mean.T @ mean * inverse.sum(), total, rtol=1e-7, atol=1e-9 * total.max())
-    assert np.trace(found.within['accelerometer']) < 0.9 * np.trace(still.within['accelerometer'])
+    total, predicted = 0.0, found.within
+    for sensor, own in noise.items():
+        process = own.bias_processes[0]
+        wander = [[process.sd**2 * (np.exp(-abs(a - b) / process.time) - np.exp(-(abs(a) + abs(b)) / process.time)) for b in offsets]
+                  for a in offsets]
+        inverse = np.linalg.inv(np.diag(np.full(count, own.low_variance[0] * count / found.samples)) + wander)
+        design, slope, mean = columns(coordinates.folded, sensor, table, motion=motion), coordinates.slopes[sensor], found.means[sensor]
+        total = total + sum(slope[:, axis].T @ design.T @ inverse @ design @ slope[:, axis] for axis in range(3))
+        predicted = predicted + mean.T @ mean * inverse.sum()
+        np.testing.assert_allclose(found.variance[sensor], 1 / inverse.sum(), rtol=1e-9)
+    np.testing.assert_allclose(predicted, total, rtol=1e-7, atol=1e-9 * total.max())
+    assert np.trace(found.within) < 0.9 * np.trace(still.within)
+
+
+def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(table, monkeypatch):
+    """All moves of seven joints at once took 5.7 GB: columns are computed by blocks, and a long chain has few places."""
+    lengths = []
+
+    def counted(*arguments, motion, **options):
+        lengths.append(len(motion))
+        return columns(*arguments, motion=motion, **options)
+
+    monkeypatch.setattr(windows, 'columns', counted)
+    model = choose_model(CalibrationOptions(), table)
+    move = MotionBuilder(3)
+    move.move_to([1.0, -0.5, 2.0])
+    found = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0).predict([tuple(move.segments)] * 1000)
+    assert len(found) == 1000 and max(lengths) <= 1.05 * windows.BLOCK < sum(lengths) / 2
+    arm = table_from_urdf(SEVEN_AXES, 'imu_link', {'gravity': 9.81})
+    assert 20 <= len(Repertoire(arm, limits_of(arm)).places) <= 45
