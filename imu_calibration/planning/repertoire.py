@@ -107,7 +107,7 @@ class Repertoire:
                         yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
-        """Return some of the places, others for other motions; fewer of a long chain, whose moves between places are as many as their square."""
+        """Return some of the places, others for other motions; fewer of a long chain, because moves number the square of the places."""
         count = max(1, min(count, 3 * count // len(self.names)))
         some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
         return self.spread[np.unique(some)]

@@ -16,14 +16,14 @@ from imu_calibration.effects.columns import columns
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
+from imu_calibration.planning import windows
 from imu_calibration.planning.belief import exact_information
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import DONE, make_planner
-from imu_calibration.planning.separation import make_separator
-from imu_calibration.planning import windows
 from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.planning.separation import make_separator
 from imu_calibration.planning.windows import SAMPLING, WindowPredictor
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
