@@ -50,6 +50,8 @@ class ImuSamples(_Columns):
     """Angular rate in the sensor frame, rad/s, shape (n, 3)."""
     frame_id: str = ''
     """Frame of the first message."""
+    corrected: np.ndarray | None = None
+    """Corrected specific force and rate that belong to the readings, shape (n, 6), where a calibration is checked."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -241,7 +241,8 @@ def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
     """Return the calibration with weak values replaced by their prior where that lowers the expected error (`replace_weak`)."""
     held = np.array([status == HELD for status in hand.statuses])
     nominal = dict.fromkeys(FIXED, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
-    weak = np.flatnonzero(~held & (hand.sd > hand.tolerances))
+    applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
+    weak = np.flatnonzero(~held & (hand.sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
     values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
                                            weak=weak.tolist())
     known = dict(zip(hand.param_names, values))

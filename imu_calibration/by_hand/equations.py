@@ -204,13 +204,6 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
     return small_rotation(-poses.half_turn[turn.last]) @ mat_ji @ small_rotation(-poses.half_turn[turn.first])
 
 
-def turned(model: HandModel, values: np.ndarray, data: TurnData) -> np.ndarray:
-    """Return the matrix that carries directions from the beginning to the end of a turn, as these parameters integrate it, shape (3, 3)."""
-    bias, matrix = values[GYRO_BIAS], unpack(values)[3]
-    further = _further_of_turn(model, State(values, np.zeros((0, 3)), np.zeros((0, 3))), data, bias)
-    return integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further).mat_ji
-
-
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows, from middle to middle."""
     count, i, j = len(state.up), data.first, data.last

@@ -6,12 +6,17 @@ from dataclasses import fields, replace
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
-from imu_calibration.by_hand.equations import COMPONENTS, TurnData, between_middles, build_system, turned
+from imu_calibration.by_hand.equations import COMPONENTS, Poses, TurnData, between_middles, build_system
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX
 from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.by_hand.poses import distinct_attitudes
+from imu_calibration.by_hand.preintegration import integrate_turn
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.proof import compared
 from imu_calibration.calibration.status import HELD
+from imu_calibration.calibration.uncorrected import LAST_SHARE, Uncorrected, uncorrected_in_time
+from imu_calibration.compensation.compensate import compensate
+from imu_calibration.effects.applied import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 
 FOLDS = 8
@@ -30,7 +35,8 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
 
     Every eighth pose is left out with the turns that begin or end there: one step from the solution with their rows left out. The error of
     the accelerometer is the length of its corrected reading in a pose less gravity; that of the gyroscope the angle by which it carries
-    gravity past the pose that a turn ends in. What is too few to leave any out has no entry.
+    gravity past the pose that a turn ends in. Readings are corrected as by compensation; with effects in time the last third of the poses
+    is judged. Too few poses or turns to leave any out: no entry.
 
     Parameters
     ----------
@@ -40,23 +46,42 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     settings : ByHandSettings
 
     """
-    poses, model, known = hand.poses, hand.model, _Rows(hand, turns)
+    poses, model, known, uncorrected = hand.poses, hand.model, _Rows(hand, turns), uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
+    judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
     for fold in range(FOLDS):
         out = np.arange(len(poses.start)) % FOLDS == fold
         if distinct_attitudes(poses.force[~out], settings.pose_apart) < ATTITUDES_LEAST:
             return {}
-        values, part = known.values_without(out), _selected(poses, out)
-        left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last])]
-        norms.append([model.norm_rows(each, part.force, time=part.time, temperature_c=part.temperature_c)[0]**2
-                      for each in (plain, values)])
-        if len(turns) - len(left) >= TURNS_LEAST:
+        values, part = _applied(model, known.values_without(out), uncorrected.centre), _selected(poses, out & judged)
+        left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
+        norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
+                       - hand.gravity)**2 for each in (plain, values)])
+        if left and len(turns) - len(left) >= TURNS_LEAST:
             angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
     proof = {'accelerometer': _entry(norms, 'm/s^2')}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
         proof['gyroscope'] = _entry(angles, PER_TURN)
     return proof
+
+
+def end_by_hand(poses: Poses) -> float:
+    """Return the end of the last pose, s since the first sample."""
+    return float(poses.time[-1] + 0.5 * (poses.stop[-1] - poses.start[-1]) * poses.period)
+
+
+def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
+    """Return the effects in time that compensation replaces by their value at the end of the recording."""
+    values = hand.model.in_model_order(hand.state.values)
+    return uncorrected_in_time(hand.model.model.at(values), values, hand.poses.time, end=end_by_hand(hand.poses))
+
+
+def _applied(model, values, centre):
+    """Return the parameters that compensation applies, in the order of the HandModel."""
+    sensors = model.model
+    known = dict(zip(sensors.param_names, applied_values(sensors, model.in_model_order(values), centre), strict=True))
+    return np.array([known[name] for name in model.param_names])
 
 
 class _Rows:
@@ -86,6 +111,12 @@ class _Rows:
         return values
 
 
+def _turned(model, values, turn):
+    """Return the matrix of a turn, shape (3, 3), integrated from corrected rates."""
+    rates = _corrected(model, values, turn.force, turn.rate, turn.temperature_c).rate
+    return integrate_turn(turn.time, rates, bias=np.zeros(3), matrix=np.eye(3)).mat_ji
+
+
 def _entry(parts, unit):
     before, after = (np.concatenate(side) for side in zip(*parts))
     return compared(before, after, np.ones(len(before)), components=1) | {'unit': unit, 'windows': len(before)}
@@ -97,13 +128,20 @@ def _selected(poses, mask):
     return replace(poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)})
 
 
+def _corrected(model, values, force, rate, temperature_c):
+    """Return readings as compensation corrects them with some parameters."""
+    own = model.in_model_order(values)
+    known = Calibration(model.model.at(own), own, np.zeros((len(own),) * 2), (HELD,) * len(own))
+    return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
+
+
 def _missed(model, values, poses, turns, gyroscope):
     """Return the angles by which turns are missed, rad, with the accelerometer of `values` and the gyroscope of others."""
     mixed = values.copy()
     for part in (GYRO_BIAS, GYRO_MATRIX, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
-    true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
+    true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
-    carried = np.array([between_middles(poses, turn, turned(model, mixed, turn)) @ up[turn.first] for turn in turns]).reshape(-1, 3)
+    carried = np.array([between_middles(poses, turn, _turned(model, mixed, turn)) @ up[turn.first] for turn in turns]).reshape(-1, 3)
     last = up[[turn.last for turn in turns]].reshape(-1, 3)
     return np.arctan2(np.linalg.norm(np.cross(carried, last), axis=1), (carried * last).sum(axis=1))

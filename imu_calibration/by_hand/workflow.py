@@ -1,7 +1,7 @@
 """A calibration by hand as the same document and result that a calibration on a table gives."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from imu_calibration.by_hand.by_evidence import EvidentHand, solve_by_evidence
 from imu_calibration.by_hand.calibrate import gather_by_hand, with_weak_replaced
 from imu_calibration.by_hand.equations import TurnData
 from imu_calibration.by_hand.options import hand_options
-from imu_calibration.by_hand.proof import prove_by_hand
+from imu_calibration.by_hand.proof import prove_by_hand, uncorrected_by_hand
 from imu_calibration.by_hand.result import HandResult
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
@@ -19,6 +19,7 @@ from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.status import HELD, reasons_held, statuses, tolerances_of
 from imu_calibration.calibration.verdict import judged
+from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
@@ -137,11 +138,15 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     model, gathered = hand.model.model, recording.gathered
     gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     order = [hand.param_names.index(name) for name in model.param_names]
-    terms = {name: np.diag(term)[order] for name, term in hand.terms.items()}
-    covariance = hand.covariance[np.ix_(order, order)]
+    uncorrected, at = uncorrected_by_hand(hand), np.ix_(order, order)
+    values, slope = centred(final := model.at(hand.values[order]), hand.values[order], uncorrected.centre)
+    terms = {name: np.diag(slope @ term[at] @ slope.T) for name, term in hand.terms.items()}
+    covariance = slope @ hand.covariance[at] @ slope.T
     held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
-    calibration = Calibration(model, hand.values[order], covariance, statuses(np.sqrt(np.diag(covariance)), held, tolerances),
+    statistics |= uncorrected.to_mapping()
+    status = statuses(np.sqrt(np.diag(covariance)), held, tolerances)
+    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, covariance, status,
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
                               proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings),

@@ -15,6 +15,8 @@ from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.proof import prove_solution
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.uncorrected import LAST_SHARE, end_of, uncorrected_on_table
+from imu_calibration.effects.applied import in_time, not_applied
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
@@ -75,16 +77,22 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
     model = choose_model(options, table)
     if model.needs_temperature:
         model = model.with_reference_temperature(_first_temperature(sources))
-    again = model
+    again, judged_from = model, 0.0
     for _ in range(PASSES):
         model = again
-        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress)
+        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress, judged_from)
         gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
         solution = solve_gathered(gathered, model, options)
-        again = linearise_again(model, solution)
-        if again is None:
+        again, last_third = linearise_again(model, solution), judged_from_of(solution.model, gathered)
+        if again is None and judged_from == last_third:
             break
+        again, judged_from = again or model, last_third
     return solution, gathered, model
+
+
+def judged_from_of(model: SensorModel, gathered: Gathered) -> float:
+    """Return the time from which windows are judged, s: that of the last third of the recording where the model has effects in time."""
+    return LAST_SHARE * end_of(gathered.accumulator) if any(map(in_time, not_applied(model))) else 0.0
 
 
 def _first_temperature(sources):
@@ -137,9 +145,10 @@ def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, tabl
     tolerances = tolerances_of(solution.model, options.tolerances)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
-    proof = prove_solution(gathered.held_out, solution, model)
+    uncorrected = uncorrected_on_table(solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model)
+    proof = prove_solution(gathered.held_out, solution, model, centre=uncorrected.centre)
     calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof,
-                           changes=changes)
+                           changes=changes, uncorrected=uncorrected)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
 

@@ -1,17 +1,26 @@
 """Is a calibration still good? The proof of any calibration on any recording on a table."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.decision import HELPS, decide, reason_of, worse_regimes
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.gathered import join
+from imu_calibration.calibration.gathered import join, naming
+from imu_calibration.calibration.held_out import HeldOut
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.proof import model_for, prove_calibration
+from imu_calibration.calibration.proof import prove_readings, reference_model, reference_values
+from imu_calibration.compensation.compensate import invertible
+from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.reference.table import Table
+from imu_calibration.samples import TemperatureSamples
+from imu_calibration.segmentation.window import Window
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +57,7 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
                    options: CalibrationOptions = CalibrationOptions(), names: Sequence[str] = (),
                    progress: Callable | None = None) -> CheckResult:
     """
-    Prove a calibration on recordings of its IMU on a table.
+    Return the errors of a calibration on recordings of its IMU on a table, of the readings that compensation writes.
 
     Parameters
     ----------
@@ -71,7 +80,40 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
 
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
-    model = model_for(calibration, table)
+    model, before, after, parts = reference_model(calibration, table), HeldOut(), HeldOut(), []
     step = GatherStep(table, model, options.windows, options.nominal, names, progress=progress)
-    gathered = join(list(map(step, enumerate(sources))), names, lambda part: check_units(part, model, table))
-    return CheckResult(prove_calibration(gathered.held_out, model, calibration), gathered.findings)
+    for session, source in enumerate(sources):
+        windows: list[Window] = []
+        parts.append(naming(names, session)(step.read, _with_corrected(source, calibration, options), session,
+                                            Preflight(table.gravity_value), windows=windows))
+        for raw, corrected in map(_both, (window for window in windows if window.kind != 'unused')):
+            for held_out, window in ((before, raw), (after, corrected)):
+                if len(window) > 1:
+                    held_out.add(reduce_window(window, model, table, session=session, with_pieces=True))
+    gathered = join(parts, names, lambda part: check_units(part, model, table))
+    return CheckResult(prove_readings(before, after, model, reference=reference_values(model, calibration)), gathered.findings)
+
+
+def _with_corrected(source, calibration, options):
+    """Yield the blocks of a recording with corrected readings beside the raw ones, as compensation writes them into a bag."""
+    temperature = None
+    if invertible(calibration.model).needs_temperature:
+        known = [block.temperature for block in source() if block.temperature is not None]
+        temperature = TemperatureSamples.concatenate(known) if known else None
+    stream = CompensationStream(calibration, temperature=temperature)
+    for block in source():
+        if block.imu is not None and len(block.imu):
+            found = stream.correct(options.nominal.apply(block.imu) if options.nominal else block.imu)
+            block = replace(block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate])))
+        yield block
+
+
+def _both(window):
+    """Return a window with raw readings and the same with corrected ones, both without samples that cannot be corrected."""
+    known = np.isfinite(window.corrected).all(axis=1)
+    if not known.all():
+        motion = window.motion.select(known) if len(window.motion) == len(window) else window.motion
+        parts = {name: getattr(window, name)[known] for name in ('stamp_ns', 'time', 'force_s', 'rate_s', 'corrected')}
+        window = replace(window, motion=motion, **parts,
+                         temperature_c=None if window.temperature_c is None else window.temperature_c[known])
+    return window, replace(window, force_s=window.corrected[:, :3], rate_s=window.corrected[:, 3:])

@@ -24,10 +24,10 @@ class Collector:
 
     def __init__(self, table: Table, model: SensorModel, settings: WindowSettings = WindowSettings(), *,
                  nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (), windows: list | None = None,
-                 spread: bool = False):
+                 spread: bool = False, judged_from: float = 0.0):
         self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
         self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
-        self.gathered = Gathered()
+        self.gathered = Gathered(judged_from=judged_from)
 
     def push(self, block: SampleBlock) -> list[Window]:
         """Take a block and return the windows that it completed."""
@@ -111,6 +111,8 @@ class GatherStep:
     """Whether windows are kept to ask for effects."""
     progress: Callable[[int], object] | None = None
     """Called with the number of IMU samples read so far."""
+    judged_from: float = 0.0
+    """Windows from this time on are judged by a proof, s."""
 
     def __call__(self, numbered: tuple[int, Callable]) -> Gathered:
         """Return the Gathered of a recording, given (its number, callable that yields its blocks)."""
@@ -130,8 +132,7 @@ class GatherStep:
 
         """
         collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,),
-                              windows=windows,
-                              spread=self.spread)
+                              windows=windows, spread=self.spread, judged_from=self.judged_from)
         count = 0
         for block in blocks:
             collector.push(block)

@@ -223,6 +223,9 @@ def _section(calibration, section):
         entries[effect.name] = {
             'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.sd[part].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
+        centre = {group.name: calibration.model.centre[group.name] for group in effect.groups if group.name in calibration.model.centre}
+        if centre:
+            entries[effect.name]['centre'] = _plain(centre)
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
         if any(reasons):
             entries[effect.name]['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()

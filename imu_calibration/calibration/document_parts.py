@@ -1,6 +1,7 @@
 """From the mapping of a calibration document to the parts of a `Calibration`: its layout, nothing about its numbers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
             raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; "
                                 "write it anew")
-    return {'model': model.at(values), 'values': values, 'covariance': _covariance(document.get('covariance'), model, entries),
+    return {'model': replace(model.at(values), centre=_centre(model, entries)), 'values': values,
+            'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
             'covariance_terms': _covariance_terms(document, model),
             'held_reason': {name: str(reason) for e in model.effects if 'held_reason' in entries[e.key] for name, reason in zip(
@@ -78,6 +80,17 @@ def _check_unit(found, effect):
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
         raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the calibration file")
+
+
+def _centre(model, entries):
+    """Return column group -> the value from which its columns are measured."""
+    known = {group.name: group for e in model.effects for group in e.groups}
+    found = {name: np.asarray(value, float) for e in model.effects for name, value in (entries[e.key].get('centre') or {}).items()}
+    for name, value in found.items():
+        if name not in known or value.shape != (known[name].width,) or not np.all(np.isfinite(value)):
+            raise DocumentError(f'the centre {shortened(repr(name))} must have one finite number for each column of its effect; '
+                                'correct the calibration file')
+    return found
 
 
 def _covariance_terms(document, model):

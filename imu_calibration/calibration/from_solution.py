@@ -12,7 +12,9 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.status import reasons_held, statuses
+from imu_calibration.calibration.uncorrected import Uncorrected
 from imu_calibration.calibration.verdict import judged
+from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.covariance_terms import GRAVITY, replace_weak, with_term
@@ -39,7 +41,8 @@ def possible_motions(table: Table) -> tuple[Motion, ...] | None:
 
 
 def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gathered: Gathered, needed: dict[str, tuple[str, float]],
-             provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges()) -> Calibration:
+             provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges(),
+             uncorrected: Uncorrected = Uncorrected()) -> Calibration:
     """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its `proof` and the verdict."""
     model = solution.model
     covariance, sd = solution.covariance, solution.sd
@@ -48,14 +51,17 @@ def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gather
     others = _besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))
     undetermined = tuple({'parameters': weights, 'needs': need}
                          for weights, need in (*((each, _need(each, needed)) for each in directions), *others))
-    centred = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
-    gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if centred else 'mount', 'axes': 'mount'}
+    both_arms = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
+    gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if both_arms else 'mount', 'axes': 'mount'}
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
-    calibration = Calibration(model.at(solution.values), solution.values, covariance, status, gathered.frame_id, gauge, undetermined,
-                              statistics(solution, gathered) | changes.to_mapping(), conditions(gathered, table.gravity_value),
+    final = model.at(solution.values)
+    values, slope = centred(final, solution.values, uncorrected.centre)
+    found = statistics(solution, gathered) | changes.to_mapping() | uncorrected.to_mapping()
+    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, slope @ covariance @ slope.T, status,
+                              gathered.frame_id, gauge, undetermined, found, conditions(gathered, table.gravity_value),
                               {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {},
-                              covariance_terms={name: np.diag(term) for name, term in solution.terms.items()},
+                              covariance_terms={name: np.diag(slope @ term @ slope.T) for name, term in solution.terms.items()},
                               held_reason=reasons_held(solution.held, model.param_names, solution.replaced))
     return judged(calibration, tolerances)
 

@@ -50,14 +50,17 @@ class Gathered:
     findings: tuple = ()
     """What a look at the recording found before anything was estimated (`preflight.finding.CheckFinding`)."""
 
+    judged_from: float = 0.0
+    """Windows from this time on are judged by a proof, s."""
+
     def take(self, window: WindowStatistics) -> None:
         """Take a reduced window."""
         self.accumulator.add(window)
-        self.held_out.add(window)
+        self.held_out.add(window, window.time >= self.judged_from)
 
-    def anew(self, windows: Iterable[WindowStatistics]) -> 'Gathered':
-        """Return the same with the windows reduced anew."""
-        fresh = replace(self, accumulator=Accumulator(), held_out=HeldOut())
+    def anew(self, windows: Iterable[WindowStatistics], judged_from: float = 0.0) -> 'Gathered':
+        """Return the same with the windows reduced again."""
+        fresh = replace(self, accumulator=Accumulator(), held_out=HeldOut(), judged_from=judged_from)
         for window in windows:
             fresh.take(window)
         return fresh

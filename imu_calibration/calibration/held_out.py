@@ -31,10 +31,15 @@ class HeldOutBlock:
     """(sensor, regime) -> triangular factor of the rows of short pieces, for judging."""
     counts: dict[str, int] = field(default_factory=dict)
     """Regime -> number of pieces."""
+    judged: int = 0
+    """Windows whose pieces are kept."""
 
-    def add(self, window: WindowStatistics) -> None:
-        """Take a window with its pieces."""
+    def add(self, window: WindowStatistics, judged: bool = True) -> None:
+        """Take a window, and its pieces where it is judged."""
         self.accumulator.add(window)
+        if not judged:
+            return
+        self.judged += 1
         for sensor in SENSORS:
             for regime, rows in window.pieces[sensor].items():
                 stack(self.pieces, (sensor, regime), rows if len(rows) <= rows.shape[1] else triangular(rows))
@@ -49,17 +54,18 @@ class HeldOutBlock:
             stack(self.pieces, key, factor)
         for regime, count in other.counts.items():
             self.counts[regime] = self.counts.get(regime, 0) + count
+        self.judged += other.judged
 
     def copy(self) -> 'HeldOutBlock':
         """Return a block that goes its own way."""
-        return HeldOutBlock(self.accumulator.copy(), dict(self.pieces), dict(self.counts))
+        return HeldOutBlock(self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged)
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
         """Return the block with the columns of the model `narrow` only."""
         chosen = {sensor: np.concatenate([columns[:-AXES], np.arange(-2 * AXES, 0)])
                   for sensor, columns in selected_columns(wide, narrow).items()}
         return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
-                            self.counts)
+                            self.counts, self.judged)
 
 
 @dataclass(eq=False)
@@ -73,10 +79,10 @@ class HeldOut:
 
     blocks: list[HeldOutBlock] = field(default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)])
 
-    def add(self, window: WindowStatistics) -> None:
-        """Take a window with its pieces."""
+    def add(self, window: WindowStatistics, judged: bool = True) -> None:
+        """Take a window, and its pieces where it is judged."""
         dealt = sum(block.accumulator.windows.get(window.kind, 0) for block in self.blocks)
-        self.blocks[dealt % BLOCKS].add(window)
+        self.blocks[dealt % BLOCKS].add(window, judged)
 
     def merge(self, other: 'HeldOut') -> None:
         """Take everything of another one; its windows follow this one's."""
@@ -95,6 +101,11 @@ class HeldOut:
     def n_windows(self) -> int:
         """Windows dealt out."""
         return sum(sum(block.accumulator.windows.values()) for block in self.blocks)
+
+    @property
+    def n_judged(self) -> int:
+        """Windows whose pieces are kept."""
+        return sum(block.judged for block in self.blocks)
 
     def values_without(self, solution: Solution) -> list[np.ndarray]:
         """

@@ -1,9 +1,9 @@
 """
-Does a calibration help on data that took no part? Errors of short pieces before and after, by sensor and by what the IMU does.
+Does a calibration help on held-out data? Errors of short pieces before and after, by sensor and by regime of motion.
 
-The error of a piece is its mean reading, corrected as compensation would correct it, minus what the reference says. Before: with a nominal
-sensor; after: with the calibration. What compensation leaves to others counts for neither: where the table's reference point lies, and how
-late the readings come, are fitted for each of the two. A wrong scale that a lag has bought is so seen as what it is.
+The error of a piece is its mean reading, corrected as compensation corrects it, minus the reference, before with nominal parameters and
+after with the calibration. The position of the table's reference point and the delay of the readings, which compensation does not correct,
+are estimated for each side: so a wrong scale that compensates for a lag is visible.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import numpy as np
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.held_out import HeldOut
+from imu_calibration.effects.applied import Centre, applied_values
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
@@ -26,6 +27,7 @@ LEAST_BLOCKS = 3
 """Blocks below which nothing is said of a regime."""
 LARGEST_DELAY = 0.1
 """A delay is looked for up to this size, s."""
+Side = tuple[HeldOut, Sequence[Sequence[np.ndarray]]]
 UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 
 
@@ -41,11 +43,13 @@ class Errors:
     """Sum of squared errors if nobody asked for a delay."""
 
 
-def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: SensorModel) -> dict:
+def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: SensorModel, *, centre: Centre) -> dict:
     """
-    Return the proof of a solution on windows that took no part: sensor -> entry of a document.
+    Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
 
-    Every fold of windows is predicted with parameters from which it was left out.
+    Every fold of windows is predicted with parameters from which it was left out, as compensation applies them (`applied_values`).
+    The correction is linearised at the reference motion, ``true + matrix^-1 (measured - output(true))``, which the statistics of windows
+    allow; it differs from that of readings by the square of the errors.
 
     Parameters
     ----------
@@ -54,53 +58,54 @@ def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: Sensor
     solution : Solution
     gathered_model : SensorModel
         The model whose columns were gathered.
+    centre : mapping
+        Where effects that compensation cannot undo are applied.
 
     """
-    dealt = held_out.restricted(gathered_model, solution.model)
-    return prove(dealt, solution.model, folds=dealt.values_without(solution), reference=solution.values)
+    dealt, model = held_out.restricted(gathered_model, solution.model), solution.model
+    nominal = nominal_values(model)
+    folds = [applied_values(model, values, centre) for values in dealt.values_without(solution)]
+    described = [_with_reference(model, values, nominal) for values in folds]
+    return prove(model, before=(dealt, ([nominal], [_with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
 
 
-def prove_calibration(held_out: HeldOut, model: SensorModel, calibration: Calibration) -> dict:
-    """Return the proof of any calibration on a recording that was gathered with `model`, which has its effects (`model_for`)."""
-    values = nominal_values(model)
-    for effect in calibration.model.effects:
-        if effect.key in model.slices:
-            values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
-    return prove(held_out, model, folds=[values], reference=values)
+def prove_readings(before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray) -> dict:
+    """
+    Return the proof of corrected readings `after` and raw readings `before`, with the columns of `model`: bias, matrix, reference.
+
+    `reference` has the parameters of the table and the clock, shape (n_params,).
+    """
+    nominal = nominal_values(model)
+    candidates = ([nominal], [_with_reference(model, nominal, reference)])
+    return prove(model, before=(before, candidates), after=(after, candidates))
 
 
-def prove(held_out: HeldOut, model: SensorModel, *, folds: Sequence[np.ndarray], reference: np.ndarray) -> dict:
+def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
     """
     Return sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows', 'seconds', 'delay_s', 'regimes'}.
 
     Parameters
     ----------
-    held_out : HeldOut
-        With the columns of `model`.
     model : SensorModel
-    folds : sequence of array
-        Parameters for the blocks of each fold, in turn.
-    reference : array, shape (n_params,)
-        Parameters of table and clock: each side may be compared with the table as it was estimated or as it was described, whichever suits
-        it better.
+    before, after : tuple
+        (HeldOut with the columns of `model`, candidates): each candidate has parameters for the blocks of each fold, in turn. The candidate
+        with the smaller error counts: each side may be compared with the table as it was estimated or as it was described.
 
     """
-    folds = [_as_compensated(model, values) for values in folds]
-    regimes = [name for name in Regime if any(name in block.counts for block in held_out.blocks)]
-    counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in held_out.blocks])
+    blocks = before[0].blocks
+    regimes = [name for name in Regime if any(name in block.counts for block in blocks)]
+    counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in blocks])
     if (counts.sum(axis=1) > 0).sum() < LEAST_BLOCKS:
         return {}
     proof = {}
     for sensor in SENSORS:
-        described = [_with_reference(model, values, nominal_values(model)) for values in folds]
-        after = min((_errors(held_out, model, sensor, each, regimes) for each in (folds, described)), key=_total)
-        nominal = [nominal_values(model), _with_reference(model, nominal_values(model), reference)]
-        before = min((_errors(held_out, model, sensor, [values], regimes) for values in nominal), key=_total)
-        entry = _entry(before.squares.sum(axis=1), after.squares.sum(axis=1), counts.sum(axis=1))
-        moving = {str(name): _entry(before.squares[:, k], after.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
+        was, now = (min((_errors(dealt, model, sensor, each, regimes) for each in candidates), key=_total)
+                    for dealt, candidates in (before, after))
+        entry = _entry(was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1))
+        moving = {str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
                   if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
-        late = {'delay_s': after.delay, 'delay_explains': 1.0 - after.squares.sum() / max(after.without_delay, 1e-300)}
-        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': held_out.n_windows} | late | {'regimes': moving}
+        late = {'delay_s': now.delay, 'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300)}
+        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
     return proof
 
 
@@ -110,26 +115,25 @@ def nominal_values(model: SensorModel) -> np.ndarray:
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def model_for(calibration: Calibration, table: Table) -> SensorModel:
-    """Return the model with which a recording on a table is gathered to prove a calibration on it."""
+def reference_model(calibration: Calibration, table: Table) -> SensorModel:
+    """Return the model of a recording of corrected readings: bias, matrix, and the effects of the table and the clock that are known."""
     known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
-    sensors = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor
-                             and (same_joints or not effect.in_reference))
-               for sensor in SENSORS}
-    model = SensorModel(sensors['accelerometer'], sensors['gyroscope'], reference=known.reference if same_joints else (),
+    names = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor and (
+        effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and _of_reference(effect))) for sensor in SENSORS}
+    model = SensorModel(names['accelerometer'], names['gyroscope'], reference=known.reference if same_joints else (),
                         joint_names=table.joint_names, temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)
-    model = model.at(np.concatenate([calibration.values[known.slices[effect.key]] for effect in model.effects]))
-    # Where the sensor sits on the table is nobody's error, and each side gets what suits it.
+    model = model.at(reference_values(model, calibration))
+    # The position of the sensor on the table is no error of either side: it is estimated for each.
     return model if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None else model.with_role('accelerometer', Role.ARM)
 
 
-def _as_compensated(model, values):
-    """Return the values with what compensation does not undo at zero; table, clock and lags stay."""
-    values = values.copy()
-    for effect in model.effects:
-        if effect.compensation == 'none' and not _of_reference(effect):
-            values[model.slices[effect.key]] = effect.prior_values()
-    return np.where(np.isfinite(values), values, 0.0)
+def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray:
+    """Return nominal values of the sensors with those of a calibration for the table and the clock, shape (n_params,)."""
+    values = nominal_values(model)
+    for effect in calibration.model.effects:
+        if effect.key in model.slices and _of_reference(effect):
+            values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
+    return values
 
 
 def _with_reference(model, values, reference):

@@ -8,6 +8,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.calibration.reasons import HAND_AXES, listed
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
 
@@ -88,7 +89,7 @@ def usage(calibration: Calibration) -> str:
 
 def caveats(calibration: Calibration) -> list[str]:
     """Return what a user of the calibration should know in addition to the decisions, a line each."""
-    return [text] if (text := missing(calibration)) else []
+    return uncorrected_lines(calibration.statistics) + ([text] if (text := missing(calibration)) else [])
 
 
 def missing(calibration: Calibration) -> str:

@@ -6,6 +6,7 @@ from imu_calibration.calibration.decision import worse_regimes
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.proof import UNITS
 from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet
+from imu_calibration.calibration.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.units import for_people, significant
 
@@ -15,7 +16,8 @@ LOST_SHARE = 0.05
 
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return the notes; arguments as in `verdict.judge`."""
-    return (_worse(calibration) + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
+    remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
+    return (_worse(calibration) + remaining + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
             + _left_out(calibration) + _lost(calibration))
 
 

@@ -74,7 +74,8 @@ class ColumnGroup:
         ref : Reference
             The true motion.
         point : dict
-            'temperature_ref_c', and effect name -> values where columns depend on them (``SensorModel.full_point``).
+            'temperature_ref_c', effect name -> values where columns depend on them, 'centre': group -> value to subtract
+            (``SensorModel.full_point``).
 
         Raises
         ------
@@ -96,6 +97,8 @@ class ColumnGroup:
                 result[:, k] = np.real(column)
                 if self.width > count:
                     result[:, count + k] = np.imag(column) / STEP
+        if self.name in point.get('centre', ()):
+            result -= point['centre'][self.name]
         if self._may_fail and not np.all(np.isfinite(result)):
             raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; "
                              "divide by nothing that "

@@ -60,6 +60,8 @@ class SensorModel:
     """
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
+    centre: dict = field(default_factory=dict)
+    """Column group -> value from which its columns are measured (`effects.applied`)."""
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
@@ -237,10 +239,11 @@ class SensorModel:
         moved = {e.name: np.array(values[self.slices[e.key]], float) for e in self.relinearised}
         return replace(self, point={**self.point, **moved})
 
-    def full_point(self) -> dict[str, float]:
+    def full_point(self) -> dict[str, Any]:
         """Return what the column groups need to know besides the reference."""
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
-        return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
+        centre = {'centre': self.centre} if self.centre else {}
+        return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c, **centre}
 
 
 def linear_names(sensor: str) -> np.ndarray:

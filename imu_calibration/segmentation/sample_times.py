@@ -1,5 +1,6 @@
 """Times of the samples of an IMU: its stamps where they are regular, else those of a clock drawn through them, in bounded memory."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -127,7 +128,7 @@ class SampleTimes:
             return []
         timed, self._held = self._held.select(slice(0, len(times))), self._held.select(slice(len(times), None))
         self.n_rebuilt += len(times)
-        return [ImuSamples(times, timed.force_s, timed.rate_s, timed.frame_id)]
+        return [replace(timed, stamp_ns=times)]
 
     def odd_line(self, count: int) -> StampLine | None:
         """Return how the stamps were where they were not regular, when that concerns more than a few of `count` samples."""

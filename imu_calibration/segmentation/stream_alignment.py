@@ -155,10 +155,11 @@ class MotionChunks:
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
         warmth = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        corrected = None if imu.corrected is None else imu.corrected[core]
         return self._without_lost(PhasedSamples(
             imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, *warmth,
             self._vibration.of(period, imu.force_s[core]), phase[core], quiet[core], after_gap,
-            np.zeros(len(after_gap), bool), joint_step[core]), self._at_edge(imu.stamp_ns[core], limit, final))
+            np.zeros(len(after_gap), bool), joint_step[core], corrected), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):
         """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""

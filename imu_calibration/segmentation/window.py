@@ -55,6 +55,8 @@ class Window:
     """Why the window is unused."""
     joint_step: np.ndarray | None = None
     """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
+    corrected: np.ndarray | None = None
+    """See `ImuSamples`."""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -107,6 +109,8 @@ class PhasedSamples(_Columns):
     """Whether the joints were unknown just before, shape (n,)."""
     joint_step: np.ndarray
     """Steps of the encoders, rad, zero where none show, shape (n, n_joints)."""
+    corrected: np.ndarray | None = None
+    """See `ImuSamples`."""
 
 
 def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
@@ -116,7 +120,7 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
                          None if temperature is None else samples.thermal_branch, samples.vibration)
     motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
-                  samples.joint_step.max(axis=0))
+                  samples.joint_step.max(axis=0), samples.corrected)
 
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:

@@ -29,21 +29,21 @@ def calibrated(pair):
 
 def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
     found = check(pair.second.block, calibrated.calibration, Table.from_mapping(pair.table))
-    assert found.helps and found.exit_code == 0 and str(found).startswith('it helps\n')
+    assert found.helps and found.exit_code == 0 and str(found).startswith('the calibration helps\n')
     assert all(part['after'] < 0.6 * part['before'] for entry in found.proof.values() for part in entry['regimes'].values())
 
 
 def test_a_file_of_another_imu_does_not_help(pair, calibrated):
     other = make_pair(None, 4)
     found = check(other.second.block, calibrated.calibration, Table.from_mapping(other.table))
-    assert not found.helps and found.exit_code == 3 and str(found).startswith('it is not shown to help\n')
+    assert not found.helps and found.exit_code == 3 and str(found).startswith('it helps no sensor\n')
 
 
 def test_a_bias_that_moved_is_named(pair, calibrated):
     imu = pair.second.imu
     moved = replace(pair.second.block, imu=replace(imu, rate_s=imu.rate_s + 0.02))
     found = check(moved, calibrated.calibration, Table.from_mapping(pair.table))
-    assert not found.helps and 'most likely the bias has moved' in found.result.lines[0]
+    assert not found.helps and any('the bias has changed' in line for line in found.result.lines)
 
 
 def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
@@ -58,7 +58,7 @@ def test_progress_is_told_while_a_recording_is_read(pair, calibrated):
 
 
 def test_nothing_to_judge_on_is_no_proof():
-    assert not CheckResult({}).helps and 'cannot be told' in CheckResult({}).lines[0]
+    assert not CheckResult({}).helps and CheckResult({}).lines[0].startswith('unproven: ')
 
 
 def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path, pair, calibrated):
@@ -68,12 +68,12 @@ def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path,
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibrated.calibration))
     assert main(['check', bag, '--calibration', file, '--table', table]) == 0
     out = capsys.readouterr().out
-    assert 'fast turns' in out and 'it helps' in out
+    assert 'fast turns' in out and 'the calibration helps' in out
     spoiled = calibrated.calibration.values.copy()
-    spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.05
+    spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.5
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(replace(calibrated.calibration, values=spoiled)))
     assert main(['check', bag, '--calibration', file, '--table', table]) == 3
-    assert 'it is not shown to help' in capsys.readouterr().out
+    assert 'it helps the accelerometer only' in capsys.readouterr().out
 
 
 def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):

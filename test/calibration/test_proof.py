@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration import held_out, proof
+from imu_calibration.calibration import held_out
 from imu_calibration.calibration.decision import HELPS, reason_of, worse_regimes
+from imu_calibration.effects.applied import applied_values
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
@@ -38,7 +39,7 @@ def test_both_sides_are_compared_with_the_same_table():
     names = [effect.name for effect in CATALOGUE.effects().values() if effect.sensor == 'reference']
     model = SensorModel(reference=tuple(names))
     values = np.arange(1.0, 1.0 + len(model.prior()[0]))
-    kept = proof._as_compensated(model, values)
+    kept = applied_values(model, values)
     assert names and all((kept[model.slices[effect.key]] == values[model.slices[effect.key]]).all() for effect in model.effects if effect.sensor == 'reference')
 
 
