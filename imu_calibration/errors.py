@@ -5,6 +5,9 @@ The core speaks of what must hold. Where something has to be given, the error ca
 that is called there: an option of the command line, a parameter or topic of a node, an argument in a notebook.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 KEYS = {
     'allow_xacro': 'permission to run a .xacro file',
     'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document',
@@ -66,6 +69,12 @@ def shortened(text: str, length: int = 60) -> str:
     """Return a text on one line without control characters, truncated at `length` characters: for received text, which may be anything."""
     text = printable(' '.join(text[:length * 4].split()))
     return text if len(text) <= length else f'{text[:length - 3]}...'
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return '; did you mean NAME?' with the known name that is closest, else an empty text."""
+    close = get_close_matches(name, list(known), n=1)
+    return f'; did you mean {close[0]}?' if close else ''
 
 
 def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:

@@ -24,6 +24,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.covariance_terms import DRIFT, Terms, replace_weak, total, with_term
 from imu_calibration.estimation.model_error import ModelError
+from imu_calibration.progress import report
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
 
@@ -198,6 +199,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
 
     See `calibrate_by_hand`. `point`: effect -> values where its columns are first taken.
     """
+    report('solving')
     poses, turns, settings = data.poses, data.turns, options.settings
     fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
     default, evidence = default_gyroscope(poses, settings)

@@ -25,6 +25,7 @@ from imu_calibration.estimation.shrinkage import shrunk
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.preflight.joint_checks import check_units
+from imu_calibration.progress import report
 from imu_calibration.reference.table import Table
 
 
@@ -82,6 +83,7 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
         model = again
         step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress, judged_from)
         gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
+        report('solving')
         solution = solve_gathered(gathered, model, options)
         again, last_third = linearise_again(model, solution), judged_from_of(solution.model, gathered)
         if again is None and judged_from == last_third:

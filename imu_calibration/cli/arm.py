@@ -2,27 +2,29 @@
 
 from argparse import Namespace
 
-from imu_calibration.by_hand.workflow import read_imu
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.cli.show import console, warn
+from imu_calibration.cli.arguments import BAG
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.errors import InputError
-from imu_calibration.preflight.checks import Preflight, warnings
-from imu_calibration.units import with_sd
-from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
 
-NAME = 'arm'
-HELP = 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.'
+EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
+            'session --imu-topic /front/imu --imu-topic /rear/imu --json')
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('bag', metavar='BAG')
-    parser.add_argument('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
+    common = parser.common.add_argument
+    parser.add_argument('bag', metavar='BAG', help=BAG)
+    common('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.by_hand.relative_arm import estimate_arm
+    from imu_calibration.by_hand.workflow import read_imu
+    from imu_calibration.cli.show import console, warn
+    from imu_calibration.preflight.checks import Preflight, warnings
+    from imu_calibration.units import with_sd
+    from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
     if len(options.imu_topic) != 2:
         raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
     imus = []
@@ -40,4 +42,4 @@ def run(options: Namespace) -> int:
         out.print(f'{axis}: {shown} +- {spread} mm')
     for line in result.lines():
         out.print(line, soft_wrap=True)
-    return 0
+    return VerbResult(0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())})

@@ -2,36 +2,37 @@
 
 from argparse import Namespace
 
-from imu_calibration import files
-from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
+from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.cli.show import show_calibration, warn
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 
-NAME = 'calibrate'
-HELP = 'Write calibration.yaml and report.html from one or several recordings of the same IMU.'
+EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gravity 9.81 --output result')
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('bags', nargs='+', metavar='BAG', help='rosbag2 folder, .db3, .mcap or ROS 1 .bag')
-    parser.add_argument('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    parser.add_argument('--gravity', type=float, help='local gravity in m/s^2 for calibration by hand or with --urdf, default 9.80665')
-    parser.add_argument('--earlier', metavar='FILE', help='calibration.yaml from before, proven on the same recordings (with a table)')
-    parser.add_argument('--no-report', action='store_true', help='write calibration.yaml only')
-    parser.add_argument('--jobs', type=int, help='recordings read side by side, default one per processor')
-    add_stand_arguments(parser, 'without any: by hand, gravity as the reference')
+    common, expert = parser.common.add_argument, parser.expert.add_argument
+    parser.add_argument('bags', nargs='+', metavar='BAG', help=BAG)
+    common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
+    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    expert('--earlier', metavar='FILE', help='calibration.yaml from before, proven on the same recordings (with a table)')
+    common('--no-report', action='store_true', help='write calibration.yaml only')
+    expert('--jobs', type=int, help='recordings read side by side, default one per processor')
+    add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     add_topic_arguments(parser)
     add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
-                                             help='add nothing to the model, whatever the recording demands')
+                                             help='add no effect to the requested model')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
+    from imu_calibration import files
+    from imu_calibration.calibration.document import to_mapping
+    from imu_calibration.cli.show import show_calibration, warn
+    from imu_calibration.use_cases.calibrate import calibrate
     with files.output_folder(options.output) as folder:
         found = calibrate(options.bags, stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices_of(options))
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, hints_of(options), report=not options.no_report)
-        return found.exit_code
+        return VerbResult(found.exit_code, to_mapping(found.calibration))

@@ -1,28 +1,31 @@
 """``imu_calibration check``: is a calibration still good on this recording?"""
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
-from imu_calibration.cli.show import console, warn
-from imu_calibration.preflight.checks import warnings
-from imu_calibration.use_cases.check import check
-from imu_calibration.use_cases.choices import Choices
+from imu_calibration.cli.arguments import BAG, add_stand_arguments, add_topic_arguments, stand_of
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 
-NAME = 'check'
-HELP = 'Say whether a calibration helps on a recording: errors before and after, by sensor and by what the IMU does.'
+EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.yaml',
+            'by_hand_session --calibration result/calibration.yaml --json')
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('bag', metavar='BAG', help='a recording of the IMU that was calibrated')
-    parser.add_argument('--calibration', metavar='FILE', required=True, help='calibration.yaml')
-    add_stand_arguments(parser, 'the reference of this recording')
+    common = parser.common.add_argument
+    parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
+    common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    add_stand_arguments(parser, 'without it: by hand')
     add_topic_arguments(parser)
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Print errors before and after with their interval and the answer; return 0 when it helps, 3 when it does not or cannot be told."""
     from rich.table import Table
+
+    from imu_calibration.cli.show import console, warn
+    from imu_calibration.preflight.checks import warnings
+    from imu_calibration.use_cases.check import check
+    from imu_calibration.use_cases.choices import Choices
     chosen = {name: value for name, value in vars(options).items() if name in Choices.__annotations__}
     found = check(options.bag, options.calibration, stand_of(options), **chosen)
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])
@@ -38,4 +41,4 @@ def run(options: Namespace) -> int:
     out.print(table)
     for line in str(found).splitlines():
         out.print(line, soft_wrap=True, markup=False)
-    return found.exit_code
+    return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -2,14 +2,9 @@
 
 from argparse import Namespace
 
-from imu_calibration import files
-from imu_calibration.calibration import comparison
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.cli.show import console
-from imu_calibration.units import for_people, with_sd
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 
-NAME = 'compare'
-HELP = 'Say whether two calibrations agree, in units of their combined standard deviation.'
+EXAMPLES = ('result/calibration.yaml earlier/calibration.yaml', 'a.yaml b.yaml --json')
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -18,9 +13,14 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('second', metavar='B.yaml')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Compare and print."""
     from rich.table import Table
+
+    from imu_calibration import files
+    from imu_calibration.calibration import comparison
+    from imu_calibration.cli.show import console
+    from imu_calibration.units import for_people, with_sd
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
     out = console()
     table = Table(box=None, pad_edge=False)
@@ -34,4 +34,6 @@ def run(options: Namespace) -> int:
     out.print(table)
     for line in result.lines:
         out.print(line, soft_wrap=True)
-    return 0
+    rows = [{'name': row.name, 'first': row.first, 'second': row.second, 'sd': row.sd, 'unit': row.unit, 'ratio': row.ratio}
+            for row in result.rows]
+    return VerbResult(0, {'rows': rows, 'lines': list(result.lines)})

@@ -2,28 +2,28 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.parser import OneLineParser
-from msg_adapters.csv_log import read_csv
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from msg_adapters.storages import identifiers
-from msg_adapters.write import write_session
 
-NAME = 'convert'
-HELP = 'Write a text log (CSV) as a bag; columns and units are found from the header and from the values, and printed.'
+EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session')
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
+    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('log', metavar='FILE', help='text with a header and columns separated by comma, semicolon, tab or spaces')
-    parser.add_argument('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    parser.add_argument('--columns', metavar='QUANTITY=NAMES:UNIT', nargs='+', default=[],
-                        help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; '
-                        'a name may be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s '
-                        'mdeg/s, rad deg')
-    parser.add_argument('--storage', choices=identifiers(), default='mcap')
+    common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
+    common('--columns', metavar='QUANTITY=NAMES:UNIT', nargs='+', default=[],
+           help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; '
+           'a name may be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s '
+           'mdeg/s, rad deg')
+    expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Read the log, print the columns used, write the bag."""
+    from msg_adapters.csv_log import read_csv
+    from msg_adapters.write import write_session
     log = read_csv(options.log, options.columns)
     for columns in log.columns:
         print(columns)
@@ -31,4 +31,5 @@ def run(options: Namespace) -> int:
         print(f'unused: {", ".join(log.unused)}')
     write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
     print(f'written: {options.output} ({len(log.imu)} Imu)')
-    return 0
+    columns = [{'quantity': c.quantity, 'joint': c.joint, 'names': c.names, 'unit': c.unit, 'origin': c.origin} for c in log.columns]
+    return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': columns, 'unused': log.unused})

@@ -14,6 +14,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
+from imu_calibration.cli.parser import VerbResult
 from imu_calibration.cli.show import console, warn
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, with_hint
@@ -29,13 +30,13 @@ HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical
             'highest_unit')
 
 
-def run_fleet(options: Namespace, settings: CalibrationOptions) -> int:
-    """Calibrate every unit of a folder; return the exit code."""
+def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
+    """Calibrate every unit of a folder."""
     found = find_units(options.folder, options.output)
     table = _table(options, [path for _, paths in found for path in paths])
     units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names) for name, paths in found]
     folder = files.make_folder(options.output)
-    with progress_bar('units', len(units), 'units') as advance:
+    with progress_bar('units', len(units)) as advance:
         mapper = _mapper(options, len(units), lambda result: advance(1))
         results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
     spreads = summarise(results)
@@ -46,7 +47,8 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> int:
     files.write_text(folder / 'units.csv', units_csv(results))
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
     show_fleet(results, spreads, folder, hints=hints_of(options))
-    return fleet_exit_code(results)
+    return VerbResult(fleet_exit_code(results), {'units': list(csv.DictReader(io.StringIO(units_csv(results)))),
+                                              'parameters': list(csv.DictReader(io.StringIO(parameters_csv(spreads))))})
 
 
 def _table(options, bags):

@@ -1,24 +1,25 @@
 """``imu_calibration import``: a calibration that another program made."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
-from imu_calibration.calibration.status import HELD
-from imu_calibration.use_cases.exporting import import_calibration
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 
-NAME = 'import'
-HELP = 'Read the calibration that another program made, so that it can be compared and used.'
+EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
+    common = parser.common.add_argument
     parser.add_argument('file', metavar='FILE', help='what the other program wrote')
-    parser.add_argument('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
-    parser.add_argument('--output', metavar='FILE', required=True, help='calibration.yaml to write')
-    parser.add_argument('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
+    common('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
+    common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
+    common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Read, write, and say what is not known."""
+    from imu_calibration.calibration.status import HELD
+    from imu_calibration.use_cases.exporting import import_calibration
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
@@ -28,4 +29,4 @@ def run(options: Namespace) -> int:
     if held:
         print(f'not in the file, held at the prior: {", ".join(held)}')
     print(f'written: {options.output}')
-    return 0
+    return VerbResult(0, {'output': str(options.output), 'held': held})

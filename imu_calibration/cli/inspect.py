@@ -1,35 +1,33 @@
 """``imu_calibration inspect``: what a recording holds, what looks wrong with it, and what it can determine."""
 
 from argparse import Namespace
+from dataclasses import asdict
 
-from imu_calibration.calibration.result import exit_code
-from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
+from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.cli.show import console, show_findings
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.errors import ImuCalibrationError, with_hint
-from imu_calibration.preflight.checks import refuse
-from imu_calibration.use_cases.choices import calibration_options, topics_of
-from imu_calibration.use_cases.inspect import imu_topics_of, inspect
-from imu_calibration.use_cases.recordings import Topics, existing
-from imu_calibration.use_cases.stand import table_of
-from msg_adapters.bag import KEYS
 
-NAME = 'inspect'
-HELP = 'Topics, rates, gaps, stamps, units and axes that look wrong, motions found, and which parameters the recording can determine.'
+EXAMPLES = ('session', 'session --table table.yaml')
 TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic', 'temperature'))
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('bag', metavar='BAG')
-    add_stand_arguments(parser, 'with it axes and units are compared with the joints, and the motions are found and judged')
+    parser.add_argument('bag', metavar='BAG', help=BAG)
+    add_stand_arguments(parser, 'with it, axes and units are compared with the joints and the motions are listed')
     add_topic_arguments(parser)
     add_model_arguments(parser)
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Read each Imu topic through and print what it is like; with the table also the motions and what they determine."""
+    from imu_calibration.cli.show import console, show_findings
+    from imu_calibration.preflight.checks import refuse
+    from imu_calibration.use_cases.choices import calibration_options, topics_of
+    from imu_calibration.use_cases.inspect import imu_topics_of, inspect
+    from imu_calibration.use_cases.recordings import Topics, existing
+    from imu_calibration.use_cases.stand import table_of
     bag, choices, stand = existing(options.bag), choices_of(options), stand_of(options)
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu))
@@ -50,7 +48,22 @@ def run(options: Namespace) -> int:
             _show_by_hand(out, look.by_hand, hints_of(options))
     if set(codes) == {1}:   # nothing is usable: told on standard error too, as every refusal
         refuse(looks[0].findings)
-    return 3 if any(codes) else 0
+    return VerbResult(3 if any(codes) else 0, {'topics': [asdict(topic) for topic in looks[0].recording.topics],
+                                            'imu': [_document(look) for look in looks]})
+
+
+def _document(look):
+    """Return the findings, streams and parameter statuses of one Imu topic as data."""
+    found = look.calibrated if look.by_hand is None else look.by_hand
+    document = {'topic': look.recording.imu_topic, 'findings': [finding.to_mapping() for finding in look.findings], 'lost': look.lost,
+                'streams': {name: {'count': s.count, 'rate': s.rate, 'duration': s.duration, 'gaps': s.n_gaps, 'dropped': s.dropped}
+                            for name, s in look.streams.items()}}
+    if isinstance(found, ImuCalibrationError):
+        return document | {'not_usable': str(found)}
+    if found is None:
+        return document
+    return document | {'status': dict(zip(found.calibration.param_names, found.calibration.status, strict=True)),
+                       'needs': list(found.calibration.undetermined)}
 
 
 def _show_topics(out, looks):
@@ -73,7 +86,8 @@ def _show_topics(out, looks):
 
 
 def _show_unread(out, recording, hints):
-    """Print which topics were left alone because there is no telling which one belongs to the IMU."""
+    """Print the topics that are not read because several fit."""
+    from msg_adapters.bag import KEYS
     for message_type, key in KEYS.items():
         names = [topic.name for topic in recording.topics if topic.type == message_type]
         if names and getattr(recording, key) is None:
@@ -91,6 +105,7 @@ def _step(step_ns):
 
 def _judge(out, look, hints):
     """Print which motions were found and which parameters they determine; return the exit code."""
+    from imu_calibration.calibration.result import exit_code
     result = look.calibrated
     if result is None or look.refused:
         return 0

@@ -1,33 +1,57 @@
 """The offline tool: ``imu_calibration VERB``."""
 
+import contextlib
+import io
 import os
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
 
-from imu_calibration.cli.hints import hints_of
-from imu_calibration.errors import ImuCalibrationError
-
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-"""The matrices are narrow: threads of BLAS cost more than they give, above all where other programs run."""
+"""The matrices are narrow: several BLAS threads cost more than they save, above all next to other programs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb; return the exit code (0 done, 1 refused, 3 written but not everything was determined or usable)."""
-    from imu_calibration.cli.parser import make_parser  # numpy counts its threads when it is imported
+    """Run one verb; return the exit code (see `parser.EXIT_CODES`)."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    return run(make_parser(*arguments[:1]).parse_args(arguments))
+    try:
+        from imu_calibration.cli.parser import check_verb, make_parser
+        check_verb(arguments)
+        options = make_parser(*arguments[:1]).parse_args(arguments)
+    except KeyboardInterrupt:
+        return _interrupted('imu_calibration')
+    return run(options)
 
 
 def run(options: Namespace) -> int:
-    """Run the verb that was parsed; return its exit code."""
+    """Run the verb that was parsed and print its document where --json asks for it; return the exit code."""
+    from imu_calibration.cli.hints import hints_of
+    from imu_calibration.errors import ImuCalibrationError
+    from imu_calibration.progress import listening
+    prog = f'imu_calibration {options.verb}'
     try:
-        return options.run(options)
+        with contextlib.ExitStack() as stack:
+            if options.json or options.quiet:
+                stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+            if not options.quiet:
+                from imu_calibration.cli.progress_bars import ProgressBars
+                stack.enter_context(listening(stack.enter_context(ProgressBars(verbose=options.verbose))))
+            code, document = options.run(options)
     except ImuCalibrationError as error:
-        print(f'imu_calibration {options.verb}: {error.told(hints_of(options))}', file=sys.stderr)
-        return 1
+        text, code = error.told(hints_of(options)), 1
+        print(f'{prog}: {text}', file=sys.stderr)
+        document = {'error': text, 'key': error.key}
     except BrokenPipeError:
+        sys.stdout = None   # a later flush would fail again
         return 1
     except KeyboardInterrupt:
-        print(f'imu_calibration {options.verb}: stopped; nothing was written', file=sys.stderr)
-        return 1
+        return _interrupted(prog)
+    if options.json:
+        from imu_calibration.cli.json_document import json_text
+        print(json_text(options.verb, code, document))
+    return code
+
+
+def _interrupted(prog):
+    print(f'{prog}: interrupted; nothing was written', file=sys.stderr)
+    return 130

@@ -1,48 +1,49 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from itertools import groupby
 from textwrap import fill
 
-from imu_calibration import files
-from imu_calibration.allan import summary
-from imu_calibration.allan.figures import HORIZON
-from imu_calibration.use_cases.noise import noise
+from imu_calibration.cli.arguments import add_topic_arguments
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 
-NAME = 'noise'
-HELP = 'Identify white noise, bias instability and random walk from a recording at rest, with intervals: noise.yaml and report.html.'
+EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
+    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('bag', metavar='BAG', help='a recording that holds rest, an hour if possible; motion is found and left out')
-    parser.add_argument('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
-    parser.add_argument('--rate', metavar='HZ', type=float, action='append', default=[],
-                        help='also print the discrete figures for this sampling rate; may be repeated')
-    parser.add_argument('--horizon', metavar='S', type=float, default=HORIZON,
-                        help=f'averaging time at which a random walk stands for other slow noise, default {HORIZON:g} s')
-    parser.add_argument('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
-    parser.add_argument('--no-report', action='store_true', help='write noise.yaml only')
-    group = parser.add_argument_group('topics', 'default name, else the only topic of that type')
-    group.add_argument('--imu-topic', metavar='TOPIC', help='sensor_msgs/Imu, default /imu/data_raw')
-    group.add_argument('--temperature-topic', metavar='TOPIC', help='sensor_msgs/Temperature, default /imu/temperature')
+    common('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
+    common('--rate', metavar='HZ', type=float, action='append', default=[],
+           help='also print the discrete figures for this sampling rate; may be repeated')
+    expert('--horizon', metavar='S', type=float, 
+           help='averaging time at which a random walk replaces other slow noise, default 100 s')
+    expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
+    common('--no-report', action='store_true', help='write noise.yaml only')
+    add_topic_arguments(parser, joints=False)
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
+    from imu_calibration import files
+    from imu_calibration.allan.document import to_mapping
+    from imu_calibration.use_cases.noise import noise
+    chosen = {} if options.horizon is None else {'horizon': options.horizon}
     with files.output_folder(options.output) as folder:
         found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, nominal=options.nominal,
-                      horizon=options.horizon)
+                      **chosen)
         for warning in found.warnings:
             print(f'warning: {warning}', file=sys.stderr)
         found.save(folder, report=not options.no_report)
         _show(found, [found.figures.rate, *options.rate], folder, 'noise.yaml' + ('' if options.no_report else ' and report.html'))
-        return found.exit_code
+        return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon))
 
 
 def _show(found, rates, folder, names):
     """Print the figures, what to know about them, and what filters ask for, in 80 columns."""
+    from imu_calibration.allan import summary
     for head, rows in groupby(summary.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
         print(head)
         for row in rows:

@@ -1,61 +1,59 @@
 """``imu_calibration plan``: the motions that bring every parameter within its tolerance."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from textwrap import fill
 
-from imu_calibration import files
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.plan import by_hand, hand_summary, plan, summary
-from imu_calibration.use_cases.progress import progress_bar
 from msg_adapters.storages import identifiers
 
-NAME = 'plan'
-HELP = 'Plan the motions that bring every parameter within its tolerance: plan.yaml, a joint trajectory and report.html.'
+EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
 CHOICES = ('tolerances', 'noise', 'accelerometer_model', 'gyroscope_model', 'reference_model', 'catalogue', 'gravity')
 SHOWN = 12
 """Motions that are printed; plan.yaml has all."""
 
 
-def add_arguments(parser: ArgumentParser) -> None:
+def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--output', metavar='DIR', required=True,
-                        help='folder for plan.yaml, trajectory.yaml, the bag trajectory and report.html')
+    common, expert = parser.common.add_argument, parser.expert.add_argument
+    common('--output', metavar='DIR', required=True,
+           help='folder for plan.yaml, trajectory.yaml, the bag trajectory and report.html')
     add_stand_arguments(parser, 'with limits: range, speed, acceleration')
-    parser.add_argument('--by-hand', action='store_true', help='without a table: poses and turns in words and pictures')
-    parser.add_argument('--motion', choices=('any', 'yaw-only'), default='any',
-                        help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
-    parser.add_argument('--calibration', '--known', metavar='FILE', help='what is known already: calibration.yaml, or the '
-                        '.accumulator.npz that calibration_node saved')
-    parser.add_argument('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
-                        '--calibration contains; at most three minutes')
-    parser.add_argument('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')
-    parser.add_argument('--around', metavar='NAME=DEG,...', default='', help='pose where the motion begins and that it keeps near, every '
-                        'joint (m where it slides)')
-    parser.add_argument('--reach', metavar='DEG', type=float, help='angle to either side of that pose that joints keep to; '
-                        'sliding joints stay')
-    parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
-    parser.add_argument('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
-    parser.add_argument('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
-    parser.add_argument('--imu-rate', type=float, default=100.0, help='Hz, default 100')
-    parser.add_argument('--gravity', type=float, help='local gravity for a robot description, m/s^2')
-    group = parser.add_argument_group('model')
+    common('--by-hand', action='store_true', help='without a table: poses and turns in words and pictures')
+    expert('--motion', choices=('any', 'yaw-only'), default='any',
+           help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
+    common('--calibration', '--known', metavar='FILE', help='what is known already: calibration.yaml, or the '
+           '.accumulator.npz that calibration_node saved')
+    expert('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
+           '--calibration contains; at most three minutes')
+    expert('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')
+    expert('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
+    expert('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
+    expert('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
+    expert('--imu-rate', type=float, default=100.0, help='Hz, default 100')
+    expert('--gravity', type=float, help='local gravity for a robot description, m/s^2')
+    group = parser.expert
     group.add_argument('--accelerometer-model', metavar='MODEL', help='a named model or effect names joined by +; default size_effect')
     group.add_argument('--gyroscope-model', metavar='MODEL', help='the same for the gyroscope; default bias+matrix')
     group.add_argument('--reference-model', metavar='MODEL', help="effects of table and clock joined by +, or 'none'; default table_tilt")
     add_effects_argument(group)
-    parser.add_argument('--storage', choices=identifiers(), default='sqlite3', help='of the bag with the trajectories, default sqlite3')
-    parser.add_argument('--no-bound', action='store_true', help='leave out the lower bound on the time, which takes longest')
-    parser.add_argument('--no-report', action='store_true', help='no report.html')
+    expert('--storage', choices=identifiers(), default='sqlite3', help='of the bag with the trajectories, default sqlite3')
+    expert('--no-bound', action='store_true', help='leave out the lower bound on the time, which takes longest')
+    expert('--no-report', action='store_true', help='no report.html')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Plan into a folder that can be written, print what it promises, return the exit code."""
     if options.by_hand and options.motion == 'any':
         return _run_by_hand(options)
     stand = _stand(options)
-    with files.output_folder(options.output) as folder, progress_bar('planning', 100, 'percent') as advance:
+    from imu_calibration import files
+    from imu_calibration.planning.document import plan_to_mapping
+    from imu_calibration.use_cases.plan import plan
+    from imu_calibration.use_cases.progress import progress_bar
+    with files.output_folder(options.output) as folder, progress_bar('planning', 100) as advance:
         told = 0.0
 
         def progress(share):
@@ -68,10 +66,13 @@ def run(options: Namespace) -> int:
                     **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
-    return made.exit_code
+    return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))
 
 
 def _run_by_hand(options):
+    from imu_calibration import files
+    from imu_calibration.by_hand.hand_plan import hand_plan_to_mapping
+    from imu_calibration.use_cases.plan import by_hand, hand_summary
     with files.output_folder(options.output) as folder:
         made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report)
@@ -80,7 +81,7 @@ def _run_by_hand(options):
     for line in hand_summary(made.plan):
         print(fill(line, 96, subsequent_indent='    '))
     print(f'written: plan.yaml in {folder}')
-    return made.exit_code
+    return VerbResult(made.exit_code, hand_plan_to_mapping(made.plan, made.provenance))
 
 
 def _pose(text):
@@ -102,6 +103,7 @@ def _stand(options):
 
 
 def _show(planned, folder):
+    from imu_calibration.use_cases.plan import summary
     made = planned.plan
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:SHOWN]:
         print(fill(f'until {end:6.1f} s  {motion.words}', 96, subsequent_indent=' ' * 16))

@@ -3,14 +3,11 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.simulation.profiles import profile_names
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.simulate import simulate
 from msg_adapters.storages import identifiers
 
-NAME = 'simulate'
-HELP = 'Write a bag from a simulated session on a turntable, and truth.yaml beside its data.'
+EXAMPLES = ('--output session --seed 1', '--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session')
 NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
          'stamp_jitter_us', 'temperature', 'catalogue')
 """Options that are arguments of `simulate` by the same name."""
@@ -18,33 +15,36 @@ NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_ra
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    parser.add_argument('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
-    parser.add_argument('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
-    parser.add_argument('--size', type=float, default=0.3,
-                        help='size of added effects as a share of the largest plausible one, default 0.3')
-    add_effects_argument(parser)
-    parser.add_argument('--profile', metavar='NAME', default='calibration', help='motion: ' + ', '.join(profile_names()))
-    parser.add_argument('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
-    parser.add_argument('--seed', type=int, default=0, help='seed of noise and motion, default 0')
-    parser.add_argument('--imu-seed', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
-    parser.add_argument('--duration', type=float, help='wanted length, s')
-    parser.add_argument('--imu-rate', type=float, default=100.0, help='Hz, default 100')
-    parser.add_argument('--joint-rate', type=float, default=100.0, help='Hz, default 100')
-    parser.add_argument('--encoder-resolution-deg', type=float, default=0.0, help='step of the joint positions, deg, default none')
-    parser.add_argument('--stamp-jitter-us', type=float, default=0.0,
-                        help='standard deviation of the IMU stamps, microseconds, default none')
-    parser.add_argument('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
-    add_stand_arguments(parser, 'default: a three-axis table')
-    parser.add_argument('--storage', choices=identifiers(), default='sqlite3')
-    parser.add_argument('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
+    common, expert = parser.common.add_argument, parser.expert.add_argument
+    common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
+    common('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
+    common('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
+    expert('--size', type=float, default=0.3,
+           help='size of added effects as a share of the largest plausible one, default 0.3')
+    add_effects_argument(parser.expert)
+    common('--profile', metavar='NAME', default='calibration', help='motion, default calibration; an unknown name lists all')
+    common('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
+    common('--seed', type=int, default=0, help='seed of noise and motion, default 0')
+    expert('--imu-seed', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
+    common('--duration', type=float, help='wanted length, s')
+    expert('--imu-rate', type=float, default=100.0, help='Hz, default 100')
+    expert('--joint-rate', type=float, default=100.0, help='Hz, default 100')
+    expert('--encoder-resolution-deg', type=float, default=0.0, help='step of the joint positions, deg, default none')
+    expert('--stamp-jitter-us', type=float, default=0.0,
+           help='standard deviation of the IMU stamps, microseconds, default none')
+    expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
+    add_stand_arguments(parser, 'default a three-axis table')
+    expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
+    expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Simulate and write."""
+    from imu_calibration.use_cases.simulate import simulate
     made = simulate(options.profile, effects=options.effect, table=stand_of(options), **{name: getattr(options, name) for name in NAMES})
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
     print(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, {len(samples.joints or ())} JointState), '
           'with truth.yaml and table.yaml')
-    return 0
+    return VerbResult(0, {'output': str(options.output), 'seconds': made.duration, 'imu': len(samples.imu or ()),
+                       'joints': len(samples.joints or ())})

@@ -4,13 +4,10 @@ import time
 from argparse import Namespace
 from typing import Any
 
-from imu_calibration.cli.parser import OneLineParser
-from imu_calibration.cli.show import console
-from imu_calibration.cli.watch_screen import NodeStatus, screen
+from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.errors import InputError
 
-NAME = 'watch'
-HELP = 'Watch a running calibration_node: bars in units of tolerance, next motion, streams, first finding; ends with the node.'
+EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
 """Seconds without a word after which the node is gone."""
 PERIOD = 0.25
@@ -18,12 +15,13 @@ PERIOD = 0.25
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
-    parser.add_argument('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
-    parser.add_argument('--once', action='store_true', help='show what there is, and end')
+    common = parser.common.add_argument
+    common('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
+    common('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
+    common('--once', action='store_true', help='show what there is, and end')
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> VerbResult:
     """Show what the node says until it ends."""
     try:
         import rclpy
@@ -36,7 +34,7 @@ def run(options: Namespace) -> int:
     try:
         return _watch(NodeWatcher(context, options.node.strip('/')), options)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        return VerbResult(0)
     finally:
         context.try_shutdown()
 
@@ -44,6 +42,8 @@ def run(options: Namespace) -> int:
 def _watch(watcher, options):
     """Wait for the node, then show it."""
     from rich.live import Live
+
+    from imu_calibration.cli.show import console
     end = time.monotonic() + options.patience
     while not watcher.complete and time.monotonic() < end:
         watcher.spin(PERIOD)
@@ -52,15 +52,16 @@ def _watch(watcher, options):
         raise InputError(f"'{options.node}' must run, nothing came of it on /diagnostics in {options.patience:g} s; start it, or name it "
                          f'with --node, as `ros2 node list` shows it{others}')
     out = console()
-    if options.once:
+    if options.once or options.json:
         out.print(watcher.screen())
-        return 0
+        return VerbResult(0, {'node': watcher.name, 'status': {name: {'level': s.level, 'message': s.message, 'values': s.values}
+                                                            for name, s in watcher.statuses.items()}})
     with Live(watcher.screen(), console=out, refresh_per_second=4, transient=False) as live:
         while time.monotonic() - watcher.heard < GONE:
             watcher.spin(PERIOD)
             live.update(watcher.screen())
     out.print(f'{watcher.name} has ended')
-    return 0
+    return VerbResult(0, {'node': watcher.name})
 
 
 class NodeWatcher:
@@ -90,6 +91,7 @@ class NodeWatcher:
         return bool(self.statuses) and bool(self.picture)
 
     def _take(self, array):
+        from imu_calibration.cli.watch_screen import NodeStatus
         for status in array.status:
             node, _, name = status.name.partition(': ')
             if node == self.name:
@@ -109,4 +111,5 @@ class NodeWatcher:
 
     def screen(self) -> Any:
         """Return what is shown now."""
+        from imu_calibration.cli.watch_screen import screen
         return screen(self.name, self.statuses, self.picture)

@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.progress import reported
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 
@@ -151,7 +152,8 @@ class Search:
         """Return the chosen questions in the order in which they were found, from none or from a first choice."""
         chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
-            scores = [self.score(chosen, q) for q in self.others(chosen)]
+            others = self.others(chosen)
+            scores = [self.score(chosen, q) for q in reported('testing effects', others, len(others))]
             self.history.append(scores)
             good = [s for s in scores if s.significant]
             if not good or len(chosen) >= MOST_FINDINGS:

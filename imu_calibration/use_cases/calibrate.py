@@ -16,6 +16,7 @@ from imu_calibration.calibration.document import Calibration, calibration_to_tex
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
 from imu_calibration.calibration.verdict import Verdict, judged
 from imu_calibration.errors import InputError
+from imu_calibration.progress import report
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
@@ -55,6 +56,7 @@ class Calibrated:
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
+        report('drawing the report')
         from imu_calibration.report.calibration_page import calibration_report
         return calibration_report(self.result)
 
@@ -139,6 +141,6 @@ def _side_by_side(sources, table, options, recordings, jobs):
     names = [name_of(recording) for recording in recordings]
     names = [name if names.count(name) == 1 else f'recording {number}' if isinstance(recording, SampleBlock) else str(Path(recording))
              for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)]
-    with progress_bar('recordings', len(recordings) if jobs > 1 else 0, 'recordings') as advance:
+    with progress_bar('recordings', len(recordings) if jobs > 1 else 0) as advance:
         mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
         return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result

@@ -95,7 +95,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it')
     topics = Topics(imu_topic, None, temperature_topic)
     bag = open_bag(recording, topics, want_joints=False)
-    with bag, progress_bar('compensate', bag.message_counts.get(bag.imu_topic, 0)) as advance:
+    with bag, progress_bar('compensating', bag.message_counts.get(bag.imu_topic, 0)) as advance:
         refuse_corrected(bag.imu_topic)
         stream = CompensationStream(calibration, temperature=temperatures(recording, topics), transfer=transfer)
 

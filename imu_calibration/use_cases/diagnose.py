@@ -10,6 +10,7 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
+from imu_calibration.progress import report
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
@@ -60,6 +61,7 @@ class Diagnosed:
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
+        report('drawing the report')
         from imu_calibration.report.diagnosis_page import diagnosis_report
         return diagnosis_report(self.result)
 
@@ -107,7 +109,7 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, None if table is None else table.joint_names)
     provenance = provenance_of([recording], kept(choices))
-    with progress_bar('diagnose', 100, '%') as advance:
+    with progress_bar('diagnosing', 100) as advance:
         if table is None:
             return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))
         return Diagnosed(diagnose_recording(source, table, options, provenance=provenance, progress=advance))

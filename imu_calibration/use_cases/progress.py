@@ -1,25 +1,20 @@
-"""A progress bar on standard error, only on a terminal."""
+"""The progress of one phase, counted in items."""
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from imu_calibration.progress import report
+
 
 @contextmanager
-def progress_bar(label: str, total: int, unit: str = 'samples') -> Iterator[Callable]:
-    """Give a function that is called with the number of items done since the last call."""
-    if not sys.stderr.isatty() or not total:
-        yield lambda count: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-    columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(), TextColumn('{task.fields[rate]}'),
-               TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(label, total=total, rate='')
+def progress_bar(phase: str, total: float) -> Iterator[Callable[[float], None]]:
+    """Give a function that takes the number of items done since its last call; a total of 0 reports nothing."""
+    done = 0.0
 
-        def advance(count):
-            progress.update(task, advance=count)
-            speed = progress.tasks[task].speed
-            progress.update(task, rate=f'{speed:,.0f} {unit}/s' if speed else '')
-        yield advance
+    def advance(count):
+        nonlocal done
+        done += count
+        if total:
+            report(phase, done, total)
+    advance(0)
+    yield advance

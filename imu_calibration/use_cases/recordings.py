@@ -51,7 +51,7 @@ def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *,
     """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
     recording = open_recording(path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
     total = 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)
-    with recording, progress_bar(Path(path).name, total) as advance:
+    with recording, progress_bar(f'reading {Path(path).name}', total) as advance:
         with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
             for block in blocks:
                 if block.imu is not None:

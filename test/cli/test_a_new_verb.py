@@ -21,15 +21,15 @@ def run(options):
     if options.gravity is None:
         raise InputError('the local gravity must be known, none came; give it', key='gravity')
     print(f'{options.bag} at {options.gravity:g} m/s^2')
-    return 3
+    return parser.VerbResult(3, {'bag': options.bag})
 
 
 @pytest.fixture(autouse=True)
 def weigh(monkeypatch):
     """Add the module and its name for the length of a test."""
-    module = SimpleNamespace(NAME='weigh', HELP='What it weighs.', add_arguments=add_arguments, run=run)
+    module = SimpleNamespace(EXAMPLES=('session.bag --gravity 9.81',), add_arguments=add_arguments, run=run)
     monkeypatch.setitem(sys.modules, 'imu_calibration.cli.weigh', module)
-    monkeypatch.setattr(parser, 'VERBS', (*parser.VERBS, 'weigh'))
+    monkeypatch.setitem(parser.VERBS, 'weigh', 'The weight of a bag.')
 
 
 def test_it_runs_and_its_exit_code_is_that_of_the_program(capsys):
@@ -53,4 +53,4 @@ def test_wrong_arguments_are_refused_with_one_line(arguments, words, capsys):
 def test_help_offers_it(capsys):
     with pytest.raises(SystemExit):
         main(['--help'])
-    assert 'What it weighs.' in capsys.readouterr().out
+    assert 'The weight of a bag.' in capsys.readouterr().out

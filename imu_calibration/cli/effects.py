@@ -1,0 +1,25 @@
+"""``imu_calibration effects``: the catalogue."""
+
+from argparse import Namespace
+
+from imu_calibration.cli.arguments import add_effects_argument
+from imu_calibration.cli.parser import OneLineParser, VerbResult
+
+EXAMPLES = ('', '--effects my_effects.yaml --json')
+
+
+def add_arguments(parser: OneLineParser) -> None:
+    """Declare the arguments."""
+    add_effects_argument(parser.common)
+
+
+def run(options: Namespace) -> VerbResult:
+    """Print one paragraph per effect."""
+    from imu_calibration.use_cases.catalogue import effect_rows
+    rows = effect_rows(options.catalogue)
+    for row in rows:
+        print(f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, compensation {row["compensation"]})')
+        for label in ('text', 'equation', 'needs'):
+            if row[label]:
+                print(f'    {"" if label == "text" else label + ": "}{row[label]}')
+    return VerbResult(0, {'effects': rows})

@@ -1,0 +1,37 @@
+"""Progress of long work: the core reports phases, the command line shows them; without a listener a report costs nothing."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+Item = TypeVar('Item')
+Listener = Callable[[str, float, float], None]
+"""Takes the name of a phase, the amount done and the total; a total of 0 means unknown."""
+
+_listener: ContextVar[Listener | None] = ContextVar('listener', default=None)
+
+
+@contextmanager
+def listening(listener: Listener | None) -> Iterator[None]:
+    """Send the reports of this context to a listener."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def report(phase: str, done: float = 0.0, total: float = 0.0) -> None:
+    """Report the amount done of a phase."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(phase, done, total)
+
+
+def reported(phase: str, items: Iterable[Item], total: int) -> Iterator[Item]:
+    """Yield items and report how many of them are done."""
+    report(phase, 0, total)
+    for number, item in enumerate(items, 1):
+        yield item
+        report(phase, number, total)

@@ -1,0 +1,100 @@
+"""Options and behaviour that all verbs share: help, JSON, quiet, verbose, suggestions, interruption, light start."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from imu_calibration.cli import main as main_module
+from imu_calibration.cli import parser
+from imu_calibration.cli.main import main
+from imu_calibration.progress import listening, report, reported
+
+ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
+SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
+
+
+HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
+"""Heavy modules that the help of a verb may import, by verb; others import none."""
+
+
+@pytest.mark.parametrize('verb', ['--version', *parser.VERBS])
+def test_help_imports_no_heavy_module(verb):
+    program = ('import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
+               'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)')
+    done = subprocess.run([sys.executable, '-c', program, verb, '--help'], cwd=ROOT, capture_output=True, text=True, check=True)
+    found = set(done.stderr.split()) & {'numpy', 'scipy', 'matplotlib', 'rich', 'yaml', 'rosbags', 'jinja2', 'rclpy'}
+    assert found <= HELP_NEEDS.get(verb, set())
+
+
+@pytest.mark.parametrize('verb', parser.VERBS)
+def test_help_fits_a_screen_and_has_two_examples(verb, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    with pytest.raises(SystemExit):
+        main([verb, '--help'])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 60
+    examples = lines[lines.index('examples:') + 1:]
+    assert len(examples) == 2
+    for example in examples:   # each option exists, and all that are required are there
+        words = example.split()
+        assert words[:2] == ['imu_calibration', verb]
+        parser.make_parser(verb).parse_args(words[1:])
+
+
+@pytest.mark.parametrize(('arguments', 'closest'), [(['calibrat', 'x'], 'calibrate'), (['check', 'x', '--calibraton', 'y', '--calibration', 'z'], '--calibration')])
+def test_the_closest_name_is_suggested(arguments, closest, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    error = capsys.readouterr().err
+    assert ended.value.code == 1 and error.count('\n') == 1 and f'did you mean {closest}?' in error
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'keys'), [
+    (['inspect', SESSION], 0, {'topics', 'imu'}),
+    (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),
+    (['effects'], 0, {'effects'}),
+    (['export', '--list'], 0, {'targets'}),
+    (['compare', TRUTH, 'nowhere.yaml'], 1, None),
+])
+def test_json_is_one_document_and_nothing_else(arguments, code, keys, capsys):
+    assert main([*arguments, '--json']) == code
+    document = json.loads(capsys.readouterr().out)
+    assert document['format'] == 'imu_calibration/cli/1' and document['verb'] == arguments[0] and document['exit_code'] == code
+    assert set(document['result']) == keys if keys else 'error' in document['error']
+
+
+def test_quiet_prints_no_result(capsys):
+    assert main(['effects', '--quiet']) == 0
+    assert capsys.readouterr() == ('', '')
+
+
+def test_numbers_that_are_not_finite_become_null():
+    from imu_calibration.cli.json_document import json_text
+    assert json.loads(json_text('x', 0, {'a': float('nan'), 'b': [float('inf'), 1.5]}))['result'] == {'a': None, 'b': [None, 1.5]}
+
+
+def test_verbose_prints_each_phase_with_its_time(capsys):
+    assert main(['inspect', SESSION, '--verbose', '--quiet']) == 0
+    quiet = capsys.readouterr()
+    assert main(['inspect', SESSION, '--verbose']) == 0
+    assert 'reading sample_session: ' in capsys.readouterr().err and quiet.err == ''
+
+
+def test_a_listener_gets_each_step_and_only_in_its_context():
+    seen = []
+    with listening(lambda *step: seen.append(step)):
+        assert list(reported('counting', 'ab', 2)) == ['a', 'b']
+    report('counting', 3, 3)
+    assert seen == [('counting', 0, 2), ('counting', 1, 2), ('counting', 2, 2)]
+
+
+@pytest.mark.parametrize('place', ['run', 'parse'])
+def test_an_interruption_ends_with_130(place, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+    from imu_calibration.cli import effects
+    monkeypatch.setattr(*((effects, 'run') if place == 'run' else (parser, 'make_parser')), interrupt)
+    assert main_module.main(['effects']) == 130
+    assert capsys.readouterr().err.count('\n') == 1
