@@ -18,29 +18,24 @@ SHOWN = 12
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
-    common('--output', metavar='DIR', required=True,
-           help='folder for plan.yaml, trajectory.yaml, the bag trajectory and report.html')
-    add_stand_arguments(parser, 'with limits: range, speed, acceleration')
-    common('--by-hand', action='store_true', help='without a table: poses and turns in words and pictures')
-    expert('--motion', choices=('any', 'yaw-only'), default='any',
-           help='yaw-only: a robot that can only turn about its vertical, by a known angle; needs no table')
-    common('--calibration', '--known', metavar='FILE', help='what is known already: calibration.yaml, or the '
-           '.accumulator.npz that calibration_node saved')
-    expert('--separate', metavar='A,B', default='', help='effects to be told apart instead, first the one that '
-           '--calibration contains; at most three minutes')
-    expert('--diagnosis', metavar='FILE', help='diagnosis.json that names a class of effects to be told apart')
-    expert('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
-    expert('--noise', metavar='FILE', help='noise.yaml of this IMU, from the verb noise, instead of a grade')
-    expert('--tolerances', metavar='FILE', help='standard deviations up to which a parameter counts as determined')
-    expert('--imu-rate', type=float, default=100.0, help='Hz, default 100')
+    common('--output', metavar='DIR', required=True, help='folder for plan.yaml, the trajectory and report.html')
+    add_stand_arguments(parser, 'with limits')
+    common('--by-hand', action='store_true', help='without a table: poses and turns in text and pictures')
+    common('--calibration', '--known', metavar='FILE', help='known already: calibration.yaml or .accumulator.npz')
+    expert('--motion', choices=('any', 'yaw-only'), default='any', help='yaw-only: turns by known angles about the vertical')
+    expert('--separate', metavar='A,B', default='', help='separate these effects; the first is in --calibration')
+    expert('--diagnosis', metavar='FILE', help='diagnosis.json: separate the effects that it names together')
+    expert('--grade', choices=sorted(GRADES), default='industrial', metavar='GRADE', help=f'of the IMU: {", ".join(sorted(GRADES))}')
+    expert('--noise', metavar='FILE', help='noise.yaml of this IMU in place of a grade')
+    expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
+    expert('--imu-rate', type=float, default=100.0, metavar='HZ', help='default 100')
     expert('--gravity', type=float, help='local gravity for a robot description, m/s^2')
-    group = parser.expert
-    group.add_argument('--accelerometer-model', metavar='MODEL', help='a named model or effect names joined by +; default size_effect')
-    group.add_argument('--gyroscope-model', metavar='MODEL', help='the same for the gyroscope; default bias+matrix')
-    group.add_argument('--reference-model', metavar='MODEL', help="effects of table and clock joined by +, or 'none'; default table_tilt")
-    add_effects_argument(group)
-    expert('--storage', choices=identifiers(), default='sqlite3', help='of the bag with the trajectories, default sqlite3')
-    expert('--no-bound', action='store_true', help='leave out the lower bound on the time, which takes longest')
+    expert('--accelerometer-model', metavar='MODEL', help='default size_effect')
+    expert('--gyroscope-model', metavar='MODEL', help='default bias+matrix')
+    expert('--reference-model', metavar='MODEL', help='default table_tilt')
+    add_effects_argument(parser.expert)
+    expert('--storage', choices=identifiers(), default='sqlite3', help='of the trajectory, default sqlite3')
+    expert('--no-bound', action='store_true', help='no lower bound on the time (it takes longest)')
     expert('--no-report', action='store_true', help='no report.html')
 
 
