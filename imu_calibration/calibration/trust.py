@@ -56,9 +56,8 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     if refused.keys() == set(SENSORS):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
         consent = not live or UNPROVEN in words.values()
-        step, key = ('calibrate again, or give your consent', 'anyway') if consent else ('calibrate again', None)
-        raise DocumentError('a calibration must help a sensor on held-out data to be applied, this one does not: '
-                            f'{first} {refused[first]}; {step}', key=key)
+        text = f'a calibration must help a sensor on held-out data to be applied, this one does not: {first} {refused[first]}; calibrate again'
+        raise DocumentError(f'{text}, or give your consent', key='anyway') if consent else DocumentError(text)
     cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
                      if sensor not in refused and words[sensor] is not HELPS)
     return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions)

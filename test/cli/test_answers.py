@@ -32,6 +32,7 @@ def test_there_is_a_page_and_a_picture_for_each_of_ten_questions():
         assert answers.commands(page.read_text()), page.name
 
 
+@pytest.mark.live
 def test_a_page_is_written_with_what_its_commands_print(tmp_path):
     text = 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\n$ printf "c\\n" | grep -c c\nold\n```\n\nand go on'
     with answers.inside(tmp_path):

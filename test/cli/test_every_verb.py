@@ -19,6 +19,7 @@ HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
 """Heavy modules that the help of a verb may import, by verb; others import none."""
 
 
+@pytest.mark.live
 @pytest.mark.parametrize('verb', ['--version', *parser.VERBS])
 def test_help_imports_no_heavy_module(verb):
     program = ('import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
