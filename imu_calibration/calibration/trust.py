@@ -56,7 +56,8 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     if refused.keys() == set(SENSORS):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
         consent = not live or UNPROVEN in words.values()
-        text = f'a calibration must help a sensor on held-out data to be applied, this one does not: {first} {refused[first]}; calibrate again'
+        text = ('a calibration must help a sensor on held-out data to be applied, this one does not: '
+                f'{first} {refused[first]}; calibrate again')
         raise DocumentError(f'{text}, or give your consent', key='anyway') if consent else DocumentError(text)
     cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
                      if sensor not in refused and words[sensor] is not HELPS)

@@ -22,6 +22,8 @@ def add_arguments(parser: OneLineParser) -> None:
     add_stand_arguments(parser, 'with limits')
     common('--by-hand', action='store_true', help='without a table: poses and turns in text and pictures')
     common('--calibration', '--known', metavar='FILE', help='known already: calibration.yaml or .accumulator.npz')
+    common('--around', metavar='NAME=DEG,...', default='', help='pose near which the motion stays, every joint (sliding: m)')
+    common('--reach', metavar='DEG', type=float, help='largest angle from that pose; sliding joints do not move')
     expert('--motion', choices=('any', 'yaw-only'), default='any', help='yaw-only: turns by known angles about the vertical')
     expert('--separate', metavar='A,B', default='', help='separate these effects; the first is in --calibration')
     expert('--diagnosis', metavar='FILE', help='diagnosis.json: separate the effects that it names together')
