@@ -8,6 +8,8 @@ STANDARD_GRAVITY_SD = 0.02
 """What it may be off by where nobody knows the local gravity, m/s^2."""
 MILLI_G = 1e-3 * STANDARD_GRAVITY
 MICRO_G = 1e-6 * STANDARD_GRAVITY
+HOTTEST_C = 200.0
+"""No IMU works above this temperature; a larger reading is in kelvin, degrees C."""
 DEG = math.pi / 180
 DEG_H = DEG / 3600
 ARCMIN = DEG / 60

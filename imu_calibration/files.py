@@ -233,11 +233,34 @@ def put_aside(path: str | PathLike[str]) -> Path:
     return free
 
 
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary files of processes that were killed while they wrote a file; nothing happens where that is impossible."""
+    with suppress(OSError, ValueError):
+        for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
+            number = found.name.split('.')[1]
+            if number.isdigit() and not _is_running(int(number)):
+                found.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:   # of another user
+        pass
+    return True
+
+
+def _ending(path: Path) -> str:
+    return f'{zlib.crc32(path.name.encode(errors="replace")):08x}'
+
+
 @contextmanager
 def _beside(path):
     """Give a name in the same folder that no other process uses; what fails becomes one line, and nothing is left under that name."""
     # A name as long as allowed leaves no room for an ending.
-    beside = path.parent / f'.{os.getpid()}.{zlib.crc32(path.name.encode(errors="replace")):08x}'
+    beside = path.parent / f'.{os.getpid()}.{_ending(path)}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside

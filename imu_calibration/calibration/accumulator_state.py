@@ -88,13 +88,13 @@ def _reading(data):
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
             if header.get('format') != FORMAT:
-                raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove it, "
-                                    'or start without resume')
+                raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove "
+                                    'the file')
             yield header, arrays
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile,
             zlib.error) as error:
-        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this is not '
-                            f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume') from error
+        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or of '
+                            'another kind; remove the file') from error
 
 
 def saved_model(data: bytes) -> SensorModel:

@@ -14,6 +14,7 @@ from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.topics import announce
 from imu_calibration.settings import setting
 from msg_adapters.rosbag2 import Rosbag2
 
@@ -47,6 +48,7 @@ class BagPlayerNode(Node):
         self.settings = declare_parameters(self, PlayerSettings)
         self._bag = self._open()
         self._topics = self._choose()
+        announce(self, [], [*self._topics, *['/clock'] * self.settings.clock], note=f'from the bag {files.user_path(self.settings.bag)}')
         self._players = [self._publisher(name) for name in self._topics]
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)

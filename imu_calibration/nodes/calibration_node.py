@@ -38,9 +38,10 @@ from imu_calibration.nodes.lifecycle import run_node
 from imu_calibration.nodes.live_view import FoxgloveSettings
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
-from imu_calibration.nodes.robot_stand import RobotSettings, chain_of, words_of
+from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.session_reference import reference_of
+from imu_calibration.nodes.topics import announce
 from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window_settings import WindowSettings
@@ -111,6 +112,8 @@ class CalibrationNode(Node):
         self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_by_hand)
         view = declare_parameters(self, FoxgloveSettings, lambda group: self._view.change(group))
         robot = declare_parameters(self, RobotSettings)
+        joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
+        announce(self, ['imu/data_raw', *joints, 'imu/temperature'], ['imu/calibration', 'imu/residual', 'imu/coverage'])
         self._reference = reference_of(chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id),
                                        words_of(robot, self.settings.table_file))
         place = SessionFiles(self.settings.save_file)

@@ -10,7 +10,9 @@ from imu_calibration.calibration import trust
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
+from imu_calibration.constants import HOTTEST_C
 from imu_calibration.nodes.adoption import Adopted
+from imu_calibration.nodes.complaints import REMINDER
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.segmentation.stamping import COUNTED
 
@@ -40,19 +42,21 @@ class CompensatorDiagnostics:
         self._node, self._counts = node, {}
         self._received, self._last_change, self._told_source, self._told_stamps = 0, monotonic(), '', None
         self._temperature: float | None = None
-        self._temperature_at, self._nan_temperatures = monotonic(), 0
+        self._temperature_at, self._unusable_temperatures = monotonic(), ''
+        self._stamps_at: dict = {}
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
     def publish_now(self) -> None:
         """Publish the present state at once."""
         self._publisher.publish_now()
 
-    def note_temperature(self, temperature_c: float) -> None:
-        """Take a temperature that came, which may be NaN."""
-        if np.isfinite(temperature_c):
-            self._temperature, self._temperature_at = temperature_c, monotonic()
-        else:
-            self._nan_temperatures += 1
+    def note_temperature(self, temperature_c: float) -> bool:
+        """Take a temperature; return whether it can be used: finite, and degrees Celsius by its size."""
+        if not np.isfinite(temperature_c) or temperature_c > HOTTEST_C:
+            self._unusable_temperatures = f'in degrees Celsius, {temperature_c:.1f} is kelvin' if temperature_c > HOTTEST_C else 'finite'
+            return False
+        self._temperature, self._temperature_at = temperature_c, monotonic()
+        return True
 
     def collect(self) -> list:
         """Return the list of DiagnosticStatus."""
@@ -62,6 +66,9 @@ class CompensatorDiagnostics:
         serious, notes = self._lines(compensation)
         notes += self._stream(compensation) + [line for each in node.inputs for line in each.faults()]
         node.complaints.now('compensation', notes, serious)
+        doubts = [compensation.slope.doubt] if compensation is not None and compensation.slope.doubt else []
+        node.complaints.now('stamps', doubts, patience=REMINDER)
+        notes += doubts
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
         level = ERROR if serious else WARN if notes else OK
@@ -99,7 +106,8 @@ class CompensatorDiagnostics:
         """Say once how stamps are that are not simply regular; a rate that changes is another line."""
         line = None if compensation is None else compensation.slope.line
         if line is not None and (told := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
-            if line.word == COUNTED or self._told_stamps is not None:
+            if (line.word == COUNTED or self._told_stamps is not None) and monotonic() - self._stamps_at.get(told, -np.inf) >= REMINDER:
+                self._stamps_at[told] = monotonic()
                 self._node.get_logger().info(str(line))
             self._told_stamps = told
 
@@ -116,8 +124,7 @@ class CompensatorDiagnostics:
         notes = []
         for reason, count in self._new_counts(compensation).items():
             (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, compensation))
-        doubts = [compensation.slope.doubt] * bool(compensation.slope.doubt)
-        return serious, notes + doubts + self._outside(compensation) + self._warmth(compensation)
+        return serious, notes + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
         """Return the reasons of which there is more than at any call before: a calibration about to take over has counted nothing."""
@@ -143,9 +150,10 @@ class CompensatorDiagnostics:
         if not compensation.needs_temperature or node.temperature is None:
             return []
         lines = []
-        if self._nan_temperatures:
-            lines.append(f'temperatures on {node.temperature.topic_name} are not finite: they are left out')
-            self._nan_temperatures = 0
+        if self._unusable_temperatures:
+            lines.append(f'temperatures on {node.temperature.topic_name} must be {self._unusable_temperatures}: they are ignored; correct '
+                         'the driver')
+            self._unusable_temperatures = ''
         if monotonic() - self._temperature_at > COLD:
             last = 'none came yet' if self._temperature is None else f'the last one, {self._temperature:.1f} C, stays in use'
             lines.append(f'{node.temperature.silence()}; {last}')

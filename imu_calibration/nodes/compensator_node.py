@@ -32,7 +32,11 @@ from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.static_frames import StaticFrames
+from imu_calibration.nodes.timers import every
+from imu_calibration.nodes.topics import announce
 
+LOOK_FOR_FILE = 1.0
+"""Seconds between two attempts to find a calibration file that is waited for."""
 MARK = '/correction'
 """Behind the name of a corrected topic: a latched topic that says which calibration made it, and that it is corrected."""
 
@@ -55,6 +59,7 @@ class CompensatorNode(Node):
         self._wanted: LiveCompensation | None = None
         self._told: Adopted | None = None
         self.problem, self.corrected_already, self._heard, self.awaited = '', '', '', ''
+        announce(self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected'])
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
         self.complaints = Complaints(self.get_logger())
@@ -75,11 +80,22 @@ class CompensatorNode(Node):
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
-        if self.settings.calibration_file:
+        if (path := self.settings.calibration_file) and not files.user_path(path).exists():
+            if not self.settings.wait_for_file:
+                raise InputError(f"parameter 'calibration_file' must name an existing file, {files.user_path(path)} is missing; correct "
+                                 'it, or wait for it with wait_for_file:=true')
+            self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
+            self.get_logger().info(f'waits for the file {files.user_path(path)}')
+        elif path:
             self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
             self.get_logger().info(f'waiting for a calibration on {self.documents.topic_name}' if self.settings.takes_topic else
                                    "waiting for parameter 'calibration_file'")
+
+    def _look_for_file(self) -> None:
+        if files.user_path(self.settings.calibration_file).exists():
+            self.destroy_timer(self._waiting)
+            self._try("parameter 'calibration_file'", self._load_file, self.settings)
 
     @property
     def compensation(self) -> LiveCompensation | None:
@@ -130,6 +146,8 @@ class CompensatorNode(Node):
             try:
                 callback(*arguments)
             except Exception as error:
+                if not self.context.ok():   # the node is ending, and nothing can be published any more
+                    return
                 self.complaints.event('what came could not be used, the node goes on as before: '
                                       + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
         return call
@@ -224,8 +242,7 @@ class CompensatorNode(Node):
             self._retry()
 
     def _on_temperature(self, message: Temperature) -> None:
-        self.diagnostics.note_temperature(message.temperature)
-        if self.compensation is not None:
+        if self.diagnostics.note_temperature(message.temperature) and self.compensation is not None:
             self.compensation.set_temperature(message.temperature)
 
     def _set_refresh(self, rate: float) -> None:

@@ -22,6 +22,7 @@ class CompensatorSettings:
     calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; '
                                     'empty: wait for imu/calibration',
                                     symptom='nothing is published, diagnostics say why', session=True, path=True)
+    wait_for_file: bool = setting(False, '', 'wait for calibration_file while it does not exist', symptom='the node ends at its start')
     adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
                          'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
                          symptom='a calibration that comes on the topic is not taken, or displaces the file', live=True)

@@ -48,13 +48,13 @@ class Complaints:
         self._said: dict[str, float] = {}
         self._open: dict[str, str] = {}
 
-    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = ()) -> None:
-        """Take all that holds at present according to `source`; what it no longer says is over."""
+    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = PATIENCE) -> None:
+        """Take all present faults of `source`; a fault that it no longer has is over, and is repeated at most every `patience` seconds."""
         present = {kind_of(source, line): (level, line) for level, lines in ((WARNING, warnings), (ERROR, errors)) for line in lines}
         for kind in [kind for kind in self._open if kind.startswith(source + ':') and kind not in present]:
             say(self._logger, INFO, f'over: {self._open.pop(kind)}')
         for kind, (level, line) in present.items():
-            if self._due(kind, REMINDER if kind in self._open else PATIENCE):
+            if self._due(kind, REMINDER if kind in self._open else patience):
                 say(self._logger, level, line)
                 self._open[kind] = line
 

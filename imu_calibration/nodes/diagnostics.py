@@ -64,5 +64,8 @@ class DiagnosticsPublisher:
         prefix = self._node.get_fully_qualified_name().lstrip('/')
         for status in array.status:
             status.name = f'{prefix}: {status.name}'
-        if self._node.context.ok():
+        try:
             self._publisher.publish(array)
+        except Exception:
+            if self._node.context.ok():   # otherwise the node is ending
+                raise

@@ -45,6 +45,7 @@ from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.nodes.timers import every
+from imu_calibration.nodes.topics import announce
 from imu_calibration.planning.noise import expected_noise, require_grade
 from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
@@ -71,6 +72,7 @@ class PlannerNode(Node):
         settings = self.settings
         require_grade(settings.grade)
         robot = declare_parameters(self, RobotSettings)
+        announce(self, ['joint_states', 'imu/calibration', '/diagnostics'], ['joint_trajectory', 'imu/coverage'], note=NOT_CHECKED)
         table = chain_of(self, robot, settings.table_file)
         if table is None:
             raise InputError("planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them")
@@ -105,7 +107,7 @@ class PlannerNode(Node):
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-                               f'{NOT_CHECKED}; nothing moves before ~/start; limits: {self._limit_words()}')
+                               f'nothing moves before ~/start; limits: {self._limit_words()}')
         for line in range_warnings(self._table):
             self.get_logger().warning(line)
 
@@ -199,6 +201,8 @@ class PlannerNode(Node):
         return call
 
     def _failed(self, error: Exception) -> str:
+        if not self.context.ok():   # the node is ending
+            return ''
         line = shortened(f'an internal error: {type(error).__name__}: {error}', 200)
         if self.driver.is_driving or self.worker.doing:
             self.worker.halt(f'{line}: stopped; start again, and report it')

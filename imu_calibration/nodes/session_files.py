@@ -27,6 +27,8 @@ class SessionFiles:
         self.given = bool(save_file)
         self.calibration = files.user_path(save_file or DEFAULT)
         self.saved_at, self.n_saved = time.monotonic(), 0
+        for path in (self.calibration, self.accumulator):
+            files.remove_leftovers(path)
 
     @property
     def accumulator(self) -> Path:

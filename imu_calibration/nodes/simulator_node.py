@@ -33,6 +33,7 @@ from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
+from imu_calibration.nodes.topics import announce
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
@@ -102,6 +103,8 @@ class SimulatorNode(Node):
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
         self._controller = declare_parameters(self, ControllerSettings)
+        announce(self, ['joint_trajectory'], ['imu/data_raw', 'joint_states', *['imu/temperature'] * settings.temperature,
+                                              *['imu/truth'] * settings.truth, *['/clock'] * settings.clock])
         self._table, self._motion = self._make_table()
         model, values = self._true_imu()
         start_ns = int(settings.start_time * 1e9) or time.time_ns()

@@ -255,8 +255,7 @@ TRUST = _of(
      'test_covariance_terms.py'),
 )
 FILES = _of(
-    ('files written where they stand', '_beside', '_1.parent / f".{os.getpid()}.{zlib.crc32(_1.name.encode(errors=\'replace\')):08x}"',
-     '_1', 'test_disk_faults.py test_cli_bad_input.py'),
+    ('files written where they stand', '_beside', '_1.parent / f".{os.getpid()}.{_ending(_1)}"', '_1', 'test_disk_faults.py test_cli_bad_input.py'),
     ('no limit to nesting', 'DEEPEST', '20', '10 ** 9', 'test_documents.py'),
     ('aliases allowed', '_look_through', "_1 == 'AliasEvent'", 'False', 'test_documents.py'),
     ('another model is resumed', '_check', 'not _1.has_columns_of(_2)', 'False', 'test_session_files.py test_live_calibration.py'),
@@ -297,6 +296,12 @@ LIVE = _of(
      'self._rested_at is None or np.any(np.abs(self.position - self._rested_at) > STILL * self.tolerance)', 'test_driving.py'),
     ('nobody waits until the joints rest', 'PlannerWorker._wait_for_rest', 'not self.driver.rests', 'False',
      'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever'),
+    ('frozen stamps go on for ever', 'Driver.observe', 'self.is_driving and (_1 := self.stamp_fault(_2))', 'False',
+     'test_planner_attacked.py::test_stamps_that_stand_still_are_a_fault_within_the_silence'),
+    ('a position that is not finite counts', 'Driver.observe', 'not np.all(np.isfinite(_1))', 'False',
+     'test_planner_attacked.py::test_positions_that_are_not_finite_are_ignored_and_counted_by_joint'),
+    ('an endless joint turns on and on', 'MotionLimits.wound', 'np.where(self.endless, 2 * np.pi * _1, np.inf)',
+     'np.full(len(self), np.inf)', 'test_joint_ranges.py'),
     ('joint states wait in line', 'BatchInput._arrived', 'self.drain()', 'False',
      'test_planner_node.py::test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once'),
     ('a node without work is not woken to end', 'run_node', '_look_again(_1)', 'pass', 'test_node_ends.py'),

@@ -1,13 +1,16 @@
 """compensator_node against bad calibrations, bad documents, bad streams: it refuses, says so, and keeps what it had."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.documents import version_of
+from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
+from imu_calibration.segmentation.stamping import COUNTED, StampLine
 from msg_adapters.encode import encode_imu
 
 from worlds.compensation_cases import random_calibration
@@ -19,12 +22,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import Imu, Temperature  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from imu_calibration.nodes import compensator_diagnostics, inputs, relay_loop  # noqa: E402
+from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs, relay_loop  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.compensator_settings import CompensatorSettings  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 
+from ros.live_station import Station  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
 
 pytestmark = pytest.mark.live
@@ -167,7 +171,7 @@ def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch
     node.convert(MESSAGES[0], {'source_timestamp': 1})
     bench.until(lambda: 'no temperature came yet' in bench.lines().get(STATUS, (0, ''))[1], 'that it waits')
     publisher.publish(Temperature(temperature=float('nan')))
-    bench.until(lambda: 'temperatures on /imu/temperature are not finite' in bench.lines()[STATUS][1], 'NaN')
+    bench.until(lambda: 'temperatures on /imu/temperature must be finite' in bench.lines()[STATUS][1], 'NaN')
     publisher.publish(Temperature(temperature=28.0))
     bench.until(lambda: node.compensation.dt is not None, 'the temperature')
     bench.until(lambda: 'the last one, 28.0 C, stays in use' in bench.lines()[STATUS][1], 'that it stopped')
@@ -213,3 +217,48 @@ def test_a_new_calibration_is_no_error(bench, place):
         bench.status.clear()
         bench.until(lambda: STATUS in bench.status, 'diagnostics')
         assert bench.lines()[STATUS][0] != ERROR
+
+
+def test_a_missing_file_ends_the_node_unless_it_is_waited_for(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(compensator_node, 'LOOK_FOR_FILE', 0.05)
+    missing = tmp_path / 'later.yaml'
+    with pytest.raises(InputError, match='wait_for_file:=true'):
+        bench.start(CompensatorNode, {'calibration_file': str(missing)})
+    node = bench.start(CompensatorNode, {'calibration_file': str(missing), 'wait_for_file': True}, namespace='patient')
+    bench.until(lambda: bench.heard('waits for the file'), 'the line')
+    assert node.adopted is None
+    missing.write_text(GOOD_TEXT)
+    bench.until(lambda: node.adopted is not None, 'the calibration')
+
+
+def test_the_process_of_a_node_whose_file_is_missing_ends_with_code_1(tmp_path):
+    with Station(tmp_path / 'out.txt') as station:
+        process = station.start('compensator_node', {'calibration_file': tmp_path / 'none.yaml'})
+        assert process.wait(60) == 1
+        station.processes.running.clear()
+    lines = (tmp_path / 'out.txt').read_text().splitlines()
+    assert 'reads /imu/data_raw, /imu/calibration, /imu/temperature; publishes /imu/data_corrected' in lines[0]
+    assert lines[1].startswith('error: ') and 'none.yaml' in lines[1] and len(lines) == 2
+
+
+def test_a_temperature_in_kelvin_is_refused(bench, tmp_path):
+    thermal = random_calibration(1, ('accel_thermal_bias',), proof=PROOF)
+    (tmp_path / 'warm.yaml').write_text(calibration_to_text(thermal))
+    node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'warm.yaml')})
+    for temperature, used in ((298.15, None), (25.0, 25.0), (float('nan'), 25.0), (310.0, 25.0)):
+        node._on_temperature(Temperature(temperature=temperature))
+        assert node.diagnostics._temperature == used
+        assert node.compensation.dt == (None if used is None else used - thermal.model.temperature_ref_c)
+    node.diagnostics.publish_now()
+    assert bench.heard('must be in degrees Celsius, 310.0 is kelvin', 'warning') == 1
+
+
+def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, place, monkeypatch):
+    node, now = bench.start(CompensatorNode, {'calibration_file': str(place)}), [1000.0]
+    monkeypatch.setattr(compensator_diagnostics, 'monotonic', lambda: now[0])
+    states = [StampLine(COUNTED, 5_000_000.0), StampLine(COUNTED, 10_000_000.0)]
+    slope = SimpleNamespace(line=None)
+    for second in range(121):
+        now[0], slope.line = 1000.0 + second, states[second % 2]
+        node.diagnostics._tell_stamps(SimpleNamespace(slope=slope))
+    assert bench.heard(str(states[0]), 'info') == 3 and bench.heard(str(states[1]), 'info') == 2

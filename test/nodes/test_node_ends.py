@@ -14,6 +14,8 @@ from imu_calibration.nodes.early_end import is_node_process
 from imu_calibration.nodes.parameter_files import settings_of
 from imu_calibration.settings import describe
 
+from ros.live_station import TABLE, Station
+
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.live
 SLOW_IMPORT = "import pathlib, time\npathlib.Path({mark!r}).touch()\ntime.sleep(60)\n"
@@ -126,3 +128,47 @@ def test_other_programs_keep_their_interrupt(monkeypatch):
     assert is_node_process()
     monkeypatch.setattr(sys, 'argv', ['/home/me/ws/install/mine/lib/mine/my_node'])
     assert not is_node_process()
+
+
+PUBLISHES = '''
+import sys
+import rclpy
+from imu_calibration.nodes.compensator_node import CompensatorNode
+from imu_calibration.nodes.planner_node import PlannerNode
+from imu_calibration.nodes.lifecycle import run_node
+
+def spin(node):
+    """A signal ends the context while a callback runs."""
+    rclpy.try_shutdown()
+    node._guarded(broken)()
+    statuses = node.diagnostics if isinstance(node, CompensatorNode) else node._diagnostics
+    statuses.publish_now()
+
+def broken():
+    raise rclpy.handle.InvalidHandle('Failed to publish')
+sys.exit(run_node(CompensatorNode if sys.argv[1] == 'compensator' else PlannerNode, sys.argv[2:], spin=spin))
+'''
+
+
+@pytest.mark.parametrize('name', ['compensator', 'planner'])
+def test_what_cannot_be_published_at_the_end_is_not_printed(name):
+    parameters = ['--ros-args', '-p', f'table_file:={TABLE}'] if name == 'planner' else []
+    done = subprocess.run([sys.executable, '-c', PUBLISHES, name, *parameters], env=environment(), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert 'Failed to publish' not in done.stderr + done.stdout and 'Error' not in done.stderr
+
+
+@pytest.mark.parametrize('node, topics', [
+    ('calibration_node', 'reads /imu/data_raw, /imu/temperature; publishes /imu/calibration, /imu/residual, /imu/coverage'),
+    ('compensator_node', 'reads /raw, /imu/calibration, /imu/temperature; publishes /imu/data_corrected'),
+    ('planner_node', 'reads /joint_states, /imu/calibration, /diagnostics; publishes /joint_trajectory, /imu/coverage; only the limits'),
+    ('simulator_node', 'reads /joint_trajectory; publishes /imu/data_raw, /joint_states'),
+    ('bag_player_node', 'publishes /imu/data_raw, /joint_states; from the bag')])
+def test_the_first_line_names_the_topics(node, topics, tmp_path):
+    with Station(tmp_path / 'out.txt') as station:
+        parameters = {'bag': ROOT / 'bags' / 'sample_session', 'wait_for_subscribers': 100} if node == 'bag_player_node' else {'table_file': TABLE}
+        parameters = {} if node in ('compensator_node', 'calibration_node') else parameters
+        station.start(node, parameters, remappings={'imu/data_raw': '/raw'} if node == 'compensator_node' else {})
+        station.until(lambda: (tmp_path / 'out.txt').read_text().strip(), 'the first line')
+        station.spin_for(0.2)
+    assert topics in (tmp_path / 'out.txt').read_text().splitlines()[0]

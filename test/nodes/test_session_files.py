@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -103,3 +104,25 @@ def test_what_is_put_aside_is_never_written_over(tmp_path):
         (tmp_path / 'a').write_text(str(number))
         assert files.put_aside(tmp_path / 'a') == tmp_path / f'a.{number}'
     assert [(tmp_path / f'a.{number}').read_text() for number in (1, 2)] == ['1', '2']
+
+
+KILLED = '''
+import os, signal, sys
+from imu_calibration import files
+files.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+files.write_whole(sys.argv[1], b'half')
+'''
+
+
+@pytest.mark.live
+def test_what_a_killed_save_left_is_removed_at_the_next_start(tmp_path):
+    target = tmp_path / 'calibration.yaml'
+    done = subprocess.run([sys.executable, '-c', KILLED, str(target)], timeout=60)
+    assert done.returncode == -signal.SIGKILL
+    left, = tmp_path.iterdir()
+    running = tmp_path / f'.{os.getpid()}.{left.name.split(".")[2]}'   # of a process that is writing now
+    others = [tmp_path / name for name in ('.12.note', '.hidden', '.99999999.00000000')]
+    for path in (running, *others):
+        path.write_text('kept')
+    SessionFiles(str(target))
+    assert set(tmp_path.iterdir()) == {running, *others}
