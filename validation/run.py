@@ -19,7 +19,7 @@ from imu_calibration.errors import ImuCalibrationError  # noqa: E402
 from validation.recordings import VARIABLE, data_folder  # noqa: E402
 from validation.section import Section, claims_table, text  # noqa: E402
 
-SECTIONS = ('cross', 'misfit', 'shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'peers', 'held_out', 'noise', 'inspecting', 'diagnosing')
+SECTIONS = ('cross', 'decisions', 'misfit', 'shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'peers', 'held_out', 'noise', 'inspecting', 'diagnosing')
 HEADING = '## How good is it\n'
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 

@@ -9,6 +9,7 @@ from imu_calibration.by_hand.calibrate import HandCalibration, HandData, default
 from imu_calibration.by_hand.inquiry import POSES_LEAST, HandInvestigation, investigate_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.calibration.model_changes import ModelChanges
+from imu_calibration.calibration.plausibility import one_significant
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.estimation.covariance_terms import REJECTED, with_term
@@ -48,16 +49,32 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
     """
     if as_asked or len(data.poses.start) < POSES_LEAST:
         return EvidentHand(solve_by_hand(data, options))
-    found = investigate_by_hand(data, options, progress)
-    asked, names = _asked(data, options), found.names
+    found, asked = investigate_by_hand(data, options, progress), _asked(data, options)
+    while faint := _faint(hand := _solved(data, found, options), found, asked):
+        found = replace(found, named=[q for q in found.named if q not in faint], denied=[*found.denied, *faint])
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
     changes = ModelChanges(added, tuple(question.name for question in found.denied),
                            {question.name: found.inquiry.share(found.named, question) for question in found.implausible})
-    base = found.baseline.model.model
+    return EvidentHand(hand, found, changes)
+
+
+def _solved(data, found, options):
+    """Return the calibration with the model that is asked for and what was found; that of the search where it is the same."""
+    asked, names, base = _asked(data, options), found.names, found.baseline.model.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
-    if same and not (found.denied or found.implausible):
-        return EvidentHand(found.baseline, found, changes)   # it is solved already
-    return EvidentHand(extended_by_hand(data, found, options), found, changes)
+    return found.baseline if same and not (found.denied or found.implausible) else extended_by_hand(data, found, options)
+
+
+def _faint(hand, found, asked):
+    """Return the effects that were added and are implausible or have no significant coefficient."""
+    faint = []
+    for question in found.adopted:
+        effect, part = question.effect, hand.model.parts[question.effect.key]
+        at = np.arange(part.start, part.stop - effect.time_constant)
+        values, sd = hand.state.values[at], np.array([hand.sd_of(hand.model.param_names[k]) for k in at])
+        if question.name not in asked[question.sensor] and (effect.surpasses(values) or not one_significant(values, sd)):
+            faint.append(question)
+    return faint
 
 
 def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:

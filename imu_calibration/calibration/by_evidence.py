@@ -19,6 +19,7 @@ from imu_calibration.calibration.calibrate import conclude, solve_recordings
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import Demand, ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.plausibility import one_significant
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.chances import chi2_sf
 from imu_calibration.effects.base import Role
@@ -205,13 +206,19 @@ def _named_elsewhere(found, others):
 
 
 def stands_out(solution: Solution, question: Question) -> bool:
-    """Return whether an effect differs from nothing by more than chance, with standard deviations that allow for what the model misses."""
+    """
+    Return whether an effect belongs into the model of a solution, with standard deviations that include all allowances.
+
+    Its size is plausible, by the threshold that the verdict uses; it differs from its prior significantly, and so does one coefficient.
+    """
     effect, part = question.effect, solution.model.slices[question.sensor, question.name]
     at = np.arange(part.start, part.stop - effect.time_constant)
-    at = at[~solution.held[at]]
-    if not len(at):
+    if effect.surpasses(solution.values[at]):
         return False
+    at = at[~solution.held[at]]
     far = (solution.values - make_prior(solution.model).mean)[at]
+    if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
+        return False
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
     known = sizes > SURE * sizes[-1]   # arms of three sensors add up to nothing by convention
     return bool(chi2_sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)

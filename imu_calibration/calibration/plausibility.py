@@ -1,8 +1,18 @@
 """Values that no instrument is known to have: what the catalogue knows of grades, held against a calibration."""
 
+import numpy as np
+
 from imu_calibration.calibration.document import Calibration
 
 LOOK_FOR = {'reference': 'such tables are known for: look for a wrong description of the table, a loose mount, wrong stamps'}
+
+ONE = 3.0
+"""Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
+
+
+def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
+    """Return whether one of several coefficients differs from its prior by more than ONE standard deviations."""
+    return bool(np.any(np.abs(distance) > ONE * sd))
 
 
 def beyond_known(share: float, section: str) -> str:

@@ -32,7 +32,8 @@ def _adopted(calibration):
     notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
                     f'{", ".join(_with_size(calibration, name) for name in added)}',
                     "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
-    notes += [Reason(NOTE, f'parts of the recording disagree on {", ".join(denied)}: left out, and the standard deviations allow for it',
+    notes += [Reason(NOTE, f'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is '
+                    f'implausible: {", ".join(denied)}; the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
     lacking = calibration.statistics.get('lacking') or []
     notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '

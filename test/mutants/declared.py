@@ -245,6 +245,8 @@ TRUST = _of(
     ('the mount that bends goes from one side of the proof', 'not_applied', '_1.sensor in SENSORS', 'True',
      'test_proof.py::test_both_sides_are_compared_with_the_same_table'),
     ('effects that are not applied count from zero', 'applied_values', 'centred(_1, _2, _3 or {})[0]', '_2.copy()', 'test_applied.py'),
+    ('one significant coefficient is not required', 'one_significant', 'np.any(np.abs(_1) > ONE * _2)', 'True',
+     'test_by_evidence.py::test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out'),
     ('effects in time are proven on all windows', 'LAST_SHARE', '...', '0.0', 'test_applied.py'),
     ('check corrects with the readings of the reference', '_both', '_1.corrected[:, :3]', '_1.force_s', 'test_applied.py'),
     ('misfit is not a reason', 'MISFIT', '10.0', '1000000000.0', 'test_verdict.py'),
