@@ -215,7 +215,7 @@ def _undetermined(calibration):
 
 def _gravity_unknown(calibration, names):
     by_hand = calibration.gauge.get('axes') == HAND_AXES
-    return by_hand and calibration.conditions.get('gravity') == STANDARD_GRAVITY and set(SCALES) <= set(names)
+    return by_hand and calibration.conditions.get('gravity') == STANDARD_GRAVITY and bool(set(SCALES) & set(names))
 
 
 def _by_need(calibration, names):
