@@ -23,6 +23,8 @@ FOLDS = 8
 """Parts that are left out in turn."""
 ATTITUDES_LEAST = 10
 """So many attitudes must stay when a part is left out: nine parameters of the accelerometer take one equation each."""
+FEW_ATTITUDES = 6
+"""So many must stay when one pose is left out: biases and scale factors of the accelerometer take one equation each."""
 TURNS_LEAST = 6
 """So many turns must stay, and be left out altogether."""
 PER_TURN = 'rad per turn'
@@ -33,10 +35,10 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     """
     Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
 
-    Every eighth pose is left out with the turns that begin or end there: one step from the solution with their rows left out. The error of
-    the accelerometer is the length of its corrected reading in a pose less gravity; that of the gyroscope the angle by which it carries
-    gravity past the pose that a turn ends in. Readings are corrected as by compensation; with effects in time the last third of the poses
-    is judged. Too few poses or turns to leave any out: no entry.
+    Every eighth pose, with few attitudes one pose, is left out with the turns that begin or end there: one step from the solution with
+    their rows left out. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
+    gyroscope the angle by which it carries gravity past the pose that a turn ends in. Readings are corrected as by compensation; with
+    effects in time the last third of the poses is judged. Too few poses or turns to leave any out: no entry.
 
     Parameters
     ----------
@@ -50,20 +52,29 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     plain = replace(model, gyro_factor=1.0).nominal
     judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
-    for fold in range(FOLDS):
-        out = np.arange(len(poses.start)) % FOLDS == fold
-        if distinct_attitudes(poses.force[~out], settings.pose_apart) < ATTITUDES_LEAST:
-            return {}
+    for out in _folds(poses, settings):
         values, part = _applied(model, known.values_without(out), uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
         norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
                        - hand.gravity)**2 for each in (plain, values)])
         if left and len(turns) - len(left) >= TURNS_LEAST:
             angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
+    if not norms:
+        return {}
     proof = {'accelerometer': _entry(norms, 'm/s^2')}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
         proof['gyroscope'] = _entry(angles, PER_TURN)
     return proof
+
+
+def _folds(poses, settings):
+    """Return masks of the poses to leave out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
+    number = np.arange(len(poses.start))
+    for count, least in ((FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
+        folds = [number % count == fold for fold in range(count)]
+        if all(distinct_attitudes(poses.force[~out], settings.pose_apart) >= least for out in folds):
+            return folds
+    return []
 
 
 def end_by_hand(poses: Poses) -> float:

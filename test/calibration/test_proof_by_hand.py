@@ -51,7 +51,10 @@ def test_an_imu_without_errors_is_not_helped_and_says_so():
     assert found.verdict.word is not HELPS and found.exit_code == 3
 
 
-def test_six_faces_are_too_few_to_leave_any_out():
-    imu, ranges, _ = simulate(4, n_poses=8)
-    few = gather_by_hand(imu, ranges)
-    assert prove_by_hand(solve_by_hand(few, OPTIONS), few.turns, OPTIONS.settings) == {}
+def test_few_attitudes_are_left_out_one_by_one_and_six_are_too_few():
+    for poses, windows in ((6, None), (8, 8), (9, 9), (20, 20)):
+        imu, ranges, _ = simulate(4, n_poses=poses)
+        data = gather_by_hand(imu, ranges)
+        found = prove_by_hand(solve_by_hand(data, OPTIONS), data.turns, OPTIONS.settings)
+        assert found.get('accelerometer', {}).get('windows') == windows
+        assert not found or found['accelerometer']['ci95'][1] < 1.0
