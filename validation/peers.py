@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.effects.forward_equations import predict
@@ -15,6 +14,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.use_cases.calibrate import calibrate
+from validation.hand_peers import imu_calib, imu_tk, norm_fit, six_faces, turned
 from validation.second_opinions import Forward, fit_norm
 from validation.section import Section, text
 
@@ -25,6 +25,9 @@ TABLE_SECONDS = 300.0
 BEHIND = 1.25
 """Level or a little behind the best peer."""
 GRAVITY = 9.81
+TRIAL_SEEDS = (8301, 8302, 8303, 8304)
+WITHIN = 1.05
+"""First, or so close to the first."""
 
 
 def kinds():
@@ -62,16 +65,6 @@ def plain(imu, ranges, average):
         return np.concatenate([turned(turn @ inverse.T, step).T @ before - after for turn, before, after in zip(turns, up, up[1:])])
 
     return accelerometer, Forward(bias, least_squares(misses, np.eye(3).ravel(), x_scale='jac').x.reshape(3, 3))
-
-
-def turned(rate, step):
-    """Return the rotation matrix, end to start, of rates at even times between two rests (trapezoids with the commutator of neighbours)."""
-    rate = np.pad(rate, ((1, 1), (0, 0)))
-    mats = Rotation.from_rotvec(0.5 * step * (rate[1:] + rate[:-1]) + step**2 / 12 * np.cross(rate[:-1], rate[1:])).as_matrix()
-    while len(mats) > 1:
-        mats = np.concatenate([mats, np.eye(3)[None]]) if len(mats) % 2 else mats
-        mats = mats[0::2] @ mats[1::2]
-    return mats[0]
 
 
 def plain_on_a_table(block, table):
@@ -121,6 +114,36 @@ def by_hand(make):
     return np.sqrt(np.mean(np.square(rows), axis=0))
 
 
+def trial(make):
+    """Return {method: median errors over the sessions of a trial}; None for a sensor that a method does not calibrate."""
+    found = {}
+    for seed in TRIAL_SEEDS:
+        imu, ranges, values = make(seed)
+        bias_f, matrix_f, bias_w, matrix_w = unpack(values)
+        truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
+        methods = {'ours': ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration),
+                   **{peer.__name__: peer(imu, ranges, GRAVITY) for peer in (imu_tk, imu_calib, norm_fit, six_faces)}}
+        for name, sensors in methods.items():
+            found.setdefault(name, []).append([np.inf] * 2 if sensors is None else
+                                              errors((sensors[0], sensors[1] or Forward(np.full(3, np.inf), np.eye(3))), truth))
+    return {name: np.median(rows, axis=0) for name, rows in found.items()}
+
+
+def trials(section):
+    """Add a claim for each trial of `worlds.hand_trials`, and the table of all methods."""
+    from worlds.hand_trials import TRIALS
+    rows = []
+    for kind, make in TRIALS.items():
+        found = trial(make)
+        mine, peers = found['ours'], np.min([errors for name, errors in found.items() if name != 'ours'], axis=0)
+        section.claim(f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope, against the best peer', f'at most {WITHIN} of it',
+                      '; '.join(f'{1e3 * a:.2f} against {1e3 * b:.2f} {unit}' for a, b, unit in zip(mine, peers, ('mm/s²', 'mrad/s'))),
+                      np.all(mine <= WITHIN * peers))
+        rows.append((kind, *(' / '.join(f'{1e3 * value:.3g}' if np.isfinite(value) else '–' for value in errors) for errors in found.values())))
+    section.say(text('hand_trials', sessions=len(TRIAL_SEEDS)))
+    section.table(('trial (mm/s² / mrad/s)', *(name.replace('_', ' ') for name in found)), rows)
+
+
 def on_a_table():
     """Return rms errors of ours and of plain least squares over all samples, shape (2, 2), where both know all there is."""
     from worlds.physics import make_session
@@ -145,6 +168,7 @@ def run(folder, plots):
                   first > of / 2, True)
     section.claim('the same: our error over that of the better peer, accelerometer and gyroscope', f'at most {BEHIND} in every kind',
                   '; '.join(f'{kind} {force:.2f}, {rate:.2f}' for kind, force, rate in ratios), max(max(both) for _, *both in ratios) <= BEHIND, True)
+    trials(section)
     mine, plainly = on_a_table()
     section.claim('a table, bias and matrix are all there is: our error over that of plain least squares over all samples', f'at most {BEHIND}',
                   f'{mine[0] / plainly[0]:.2f} ({1e3 * mine[0]:.3f} and {1e3 * plainly[0]:.3f} mm/s²), '

@@ -29,11 +29,11 @@ class Forward:
         return np.linalg.norm(np.linalg.solve(self.matrix, (np.asarray(force) - self.bias).T), axis=0) - gravity
 
 
-def fit_norm(force, gravity, cross_axis=True):
+def fit_norm(force, gravity, cross_axis=True, loss='linear'):
     """
     Fit biases and a lower triangular matrix so that the mean readings `force` (n, 3) get the length `gravity`.
 
-    Nine parameters; without `cross_axis` six, which is what six faces can tell.
+    Nine parameters; without `cross_axis` six, which is what six faces can tell. `loss` is that of `scipy.optimize.least_squares`.
     """
     lower = np.tril_indices(3) if cross_axis else np.diag_indices(3)
 
@@ -43,7 +43,7 @@ def fit_norm(force, gravity, cross_axis=True):
         return Forward(values[:3], matrix)
 
     start = np.concatenate([np.zeros(3), np.eye(3)[lower]])
-    return model(least_squares(lambda values: model(values).norm_errors(force, gravity), start, x_scale='jac').x)
+    return model(least_squares(lambda values: model(values).norm_errors(force, gravity), start, x_scale='jac', loss=loss).x)
 
 
 def cut(imu, sections):

@@ -16,7 +16,7 @@ from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTu
 from imu_calibration.by_hand.outliers import possible_turns, without_outliers
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.by_hand.solver import first_state, solve_joint
-from imu_calibration.by_hand.turns import collect_turns, known_turn_data, rising
+from imu_calibration.by_hand.turns import collect_turns, known_turn_data, sample_times
 from imu_calibration.calibration.status import DETERMINED, HELD, statuses
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
@@ -180,7 +180,7 @@ class HandData:
 def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
                    known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
-    time = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    time = sample_times(imu)
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force, settings.pose_apart)
     if attitudes < POSES_LEAST:

@@ -5,6 +5,7 @@ import numpy as np
 from imu_calibration.by_hand.equations import Poses, TurnData
 from imu_calibration.by_hand.options import ByHandSettings, KnownTurn
 from imu_calibration.samples import ImuSamples, runs_of
+from imu_calibration.segmentation.stamping import LAG, LATE, MOST_LOST, WHOLE
 
 TOP = 20
 """Readings below the largest that tell how closely readings lie there."""
@@ -12,6 +13,10 @@ CROWDED = 20.0
 """Times as many readings at the extreme as chance puts there are the end of the range."""
 CERTAIN = 1e-3
 """With chance readings below this, two that are equal are no chance, neighbours neither."""
+LINE = 20.0
+"""A clock counts as straight over so many seconds: long against the jitter of its stamps, short against the drift of its rate."""
+UNDECIDED = 1.02
+"""Interpolation errors at even times may exceed those at the stamps by this factor, from noise."""
 SUMMIT = 3
 """Neighbours that the top of one smooth turn may leave in the same coarse step."""
 
@@ -91,6 +96,39 @@ def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses
     noise_variance = density * (time[piece][-1] - time[piece][0])
     return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
                     rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+
+
+def sample_times(imu: ImuSamples) -> np.ndarray:
+    """
+    Return the times of samples since the first one, s, shape (n,): those of the clock that the stamps follow, or the stamps.
+
+    An even clock is a straight line through the stamps over the count of the samples, in pieces of `LINE` seconds. It is used unless the
+    readings interpolate better from their neighbours at the stamps, as those of a driver do that polls the sensor at uneven moments.
+    """
+    stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    even, period = stamps.copy(), float(np.median(np.diff(stamps)))
+    step = np.diff(stamps) / period
+    count = np.where((step > LATE) & (np.abs(step - np.rint(step)) <= WHOLE), np.rint(step), 1.0)
+    number, edges = np.concatenate([[0.0], np.cumsum(count)]), np.flatnonzero(step > MOST_LOST + LATE) + 1
+    for part in np.split(np.arange(len(stamps)), edges):
+        if len(part) >= 2 * LAG:
+            lines = (_clock_line(each, stamps[part], max(1, int(period * len(part) / LINE))) for each in (number[part], part))
+            line = min(lines, key=lambda line: np.sum((stamps[part] - line)**2))   # long steps of a rebuilt clock need not be lost samples
+            late = np.array([piece.mean() for piece in np.array_split(stamps[part] - line, len(part) // LAG)])
+            even[part] = line if np.abs(late).max() < 0.6 * period else even[part]   # else samples were lost unnoticed
+    return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
+
+
+def _clock_line(number, time, pieces):
+    line = np.polynomial.Polynomial.fit(number, time, 1)(number)
+    means = np.array([[part.mean() for part in np.array_split(values, pieces)] for values in (number, time - line)])
+    return line + np.interp(number, *means)
+
+
+def _roughness(time, rate):
+    """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
+    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
+    return float(np.sum((rate[1:-1] - (1 - share) * rate[:-2] - share * rate[2:])**2))
 
 
 def rising(time: np.ndarray) -> np.ndarray:

@@ -57,14 +57,15 @@ def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, 
     """
     quiet = quiet_samples(force_s, rate_s, period, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
     width = 2 * int(round(BELOW / period / 2)) + 1
-    below = quiet_samples(_smooth(force_s, width), _smooth(rate_s, width), period, ratio=ratio, longest=longest, floor=floors[1],
+    below = quiet_samples(low_passed(force_s, width), low_passed(rate_s, width), period, ratio=ratio, longest=longest, floor=floors[1],
                           resting=resting, spans=SPANS[1:])
     if quiet[resting].all() or width < 3:
         return quiet
     return quiet | (below & _steady(force_s, rate_s, period, ratio=ratio, resting=resting))
 
 
-def _smooth(values, width):
+def low_passed(values: np.ndarray, width: int) -> np.ndarray:
+    """Return the running mean over an odd number of samples, taken three times, shape (n, 3)."""
     for _ in range(3):
         values = uniform_filter1d(values, width, axis=0, mode='nearest')
     return values

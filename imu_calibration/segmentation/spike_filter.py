@@ -15,11 +15,15 @@ NEAR = 4
 """Samples on either side that a reading is compared with."""
 LARGE = 8.0
 """Departures below so many noise sds are left alone."""
-ROUGH = 5.0
-"""Times the roughness of the four nearest neighbours: a knock, a stop and fast twisting are shared by them."""
+SHARE = 0.2
+"""Largest difference of the predictions from either side, as a share of the departure: a knock, a stop and fast twisting exceed it."""
 SPREAD = 10.0
 """Times the spread of the eight neighbours without the two lowest and the two highest."""
-BETWEEN = (0.1, 0.4)
+MARGIN = 0.25
+"""The same in units of `LARGE` noise sds, for the noise of these predictions."""
+SHARED = 1.5
+"""The same for the differences among the four neighbours, whose own noise is 0.4 of this unit: more in two of six readings is a knock."""
+BETWEEN = (0.03, 0.4)
 """A neighbour that departs by more than the first share of a spike, and less than the second, belongs to a knock."""
 TINY = 1e-7
 """Share of the readings below which differences are rounding."""
@@ -32,7 +36,7 @@ class SpikeFilter:
     Passes samples on without spikes; the outcome does not depend on how the stream is cut into pieces.
 
     A reading is a spike when it departs by more than `LARGE` sds of the noise and much more than its neighbours depart from each other:
-    from the cubic through the four nearest, which follows fast motion, or, where one of those is wrong as well, from the median of the
+    from the cubic through the four nearest, which follows fast motion and which the readings on either side alone must meet, or, where one of those is wrong as well, from the median of the
     nine around it (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second
     differences; white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
     """
@@ -70,7 +74,7 @@ class SpikeFilter:
         at = len(self._values) - len(self._held) + np.arange(count)
         spiky = self._spikes(at)
         self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
-        kept = max((at[-1] + 1 - REACH) // CHUNK * CHUNK, 0)
+        kept = max((at[-1] + 1 - REACH) // CHUNK - 1, 0) * CHUNK   # the first row of what is kept has no second difference
         self._values, self._first = self._values[kept:], self._first + kept
         self._noise = self._noise[-2 - (len(self._values) + REACH) // CHUNK:]
         return [samples.select(~spiky) if spiky.any() else samples]
@@ -90,13 +94,15 @@ class SpikeFilter:
         if len(row):
             first = np.clip(at[row] - REACH, 0, len(values) - 2 * REACH - 1)
             window, column = first[:, None] + np.arange(2 * REACH + 1), column[:, None]
+            inner = np.clip(at[row], 2, len(values) - 3)
+            knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (inner == at[row])
             # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike shows in three second
             # differences, two in six
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - NEAR, 0, len(values) - 2 * NEAR - 1)
             around, place = values[first[:, None] + np.arange(2 * NEAR + 1), column], at[row] - first
-            spiky[row[_off_the_cubic(around, place, limit) | _off_the_median(around, place, limit)]] = True
+            spiky[row[~knock & (_contradicted(around, place, limit) | _off_the_median(around, place, limit))]] = True
         return spiky
 
     def _add_noise(self, second):
@@ -129,12 +135,22 @@ def _without_breaks(samples):
             yield samples.select(slice(start, stop))
 
 
-def _off_the_cubic(around, place, limit):
-    """Compare with the cubic through two neighbours on either side; the reading's `place` in `around` is the middle but at the ends."""
+def _knocked(beside, limit):
+    """Return where two or more of the six readings depart in the neighbours `beside` (m, 4, 6) as well: motion reaches several axes."""
+    return np.count_nonzero(np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1) >= 2
+
+
+def _contradicted(around, place, limit):
+    """
+    Compare with the cubic through two neighbours on either side, and with the straight lines through the two on each side alone.
+
+    A motion that differs so much at one reading shows in its neighbours: the impulse response of 0.9 of the Nyquist bandwidth has a tenth
+    there. Both lines must therefore meet the cubic; the reading's `place` in `around` is the middle but at the ends.
+    """
     a, b, x, c, d = around[:, NEAR - 2:NEAR + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
-    rough = np.abs(predicted - 0.5 * (b + c)) + 0.5 * np.abs(d - 2 * c + 2 * b - a)
-    return (place == NEAR) & (np.abs(x - predicted) > np.maximum(1.4 * limit, ROUGH * rough))   # the prediction is as noisy as the reading
+    off, apart = np.abs(x - predicted), np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted))
+    return (place == NEAR) & (off > 1.4 * limit) & (apart < SHARE * off + MARGIN * limit)   # the prediction is as noisy as the reading
 
 
 def _off_the_median(around, place, limit):
@@ -143,5 +159,5 @@ def _off_the_median(around, place, limit):
     off = np.abs(around - ordered[:, [NEAR]])
     own = off[rows, place]
     beside = off[rows[:, None], np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * NEAR)]
-    knock = ((beside > BETWEEN[0] * own[:, None]) & (beside < BETWEEN[1] * own[:, None])).any(axis=1)
+    knock = ((beside > np.maximum(BETWEEN[0] * own, 0.5 * limit)[:, None]) & (beside < BETWEEN[1] * own[:, None])).any(axis=1)
     return (own > np.maximum(limit, SPREAD * (ordered[:, -3] - ordered[:, 2]))) & ~knock

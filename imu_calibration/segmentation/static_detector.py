@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.quiet_detector import SPANS, QuietFloor, least_variance, quiet_samples
+from imu_calibration.segmentation.quiet_detector import BELOW, SPANS, QuietFloor, least_variance, low_passed, quiet_samples
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 _TURNING_SD = 30.0
@@ -16,6 +16,9 @@ _ENOUGH = 6
 """Intervals whose mean rates show how they scatter."""
 _SCATTERS = 8.0
 """A mean rate that stands out from both neighbours by so many times the scatter (and the noise of one sample at least) is a turn."""
+
+_LEAVES = 5.0
+"""A low-passed reading that differs from the mean of the middle half by more than so many sds belongs to the turn before or after."""
 
 _LARGEST_GROWTH = 4.0
 """Bias wander over a long rest adds less variance than this."""
@@ -56,7 +59,8 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     period = np.median(step[step > 0]) / 1e9
     quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=settings.quiet_ratio, longest=settings.static_minimum, floor=QuietFloor())
     found = [piece for piece in _intervals(imu.stamp_ns, quiet, period, settings) if _keeps_attitude(imu.force_s[piece], period)]
-    return _not_turning(imu.rate_s, _at_one_rate(imu.rate_s, found, period, settings.static_minimum))
+    found = _at_one_rate(imu.rate_s, found, period, settings.static_minimum)
+    return _not_turning(imu.rate_s, _trimmed(imu, found, period, settings.static_minimum))
 
 
 def _intervals(stamp_ns, quiet, period, settings):
@@ -98,6 +102,24 @@ def _at_one_rate(rate, found, period, shortest):
 def _least_step(rate):
     """Return the rate step, shape (3,), below which nothing counts: a thousandth of the largest rate."""
     return 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0)
+
+
+def _trimmed(imu, found, period, shortest):
+    """Cut both ends of intervals from where the low-passed readings leave the scatter of the middle: a turn begins below the noise."""
+    first, last = (np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop'))
+    width = 2 * int(round(BELOW / period / 2)) + 1
+    for values in (imu.force_s, imu.rate_s) if found else ():
+        slow = low_passed(values, width)
+        middles = [slice(*np.linspace(a, b, 5).astype(int)[1:4:2]) for a, b in zip(first, last)]
+        centres = [slow[middle].mean(axis=0) for middle in middles]
+        spread = [np.mean((slow[middle] - centre)**2) for middle, centre in zip(middles, centres)]
+        spread = np.maximum(np.maximum(spread, np.median(spread)), least_variance(values) / 3 / width)
+        for k, (middle, centre) in enumerate(zip(middles, centres)):
+            off = np.sum((slow[first[k]:last[k]] - centre)**2, axis=1) > 3 * _LEAVES**2 * spread[k]
+            before, after = off[:middle.start - first[k]], off[middle.stop - first[k]:]
+            last[k] = middle.stop + int(np.argmax(after)) if after.any() else last[k]
+            first[k] = middle.start - int(np.argmax(before[::-1])) if before.any() else first[k]
+    return [slice(int(a), int(b)) for a, b in zip(first, last) if (b - a) * period >= shortest]
 
 
 def _not_turning(rate, found):

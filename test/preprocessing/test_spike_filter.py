@@ -11,6 +11,7 @@ from imu_calibration.by_hand.workflow import read_by_hand
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.spike_filter import SpikeFilter
 
 from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY
@@ -73,6 +74,27 @@ def test_a_knock_a_step_and_coarse_readings_are_no_spikes(session):
                 replace(session, force_s=np.round(session.force_s, 1), rate_s=np.round(session.rate_s, 2)),
                 replace(session, rate_s=np.clip(session.rate_s, -0.8, 0.8))):
         assert cleaned(imu)[1] <= 2   # of 4000; the first reading of a knock may look like one
+
+
+@pytest.mark.parametrize('size', [1, 7, 31])
+def test_the_noise_of_a_chunk_does_not_depend_on_how_the_stream_is_cut(session, size):
+    """The first row of the values that are kept had the second difference of its neighbour."""
+    noises = []
+    for length in (size, len(session)):
+        filtered = SpikeFilter()
+        for start in range(0, 3200, length):
+            filtered.push(session.select(slice(start, min(start + length, 3200))))
+        noises.append(filtered._noise[-1])
+    np.testing.assert_array_equal(*noises)
+
+
+def test_knocks_of_one_reading_that_reach_several_axes_stay(session):
+    """A bang on the table passes a wide filter: nine tenths of it in one reading, the rest in the neighbours, on all axes."""
+    rng, force, rate = np.random.default_rng(8), session.force_s.copy(), session.rate_s.copy()
+    for at in range(60, len(session) - 60, 97):
+        for values, size in ((force, 10.0), (rate, 1.0)):
+            values[at - 1:at + 3] += np.outer([-0.05, 1.0, 0.1, -0.04], size * rng.uniform(0.5, 1.0, 3) * rng.choice([-1, 1], 3))
+    assert cleaned(replace(session, force_s=force, rate_s=rate))[1] <= 3   # of 63; two thirds without the look at the other axes
 
 
 def test_fast_twisting_at_a_low_rate_is_no_spike():

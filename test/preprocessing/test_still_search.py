@@ -9,6 +9,7 @@ from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 from worlds.cleaning import clean_samples
+from worlds.hand_trials import vibration
 
 HZ = 100
 
@@ -106,3 +107,12 @@ def test_real_recordings(recordings, name):
         recording.close()
     (imu,), _ = clean_samples(imu)
     assert least <= len(find_still(imu)) <= most
+
+
+def test_rests_end_where_the_turn_begins_even_in_vibration():
+    imu, ranges, _ = vibration(5, rests=16)
+    found = find_still(imu)
+    assert len(found) == len(ranges)
+    late = [rest.stop - held.stop for rest, held in zip(found, ranges)]
+    assert max(late) <= 3 and min(late) >= -12   # samples of 10 ms; up to 32 by the variance alone
+    assert all(rest.start >= held.start for rest, held in zip(found, ranges))

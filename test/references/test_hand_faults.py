@@ -12,7 +12,7 @@ from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.poses import average_poses
-from imu_calibration.by_hand.turns import at_range_end, rising
+from imu_calibration.by_hand.turns import at_range_end, rising, sample_times
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.preflight.checks import Preflight
@@ -21,6 +21,7 @@ from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.segmentation.static_detector import find_still
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
+from worlds.hand_trials import clean, jitter
 from worlds.physics_hand import clipped, drifting, hold_and_turn, warmed_up, with_slow_turn, with_stamp_jitter, with_wrong_full_scale
 from worlds.physics_table import stand_up
 
@@ -240,3 +241,22 @@ def test_late_stamps_of_even_samples_do_not_reach_the_turns(session):
 
 def test_repeated_stamps_are_spread_over_the_step_that_follows():
     np.testing.assert_allclose(rising(np.array([0.0, 0.01, 0.01, 0.02])), [0.0, 0.01, 0.015, 0.02], atol=1e-6)
+
+
+def test_times_are_those_of_the_clock_that_jittering_stamps_follow():
+    steady, jittering = clean(4, rests=10)[0], read_by_hand([SampleBlock(jitter(4, rests=10)[0])]).imu
+    off = sample_times(jittering) - 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
+    assert np.std(np.diff(off[::150])) < 1e-4   # over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples
+    lost = np.ones(len(steady), bool)
+    lost[[700, 1500, 1501, 2200]] = False
+    np.testing.assert_allclose(np.diff(sample_times(steady.select(lost))), np.diff(steady.select(lost).stamp_ns) * 1e-9, atol=1e-6)
+
+
+def test_times_of_a_sensor_that_is_polled_at_uneven_moments_are_its_stamps():
+    steady = clean(4, rests=10)[0]
+    time = 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
+    polled = time + np.random.default_rng(2).uniform(-2e-3, 2e-3, len(time))
+    rate = np.column_stack([np.interp(polled, time, axis) for axis in steady.rate_s.T])
+    stamps = 10**18 + np.round(1e9 * polled).astype(np.int64)
+    found = sample_times(ImuSamples(stamps, steady.force_s, rate, 'imu_link'))
+    np.testing.assert_allclose(found, 1e-9 * (stamps - stamps[0]), atol=1e-9)
