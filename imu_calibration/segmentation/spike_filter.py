@@ -35,10 +35,11 @@ class SpikeFilter:
     """
     Passes samples on without spikes; the outcome does not depend on how the stream is cut into pieces.
 
-    A reading is a spike when it departs by more than `LARGE` sds of the noise and much more than its neighbours depart from each other:
-    from the cubic through the four nearest, which follows fast motion and which the readings on either side alone must meet, or, where one of those is wrong as well, from the median of the
-    nine around it (Hampel's test). The noise is that of the chunk of samples before or of the samples around, from medians of second
-    differences; white noise passes 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
+    A reading is a spike when it departs by more than `LARGE` sds of the noise, and by much more than its neighbours depart from each other,
+    from the cubic through the four nearest, which follows fast motion and which the readings on either side alone must meet. Where one of
+    these is wrong as well, the median of the nine around it replaces the cubic (Hampel's test). The noise is that of the chunk of samples
+    before or of the samples around, from medians of second differences; white noise passes 8 sds once in 1e15 samples. Source: Pearson et
+    al., EURASIP J. Adv. Signal Process. 2016:87.
     """
 
     def __init__(self) -> None:
