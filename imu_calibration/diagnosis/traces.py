@@ -11,7 +11,7 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window, all_samples
+from imu_calibration.segmentation.window import Window, all_samples, chunks
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""
@@ -59,27 +59,41 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     before, after : Solution
 
     """
-    motion, temperature, rows = all_samples(windows)
-    outputs = {'accelerometer': np.concatenate([w.force_s for w in windows]), 'gyroscope': np.concatenate([w.rate_s for w in windows])}
-    errors, references = [], []
-    for solution in (before, after):
-        model = solution.model.at(solution.values)
-        predicted = predict(model, solution.values, table, motion=motion, temperature_c=temperature)
-        errors.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
-        references.append({s: warped_reference(model, s, table, motion=motion, temperature_c=temperature) for s in SENSORS})
+    solutions = before, after
+    warm = all(window.temperature_c is not None for window in windows)
+    parts = [_errors(group, table, solutions, warm) for group in chunks(windows)]
+    errors = [{s: np.concatenate([part[k][s] for part, _ in parts]) for s in SENSORS} for k in range(len(solutions))]
     time = np.concatenate([w.time for w in windows])
-    navigation = _dead_reckoning(time, (before, after), errors, references, rows)
+    navigation = _dead_reckoning(time, windows, table, solutions=solutions, errors=errors)
     known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
     block, number = _blocks(windows)
 
     def mean(values):
         return _block_mean(np.asarray(values, float)[known], block, number)
-    first = references[0]
+    position, force_s, rate_s, temperature = (None if beside[0] is None else mean(np.concatenate(beside))
+                                              for beside in zip(*(beside for _, beside in parts)))
     kind = np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known]
-    return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))],
-                  mean(motion.position[rows]), mean(first['accelerometer'].force_s[rows]), mean(first['gyroscope'].rate_s[rows]),
-                  None if temperature is None else mean(temperature[rows]), {s: mean(errors[0][s]) for s in SENSORS},
-                  {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
+    return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))], position, force_s, rate_s, temperature,
+                  {s: mean(errors[0][s]) for s in SENSORS}, {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
+
+
+def _errors(windows, table, solutions, warm):
+    """Return (measured minus predicted of each solution by sensor, (position, force, rate, temperature) to draw it against)."""
+    motion, temperature, rows = all_samples(windows)
+    temperature = temperature if warm else None
+    outputs = {'accelerometer': np.concatenate([w.force_s for w in windows]), 'gyroscope': np.concatenate([w.rate_s for w in windows])}
+    found = []
+    for solution in solutions:
+        predicted = predict(solution.model.at(solution.values), solution.values, table, motion=motion, temperature_c=temperature)
+        found.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
+    first = _references(solutions[0], table, motion, temperature)
+    return found, (motion.position[rows], first['accelerometer'].force_s[rows], first['gyroscope'].rate_s[rows],
+                   None if temperature is None else temperature[rows])
+
+
+def _references(solution, table, motion, temperature):
+    """Return sensor -> the Reference of its samples at a solution."""
+    return {s: warped_reference(solution.model.at(solution.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
 
 
 def _blocks(windows):
@@ -101,16 +115,18 @@ def _block_mean(values, block, number):
     return means[:, 0] if values.ndim == 1 else means
 
 
-def _dead_reckoning(time, solutions, errors, references, rows):
+def _dead_reckoning(time, windows, table, *, solutions, errors):
     """Return medians over stretches of 50 s without gaps, or None."""
     edges = np.flatnonzero(np.diff(time) > 0.1)
     starts, stops = np.r_[0, edges + 1], np.r_[edges + 1, len(time)]
     pieces = [slice(a, b) for a, b in zip(starts, stops) if time[b - 1] - time[a] >= DEAD_RECKONING and np.all(np.diff(time[a:b]) > 0)]
+    if not pieces:
+        return None
+    motion, temperature, rows = all_samples(windows)
     found = []
-    for solution, error, reference in zip(solutions, errors, references):
-        ends = [_drifts(piece, time, solution, error, reference, rows) for piece in pieces]
-        if not ends:
-            return None
+    for solution, error in zip(solutions, errors):
+        references = _references(solution, table, motion, temperature)
+        ends = [_drifts(piece, time, solution, error, references, rows) for piece in pieces]
         found.append((np.median(np.concatenate([e.position for e in ends])), np.median(np.concatenate([e.velocity for e in ends])),
                       sum(len(e.position) for e in ends)))
     return {'seconds': DEAD_RECKONING, 'position_before': float(found[0][0]), 'position_after': float(found[1][0]),

@@ -1,6 +1,6 @@
 """What a window is, and how samples become one."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -121,6 +121,23 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
     motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
                   samples.joint_step.max(axis=0), samples.corrected)
+
+
+CHUNK = 4096
+"""Samples whose columns or predictions are in memory at once."""
+
+
+def chunks(windows: Sequence[Window]) -> Iterator[list[Window]]:
+    """Yield the windows in groups of more than `CHUNK` samples, in order."""
+    part, size = [], 0
+    for window in windows:
+        part.append(window)
+        size += len(window.motion)
+        if size > CHUNK:
+            yield part
+            part, size = [], 0
+    if part:
+        yield part
 
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:

@@ -72,30 +72,39 @@ class ParameterSpace:
 
         `part` 'within' or 'slow'; without it what is compared on that axis.
         """
-        return self._joined(sensor, axis, part, lambda products: products[rows], np.flatnonzero(rows))
+        slow_only = part is None and self.slow_only[sensor][axis]
+        products = self.recording.products_of(sensor, 'slow' if slow_only else part or 'within')[rows]
+        return self._joined(sensor, axis, products, self._missing(sensor, axis)[rows] if slow_only else 0.0)
 
     def within_sum(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
         """Return the sum of `within_each`, shape (q_a + 1, q_a + 1)."""
-        return self._joined(sensor, axis, part, lambda products: products[rows].sum(axis=0, keepdims=True), rows)[0]
+        slow_only, recording = part is None and self.slow_only[sensor][axis], self.recording
+        if part is None:
+            total = np.tensordot(rows.astype(float), recording.products_of(sensor, 'slow' if slow_only else 'within'), 1)
+        else:   # once per axis: not worth the memory
+            total = recording.product_sum(sensor, part, rows)
+        return self._joined(sensor, axis, total[None], self._missing(sensor, axis)[rows].sum() if slow_only else 0.0)[0]
 
     def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """Return the products of the centred rows of each window with themselves times `weights` (q_a + 1,), shape (k, q_a + 1)."""
         join = self.join_within[sensor][axis]
-        return self.recording.products[sensor, 'slow' if self.slow_only[sensor][axis] else 'within'] @ (join @ weights) @ join
+        return self.recording.products_of(sensor, 'slow' if self.slow_only[sensor][axis] else 'within') @ (join @ weights) @ join
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """Return the sum of squares of the centred rows of each window times its `weights` (k, q_a + 1), shape (k,)."""
         columns = weights @ self.join[sensor][axis].T
-        return np.maximum(np.einsum('kij,ki,kj->k', self.recording.products[sensor, 'within'], columns, columns, optimize=True), 0.0)
+        return np.maximum(np.einsum('kij,ki,kj->k', self.recording.products_of(sensor, 'within'), columns, columns, optimize=True), 0.0)
 
-    def _joined(self, sensor, axis, part, pick, rows):
-        slow_only = part is None and self.slow_only[sensor][axis]
+    def _joined(self, sensor, axis, products, missing):
+        """Return products with the columns of an axis, and with the squares that stand for the fast part."""
         join = self.join_within[sensor][axis]
-        found = join.T @ (pick(self.recording.products[sensor, 'slow' if slow_only else part or 'within']) @ join)
-        if slow_only:
-            missing = np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
-            found[:, -1, -1] += self.slow_variance[sensor][axis] * (missing[rows] if rows.dtype != bool else missing[rows].sum())
+        found = join.T @ (products @ join)
+        found[:, -1, -1] += missing
         return found
+
+    def _missing(self, sensor, axis):
+        """Return the squares that stand for the fast part of each window, shape (k,)."""
+        return self.slow_variance[sensor][axis] * np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
 
 
 def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:

@@ -14,12 +14,8 @@ from imu_calibration.estimation.accumulator import Accumulator, restricted_windo
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window import Window, chunks
 from imu_calibration.selection.time_constant_bank import BankEntry
-
-CHUNK = 16384
-"""Samples whose columns are held at once."""
-
 
 @dataclass(frozen=True, eq=False)
 class ReducedRecording:
@@ -85,34 +81,35 @@ class ReducedRecording:
         """Return the mean rows ``[columns | residual]``, shape (k, p + 3)."""
         return self._with_residual(sensor, np.array([window.sensors[sensor].mean for window in self.windows]))
 
+    def products_of(self, sensor: str, part: str) -> np.ndarray:
+        """Return the products of the centred rows ``[columns | residual]`` of each window, or of their slow part, shape (k, p + 3, p + 3)."""
+        if (sensor, part) not in self._products:
+            width = len(self.windows[0].sensors[sensor].mean)
+            found = self._products[sensor, part] = np.zeros((len(self.windows), width, width))   # of windows at rest nothing is written
+            for k, rows in self._centred(sensor, part, self.moving):
+                np.matmul(rows.T, rows, out=found[k])
+        return self._products[sensor, part]
+
+    def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
+        """Return the sum of `products_of` over the windows `rows` (mask) without keeping them, shape (p + 3, p + 3)."""
+        width = len(self.windows[0].sensors[sensor].mean)
+        return sum((each.T @ each for _, each in self._centred(sensor, part, rows & self.moving)), np.zeros((width, width)))
+
     @cached_property
-    def products(self) -> dict[tuple[str, str], np.ndarray]:
-        """(sensor, 'within' or 'slow') -> products of centred rows ``[columns | residual]`` or of their slow part, (k, p + 3, p + 3)."""
-        found = {}
-        for (sensor, part), factors in self._factors.items():
-            rows = self._with_residual(sensor, factors[self.moving])
-            found[sensor, part] = np.zeros_like(factors)
-            found[sensor, part][self.moving] = rows.transpose(0, 2, 1) @ rows
-        return found
+    def _products(self):
+        return {}
+
+    def _centred(self, sensor, part, rows):
+        """Yield (number, triangular factor of the centred rows with the residual) of the windows `rows` (mask)."""
+        for k in np.flatnonzero(rows).tolist():
+            factor = getattr(self.windows[k].sensors[sensor], part)
+            if factor is not None:
+                yield k, self._with_residual(sensor, factor)
 
     @cached_property
     def sessions(self) -> list[np.ndarray]:
         """Indices of each session's windows in order of time."""
         return sessions_of(self.windows)
-
-    @cached_property
-    def _factors(self):
-        """(sensor, part) -> the windows' triangular factors, filled up with zeros, shape (k, p + 3, p + 3)."""
-        found = {}
-        for sensor in SENSORS:
-            width = len(self.windows[0].sensors[sensor].mean)
-            for part in ('within', 'slow'):
-                found[sensor, part] = np.zeros((len(self.windows), width, width))
-                for filled, window in zip(found[sensor, part], self.windows):
-                    factor = getattr(window.sensors[sensor], part)
-                    if factor is not None:
-                        filled[:len(factor)] = factor
-        return found
 
     def _with_residual(self, sensor, rows):
         own = coefficients(self.model, sensor, self.values)
@@ -123,8 +120,8 @@ class ReducedRecording:
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
         """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
         moved = replace(self, values=values)
-        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions',
-                                                                      '_factors') if name in self.__dict__})
+        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions')
+                               if name in self.__dict__})
         return moved
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
@@ -167,25 +164,13 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
                                *(entry.columns(ref) for entry in bank[sensor])], axis=1)
 
     reduced = []
-    for part in _pieces(windows):
+    for part in chunks(windows):
         reduced += reduce_windows(part, model, table, column_function=with_bank)
         if progress:
             progress(len(reduced) / len(windows))
     descriptions = [_describe(window) for window in windows]
     return ReducedRecording(model, values, bank, tuple(reduced),
                             {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
-
-
-def _pieces(windows):
-    part, size = [], 0
-    for window in windows:
-        part.append(window)
-        size += len(window.motion)
-        if size > CHUNK:
-            yield part
-            part, size = [], 0
-    if part:
-        yield part
 
 
 def _describe(window):
