@@ -26,7 +26,7 @@ def generate_launch_description():
         DeclareLaunchArgument('calibration', default_value='',
                               description='calibration.yaml; empty: wait for the latched topic imu/calibration'),
         DeclareLaunchArgument('adopt', default_value='file_then_topic',
-                              description='where calibrations come from: file, topic (displaces the file), file_then_topic'),
+                              description='where calibrations come from: file (in the field), topic (displaces the file), file_then_topic'),
         DeclareLaunchArgument('target_frame', default_value='',
                               description='frame to move the readings to, by the transforms on /tf_static; empty: that of the sensor'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),

@@ -5,12 +5,15 @@ import json
 import zipfile
 import zlib
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.calibration.gathered import Gathered
+from imu_calibration.calibration.held_out import HeldOut, HeldOutBlock
 from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, shortened
@@ -30,40 +33,54 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
     Parameters
     ----------
     gathered : Gathered
-        Its least-squares system, poses and counts; windows with samples are left out.
+        Its least-squares system, the held-out blocks of the proof, poses and counts; windows with samples are left out.
     model : SensorModel
         The model whose columns it holds.
     demand : Demand
         What joined the model that was asked for.
 
     """
-    rows, accumulator = gathered.accumulator.rows, gathered.accumulator
     names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
     header = {'format': FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
               'effects': model.definitions, 'demand': demand.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
-              'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in rows],
-              'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
-              'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length,
-              'blocks': [_outline(block) for block in accumulator.blocks],
+              **_header_of(gathered.accumulator), 'judged_from': gathered.judged_from,
+              'held_out': [_header_of(block.accumulator) | {'pieces': [list(key) for key in block.pieces], 'counts': block.counts,
+                                                            'judged': block.judged} for block in gathered.held_out.blocks],
               **{name: getattr(gathered, name) for name in _PLAIN}}
     arrays: dict[str, Any] = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
-                              'rows': np.array([(row.time, row.duration, row.encoder_step) for row in rows], float).reshape(-1, 3),
-                              'whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2),
+                              **_arrays_of(gathered.accumulator, ''),
                               'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
                               'poses': np.array([position for _, _, position in gathered.poses], float)}
-    for sensor in _sensors(rows):
-        for name in ('mean', 'noise_variance', 'inflation'):
-            arrays[f'{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
-    for name in ('within', 'slow'):
-        arrays |= {f'{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
-    for number, block in enumerate(accumulator.blocks):
-        for name in ('within', 'slow'):
-            arrays |= {f'block{number}.{name}.{k}': factor for k, factor in enumerate(getattr(block, name).values())}
+    for number, block in enumerate(gathered.held_out.blocks):
+        arrays |= _arrays_of(block.accumulator, f'held_out{number}.')
+        arrays |= {f'held_out{number}.pieces.{k}': factor for k, factor in enumerate(block.pieces.values())}
     target = io.BytesIO()
     np.savez(target, **arrays)
     return target.getvalue()
+
+
+def _header_of(accumulator):
+    return {'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in accumulator.rows],
+            'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
+            'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length,
+            'blocks': [_outline(block) for block in accumulator.blocks]}
+
+
+def _arrays_of(accumulator, label):
+    rows = accumulator.rows
+    arrays = {f'{label}rows': np.array([(row.time, row.duration, row.encoder_step) for row in rows], float).reshape(-1, 3),
+              f'{label}whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2)}
+    for sensor in _sensors(rows):
+        for name in ('mean', 'noise_variance', 'inflation'):
+            arrays[f'{label}{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
+    for name in ('within', 'slow'):
+        arrays |= {f'{label}{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
+    for number, block in enumerate(accumulator.blocks):
+        for name in ('within', 'slow'):
+            arrays |= {f'{label}block{number}.{name}.{k}': factor for k, factor in enumerate(getattr(block, name).values())}
+    return arrays
 
 
 def from_bytes(data: bytes, model: SensorModel) -> Gathered:
@@ -129,22 +146,33 @@ def _text(model):
 
 
 def _gathered(header, arrays):
-    numbers, whole = arrays['rows'], arrays['whole']
-    sensors = sorted(name[:-5] for name in arrays.files if name.endswith('.mean'))
-    columns = {sensor: [arrays[f'{sensor}.{name}'] for name in ('mean', 'noise_variance', 'inflation')] for sensor in sensors}
+    poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
+    plain = {name: header[name] for name in _PLAIN}
+    plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
+    held_out = HeldOut()   # files of earlier versions have no blocks, and their session is unproven
+    for number, known in enumerate(header.get('held_out', ())):
+        pieces = {tuple(key): arrays[f'held_out{number}.pieces.{k}'] for k, key in enumerate(known['pieces'])}
+        accumulator = replace(held_out.blocks[number].accumulator, **_fields(known, arrays, f'held_out{number}.'))
+        held_out.blocks[number] = HeldOutBlock(accumulator, pieces, known['counts'], known['judged'])
+    return Gathered(Accumulator(**_fields(header, arrays, '')), held_out, poses=poses, judged_from=header.get('judged_from', 0.0), **plain)
+
+
+def _fields(header, arrays, label):
+    """Return the fields of an Accumulator."""
+    numbers, whole = arrays[f'{label}rows'], arrays[f'{label}whole']
+    columns = {sensor: [arrays[f'{label}{sensor}.{name}'] for name in ('mean', 'noise_variance', 'inflation')] for sensor in SENSORS
+               if f'{label}{sensor}.mean' in arrays.files}
     rows = []
     for k, kind in enumerate(header['kinds']):
         statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
                       for sensor, (mean, variance, inflation) in columns.items()}
         time, duration, *step = map(float, numbers[k])   # files of earlier versions know no steps
         rows.append(WindowStatistics(kind, time, duration, int(whole[k, 0]), statistics, int(whole[k, 1]), *step))
-    within, slow = ({tuple(key): arrays[f'{name}.{number}'] for number, key in enumerate(header[name])} for name in ('within', 'slow'))
-    poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
-    plain = {name: header[name] for name in _PLAIN}
-    plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
-    blocks = [_block(outline, f'block{number}', arrays) for number, outline in enumerate(header['blocks'])]
-    accumulator = Accumulator(rows, within, slow, header['slow_rows'], header['samples'], header['windows'], blocks, header['block_length'])
-    return Gathered(accumulator, poses=poses, **plain)
+    within, slow = ({tuple(key): arrays[f'{label}{name}.{number}'] for number, key in enumerate(header[name])}
+                    for name in ('within', 'slow'))
+    blocks = [_block(outline, f'{label}block{number}', arrays) for number, outline in enumerate(header['blocks'])]
+    return {'rows': rows, 'within': within, 'slow': slow, 'slow_rows': header['slow_rows'], 'samples': header['samples'],
+            'windows': header['windows'], 'blocks': blocks, 'block_length': header['block_length']}
 
 
 def _outline(block):

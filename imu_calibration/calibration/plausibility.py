@@ -3,6 +3,9 @@
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
+from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.effects.base import Role
+from imu_calibration.units import significant
 
 LOOK_FOR = {'reference': 'such tables are known for: look for a wrong description of the table, a loose mount, wrong stamps'}
 
@@ -13,6 +16,28 @@ ONE = 3.0
 def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
     """Return whether one of several coefficients differs from its prior by more than ONE standard deviations."""
     return bool(np.any(np.abs(distance) > ONE * sd))
+
+
+DIAGONAL = (0.5, 2.0)
+"""Scale factors that an instrument in SI units can have: data sheets promise a few per cent."""
+OFF_DIAGONAL = 0.5
+"""Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table description."""
+LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
+"""The largest full scales of such sensors, m/s^2 and rad/s."""
+
+
+def beyond_instruments(calibration: Calibration, sensor: str) -> str:
+    """Return which value of a sensor's matrix or bias belongs to no instrument, with the limit; '' where none does."""
+    matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
+    diagonal, off = np.diag(matrix), np.abs(matrix - np.diag(np.diag(matrix))).max()
+    for value in (diagonal.min(), diagonal.max()):
+        if not DIAGONAL[0] <= value <= DIAGONAL[1]:
+            return f'a scale factor must be {DIAGONAL[0]:g} to {DIAGONAL[1]:g}, it is {significant(value)}'
+    if off > OFF_DIAGONAL:
+        return f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is {significant(off)}'
+    if np.abs(bias).max() > LARGEST_BIAS[sensor]:
+        return f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is {significant(np.abs(bias).max())}'
+    return ''
 
 
 def beyond_known(share: float, section: str) -> str:

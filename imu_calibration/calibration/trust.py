@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN, decisions_text
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
+from imu_calibration.calibration.plausibility import beyond_instruments
 from imu_calibration.calibration.reasons import HAND_AXES, listed
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.uncorrected import uncorrected_lines
@@ -36,7 +37,8 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
 
     A sensor with the decision `helps` is applied always. Offline `unproven` is applied with a caution, and `harms` with the user's consent
     only. Live `unproven` is applied with consent only, and `harms` never. By hand the gyroscope's axes are those of the accelerometer, so
-    that it is not applied without the accelerometer.
+    that it is not applied without the accelerometer. A sensor with values that no instrument has is never applied, nor, live, an unproven
+    one with most of its parameters undetermined.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
     if refused.keys() == set(SENSORS):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
-        consent = not live or UNPROVEN in words.values()
+        consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(SENSORS)
         text = ('a calibration must help a sensor on held-out data to be applied, this one does not: '
                 f'{first} {refused[first]}; calibrate again')
         raise DocumentError(f'{text}, or give your consent', key='anyway') if consent else DocumentError(text)
@@ -68,9 +70,21 @@ def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: boo
     """Return sensor -> why it is not corrected; arguments as in `usable`."""
     accepted = {HELPS} | ({UNPROVEN} if anyway or not live else set()) | ({HARMS} if anyway and not live else set())
     refused = {sensor: _text(calibration, sensor) for sensor in SENSORS if calibration.decisions[sensor] not in accepted}
+    for sensor in SENSORS:
+        if why := beyond_instruments(calibration, sensor) or (live and _mostly_undetermined(calibration, sensor)):
+            refused[sensor] = why
     if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
         refused.setdefault('gyroscope', 'its axes are those of the accelerometer')
     return refused
+
+
+def _mostly_undetermined(calibration, sensor):
+    """Return why an unproven sensor is not applied even with consent; '' where it may be."""
+    status = [calibration.status[place] for effect in calibration.model.effects if effect.sensor == sensor
+              for place in range(*calibration.model.slices[effect.key].indices(len(calibration.status)))]
+    missing = sum(each != DETERMINED for each in status)
+    return f'unproven, and {missing} of {len(status)} parameters are not determined' \
+        if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status) else ''
 
 
 def _text(calibration, sensor):

@@ -32,6 +32,7 @@ from imu_calibration.nodes.calibration_worker import CalibrationWorker
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import markers_of
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.heap import give_arrays_own_pages
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
@@ -239,6 +240,7 @@ class CalibrationNode(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
+    give_arrays_own_pages()
     return run_node(CalibrationNode, arguments, hints=HINTS['calibration_node'])
 
 

@@ -62,6 +62,7 @@ class CompensatorDiagnostics:
         """Return the list of DiagnosticStatus."""
         node = self._node
         node.look_for_correction()
+        node.return_from_harm()
         compensation = node.compensation
         serious, notes = self._lines(compensation)
         notes += self._stream(compensation) + [line for each in node.inputs for line in each.faults()]

@@ -17,8 +17,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from imu_calibration import files
+from imu_calibration.compensation.health import HARMS
 from imu_calibration.compensation.stream import refuse_corrected
-from imu_calibration.errors import ImuCalibrationError, InputError, shortened
+from imu_calibration.documents import version_of
+from imu_calibration.errors import DocumentError, ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
@@ -55,6 +57,8 @@ class CompensatorNode(Node):
         view = declare_parameters(self, CompensatorFoxglove, lambda group: self._view.change(group))
         self._view = CompensatorView(self, view)
         self.adopted: Adopted | None = None
+        self._previous: Adopted | None = None
+        self._harmful = ''
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
         self._told: Adopted | None = None
@@ -153,6 +157,11 @@ class CompensatorNode(Node):
         return call
 
     def _on_document(self, message: String) -> None:
+        self.documents.look()
+        if self.documents.mixed:
+            self.complaints.event(f'{self.documents.topic_name} has the publishers {", ".join(sorted(self.documents.names()))}: '
+                                  'no calibration is adopted; stop all but one')
+            return
         self._heard = message.data
         if self.settings.takes_topic:
             source = f'topic {self.documents.topic_name}'
@@ -163,6 +172,8 @@ class CompensatorNode(Node):
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
+        if source.startswith('topic') and version_of(text) == self._harmful:
+            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again')
         adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
         self._put_in_force(adopted)
         if adopted.says_more_than(self._told):
@@ -171,7 +182,19 @@ class CompensatorNode(Node):
             for line in adopted.caveats:
                 self.get_logger().warning(f'calibration {adopted.version}: {line}')
 
+    def return_from_harm(self) -> None:
+        """Return to the previous calibration where a stop shows that the present one increases the error."""
+        harmful, previous = self.adopted, self._previous
+        if harmful is None or previous is None or harmful.compensation.watch.health.state.word != HARMS:
+            return
+        self.complaints.event(f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
+                              f'{harmful.compensation.watch.health.state.message}', ERROR)
+        self._harmful, self._previous, self.adopted = harmful.version, None, None
+        self._put_in_force(again(previous, self.settings, self._frames))
+
     def _put_in_force(self, adopted: Adopted) -> None:
+        if self.adopted is not None and self.adopted.version != adopted.version:
+            self._previous = self.adopted
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
         self._view.take_calibration(adopted)
         self.awaited = ''

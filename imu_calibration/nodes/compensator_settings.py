@@ -23,8 +23,9 @@ class CompensatorSettings:
                                     'empty: wait for imu/calibration',
                                     symptom='nothing is published, diagnostics say why', session=True, path=True)
     wait_for_file: bool = setting(False, '', 'wait for calibration_file while it does not exist', symptom='the node ends at its start')
-    adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone; topic: imu/calibration, which '
-                         'displaces the file; file_then_topic: imu/calibration only while no calibration_file is named',
+    adopt: str = setting(FILE_THEN_TOPIC, '', 'where calibrations come from; file: calibration_file alone, for the field; '
+                         'topic: imu/calibration, which displaces the file; '
+                         'file_then_topic: imu/calibration only while no calibration_file is named',
                          symptom='a calibration that comes on the topic is not taken, or displaces the file', live=True)
     anyway: bool = setting(False, '', 'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
                            symptom='the correction may increase the error of the readings', live=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.diagnosis.live import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
+from imu_calibration.nodes.heap import return_freed_memory
 
 SHARE = 0.2
 """Share of the time that diagnosing takes at most."""
@@ -78,6 +79,8 @@ class DiagnosisThread:
             answer = Answer(DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
         if session == self._session:
             self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question, self.n_answers + 1
+        del answer
+        return_freed_memory()
         end = time.monotonic()
         self._next = end + self.period
         self._pacer.note(start, end)

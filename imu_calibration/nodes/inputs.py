@@ -82,13 +82,16 @@ class MatchedInput:
         known = self.node.get_publishers_info_by_topic(self.topic_name)
         self.publishers = [found for found in known if found.topic_type == self.type_name]
         self.others = [found for found in known if found.topic_type != self.type_name]
+        several, self.mixed = self.mixed, len(self.publishers) > 1
         reliable = self._latched or all(found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for found in self.publishers)
-        if reliable != self.reliable:
+        if reliable != self.reliable or (self._latched and several and not self.mixed):   # the last message of the one that remains
             before, self.reliable = self.subscription, reliable
             self.subscription = self._subscribe()
             self.node.destroy_subscription(before)
         self._several_since = None if len(self.publishers) < 2 else self._several_since or time.monotonic()
 
+    mixed = False
+    """Whether several publishers send on the topic at present."""
     others: list = []
     """Publishers of another type on the topic."""
 

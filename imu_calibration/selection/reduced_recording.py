@@ -6,7 +6,6 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import all_arms, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
@@ -16,6 +15,7 @@ from imu_calibration.estimation.window_statistics import WindowStatistics, reduc
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window, chunks
 from imu_calibration.selection.time_constant_bank import BankEntry
+
 
 @dataclass(frozen=True, eq=False)
 class ReducedRecording:
@@ -82,7 +82,7 @@ class ReducedRecording:
         return self._with_residual(sensor, np.array([window.sensors[sensor].mean for window in self.windows]))
 
     def products_of(self, sensor: str, part: str) -> np.ndarray:
-        """Return the products of the centred rows ``[columns | residual]`` of each window, or of their slow part, shape (k, p + 3, p + 3)."""
+        """Return the products of the centred rows ``[columns | residual]`` of each window, shape (k, p + 3, p + 3)."""
         if (sensor, part) not in self._products:
             width = len(self.windows[0].sensors[sensor].mean)
             found = self._products[sensor, part] = np.zeros((len(self.windows), width, width))   # of windows at rest nothing is written

@@ -7,6 +7,7 @@ import pytest
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import calibrate, conclude, solve_gathered
+from imu_calibration.calibration.decision import HELPS
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.live_settings import LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
@@ -161,6 +162,18 @@ def at_temperature(samples, temperature_c):
     imu, joints = samples
     warm = temperature_c + np.linspace(-1.5, 1.5, len(imu))
     return replace(imu, force_s=imu.force_s + (warm - 20.0)[:, None] * WARMTH), joints, TemperatureSamples(imu.stamp_ns, warm)
+
+
+def test_a_proven_session_is_proven_after_resume(quick):
+    """Held-out blocks are saved; without them the resumed session was unproven until as many windows had come again."""
+    first = LiveCalibration(TABLE)
+    run(first, *quick)
+    before = first.solve(pending=True).calibration
+    after = LiveCalibration(TABLE, saved=first.saved(pending=True)).solve().calibration
+    assert set(before.decisions.values()) == {HELPS} and after.decisions == before.decisions
+    for sensor in before.proof:
+        assert after.proof[sensor]['windows'] == before.proof[sensor]['windows']
+        assert after.proof[sensor]['after'] == pytest.approx(before.proof[sensor]['after'], rel=1e-3)
 
 
 def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):

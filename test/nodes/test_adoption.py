@@ -54,6 +54,44 @@ def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
     assert again(adopted, SETTINGS, None).used is adopted.used
 
 
+PROVEN = {'accelerometer': HELPS, 'gyroscope': HELPS}
+
+
+def changed(sensor, effect, values):
+    """The calibration with copied proofs and other values of one effect."""
+    new = GOOD.values.copy()
+    new[GOOD.model.slices[sensor, effect]] = np.ravel(values)
+    return calibration_to_text(replace(GOOD, values=new, proof=PROVEN))
+
+
+@pytest.mark.parametrize(('sensor', 'effect', 'values'), (
+    ('gyroscope', 'matrix', -np.eye(3)), ('gyroscope', 'matrix', 3 * np.eye(3)), ('accelerometer', 'matrix', np.diag([1.0, 1.0, 0.1])),
+    ('accelerometer', 'matrix', np.eye(3) + 0.6 * np.eye(3, k=1)), ('accelerometer', 'bias', [0, 0, 200.0]), ('gyroscope', 'bias', [80.0, 0, 0])))
+@pytest.mark.parametrize('source', ('file a', 'topic a'))
+def test_values_of_no_instrument_are_refused_per_sensor_whatever_the_proof(sensor, effect, values, source):
+    """A gyroscope matrix of -I with a copied proof was adopted as proven."""
+    for settings in (SETTINGS, replace(SETTINGS, anyway=True)):
+        assert adopt(changed(sensor, effect, values), source, settings, frames=None).used.refused.keys() == {sensor}
+
+
+def test_a_document_whose_sensors_both_have_values_of_no_instrument_is_refused():
+    both = replace(GOOD, values=-GOOD.values, proof=PROVEN)
+    with pytest.raises(DocumentError) as refusal:
+        adopt(calibration_to_text(both), 'a file', replace(SETTINGS, anyway=True), frames=None)
+    assert refusal.value.key is None
+
+
+def test_an_unproven_document_with_most_parameters_undetermined_is_not_adopted_with_consent_either():
+    for share, adopted in ((0.4, True), (0.6, False)):
+        status = tuple('weak' if k % 10 < 10 * share else 'determined' for k in range(len(GOOD.status)))
+        text = calibration_to_text(replace(GOOD, status=status, decision={}))
+        if adopted:
+            assert not adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None).used.refused
+        else:
+            with pytest.raises(DocumentError):
+                adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None)
+
+
 def test_whatever_a_document_does_becomes_one_line(monkeypatch):
     """An error that nobody thought of refuses the document; it does not end the node."""
     def fails(*given):

@@ -8,6 +8,7 @@ import pytest
 
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.documents import version_of
+from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.stamping import COUNTED, StampLine
@@ -34,7 +35,7 @@ from ros.one_process import OneProcess  # noqa: E402
 pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
 PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
-GOOD, OTHER = (random_calibration(seed, proof=PROOF) for seed in (1, 2))
+GOOD, OTHER = (random_calibration(seed, proof=PROOF, decision={}) for seed in (1, 2))
 GOOD_TEXT, OTHER_TEXT = map(calibration_to_text, (GOOD, OTHER))
 WORSE = {sensor: part | {'after': 0.2, 'ci95': [1.5, 2.5]} for sensor, part in PROOF.items()}
 MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
@@ -71,7 +72,7 @@ def damaged(before, after):
 
 
 REFUSED = {
-    'unproven': (calibration_to_text(replace(OTHER, proof={})), 'unproven'),
+    'unproven': (calibration_to_text(replace(OTHER, proof={}, decision={})), 'unproven'),
     'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'accelerometer harms: error'),
     'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'noise_sd'),
     'brackets': ('[' * 200_000, 'YAML|levels'),
@@ -262,3 +263,40 @@ def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, 
         now[0], slope.line = 1000.0 + second, states[second % 2]
         node.diagnostics._tell_stamps(SimpleNamespace(slope=slope))
     assert bench.heard(str(states[0]), 'info') == 3 and bench.heard(str(states[1]), 'info') == 2
+
+
+def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_word_of_the_one_that_stays(bench):
+    node = bench.start(CompensatorNode, {'adopt': 'topic'})
+    first = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    bench.until(first.get_subscription_count, 'a subscription')
+    first.publish(String(data=GOOD_TEXT))
+    bench.until(lambda: node.adopted is not None, 'the first one')
+    second = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    bench.until(second.get_subscription_count, 'another subscription')
+    second.publish(String(data=OTHER_TEXT))
+    bench.until(lambda: bench.heard('no calibration is adopted', 'warning'), 'the refusal')
+    assert node.adopted.version == version_of(GOOD_TEXT)
+    bench.node.destroy_publisher(first)
+    bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT), 'the one that stays')
+
+
+def test_a_calibration_that_harms_at_rest_gives_way_to_the_previous_one(bench, place):
+    """A gyroscope bias of 0.01 rad/s too much with a copied proof; the same document is not adopted again."""
+    node = bench.start(CompensatorNode, {'calibration_file': str(place), 'adopt': 'topic'})
+    publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    bench.until(publisher.get_subscription_count, 'a subscription')
+    values = GOOD.values.copy()
+    values[GOOD.model.slices['gyroscope', 'bias']] += 0.01
+    harmful = calibration_to_text(replace(GOOD, values=values))
+    publisher.publish(String(data=harmful))
+    bench.until(lambda: node.adopted.version == version_of(harmful), 'the harmful one')
+    readings = np.random.default_rng(1).normal(0, [[0.02] * 3 + [0.002] * 3], (1000, 6)) + [0, 0, 9.8, 0, 0, 0]
+    readings[:, 3:] += GOOD.of('gyroscope', Role.OFFSET)
+    imu = ImuSamples(10**18 + 5_000_000 * np.arange(1000), readings[:, :3] + GOOD.of('accelerometer', Role.OFFSET), readings[:, 3:], 'imu_link')
+    for row in encode_imu(imu):
+        node.convert(row.tobytes(), {'source_timestamp': 1})
+    bench.until(lambda: node.adopted.version == version_of(GOOD_TEXT), 'the previous one')
+    assert bench.heard('is used again', 'error') == 1
+    publisher.publish(String(data=harmful))
+    bench.until(lambda: 'increased the error at rest' in bench.lines()[STATUS][1], 'the refusal')
+    assert node.adopted.version == version_of(GOOD_TEXT)
