@@ -70,8 +70,8 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
 
     def mean(values):
         return _block_mean(np.asarray(values, float)[known], block, number)
-    position, force_s, rate_s, temperature = (None if beside[0] is None else mean(np.concatenate(beside))
-                                              for beside in zip(*(beside for _, beside in parts)))
+    position, force_s, rate_s = (mean(np.concatenate([beside[k] for _, beside in parts])) for k in range(3))
+    temperature = mean(np.concatenate([beside[3] for _, beside in parts])) if warm else None
     kind = np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known]
     return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))], position, force_s, rate_s, temperature,
                   {s: mean(errors[0][s]) for s in SENSORS}, {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)

@@ -185,10 +185,11 @@ class CompensatorNode(Node):
     def return_from_harm(self) -> None:
         """Return to the previous calibration where a stop shows that the present one increases the error."""
         harmful, previous = self.adopted, self._previous
-        if harmful is None or previous is None or harmful.compensation.watch.health.state.word != HARMS:
+        watch = None if harmful is None else harmful.compensation.watch
+        if harmful is None or previous is None or watch is None or watch.health.state.word != HARMS:
             return
         self.complaints.event(f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
-                              f'{harmful.compensation.watch.health.state.message}', ERROR)
+                              f'{watch.health.state.message}', ERROR)
         self._harmful, self._previous, self.adopted = harmful.version, None, None
         self._put_in_force(again(previous, self.settings, self._frames))
 
