@@ -46,7 +46,8 @@ def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
 def test_a_bias_that_moved_is_named(second, calibrated):
     moved = second.rate_s - 3 * calibrated.value('gyroscope', 'bias')   # it has passed zero, so that nothing at all would now be better
     found = check(SampleBlock(replace(second, rate_s=moved)), calibrated, gravity=GRAVITY)
-    assert found.exit_code == 3 and 'most likely the bias has moved' in ' '.join(found.result.lines)
+    assert found.exit_code == 3 and found.proof['gyroscope']['regimes']['rest']['ci95'][0] > 1
+    assert 'bias' in found.result.lines[1]
 
 
 def test_a_file_of_another_imu_does_not_help(calibrated):
@@ -82,7 +83,7 @@ def test_two_attitudes_tell_nothing():
     imu, ranges, _ = hold_and_turn(3, rate_hz=50.0, n_poses=2)
     good = calibrate(SampleBlock(hold_and_turn(3, rate_hz=50.0)[0]), gravity=GRAVITY).calibration
     found = check(SampleBlock(imu), good)
-    assert found.exit_code == 3 and found.result.lines[0].startswith('whether it helps cannot be told:') and '4 different attitudes' in str(found)
+    assert found.exit_code == 3 and not found.proof and '4 different attitudes' in str(found)
 
 
 def test_the_verb_needs_no_table(capsys, tmp_path, second, calibrated):
@@ -91,4 +92,4 @@ def test_the_verb_needs_no_table(capsys, tmp_path, second, calibrated):
     file.write_text(calibration_to_text(calibrated))
     assert main(['check', str(bag), '--calibration', str(file)]) == 0
     printed = capsys.readouterr().out
-    assert 'it helps' in printed and 'rad per turn' in printed and "turns" in printed
+    assert 'helps' in printed and 'rad per turn' in printed and 'turns' in printed
