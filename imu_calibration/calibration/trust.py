@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN, decisions_text
+from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.calibration.plausibility import beyond_instruments
@@ -89,7 +89,7 @@ def _mostly_undetermined(calibration, sensor):
 
 def _text(calibration, sensor):
     """Return the decision on a sensor with its reason."""
-    return ': '.join([calibration.decisions[sensor], *[why for why in [calibration.decision_reasons.get(sensor)] if why]])
+    return f'{calibration.decisions[sensor]}: {calibration.decision_reasons.get(sensor) or reason_of(calibration.proof.get(sensor))}'
 
 
 def usage(calibration: Calibration) -> str:

@@ -72,8 +72,8 @@ def damaged(before, after):
 
 
 REFUSED = {
-    'unproven': (calibration_to_text(replace(OTHER, proof={}, decision={})), 'unproven'),
-    'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'accelerometer harms'),
+    'unproven': (calibration_to_text(replace(OTHER, proof={}, decision={})), 'accelerometer unproven'),
+    'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'accelerometer harms: error'),
     'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'noise_sd'),
     'brackets': ('[' * 200_000, 'YAML|levels'),
     'aliases': ('a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]', 'aliases'),
