@@ -79,7 +79,8 @@ def _look_through(events, what):
         kind = type(event).__name__
         depth += kind.endswith('StartEvent') - kind.endswith('EndEvent')
         if kind == 'AliasEvent':
-            raise InputError(f'a {what} must say everything where it stands, this one has YAML aliases (*{event.anchor}); write it without')
+            raise InputError(f'a {what} must say everything where it stands, this one has YAML aliases (*{event.anchor}); write it without',
+                             code='yaml_alias')
         _within_limits(depth - 2, DEEPEST, what, 'levels')   # the stream and the document are levels too
         _within_limits(count, MOST_PARTS, what, 'parts')
         _within_limits(len(getattr(event, 'value', '')), LONGEST, what, 'characters in a row')
@@ -87,7 +88,8 @@ def _look_through(events, what):
 
 def _within_limits(number, limit, what, unit):
     if number > limit:
-        raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?')
+        raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
+                         code='document_limit')
 
 
 def version_of(text: str) -> str:

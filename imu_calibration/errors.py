@@ -31,16 +31,18 @@ class ImuCalibrationError(Exception):
         What must hold, what came, what to do.
     key : str, optional
         What has to be given, a key of `KEYS`.
+    code : str
+        Stable name of the requirement that is not met, for programs and tests; the text may change.
 
     """
 
-    def __init__(self, text: str = '', *, key: str | None = None):
+    def __init__(self, text: str = '', *, key: str | None = None, code: str = ''):
         super().__init__(text)
-        self.key = key
+        self.key, self.code = key, code
 
     def named(self, name: str) -> 'ImuCalibrationError':
         """Return the error with the name of what it is about before its text."""
-        return type(self)(f'{name}: {self}', key=self.key)
+        return type(self)(f'{name}: {self}', key=self.key, code=self.code)
 
     def told(self, hints: dict[str, str]) -> str:
         """Return the text with what the key is called here; `hints` as for `with_hint`."""

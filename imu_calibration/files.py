@@ -34,7 +34,7 @@ def user_path(text: str) -> Path:
     try:
         return Path(os.path.abspath(Path(text).expanduser()))
     except (RuntimeError, ValueError) as error:
-        raise InputError(f'{text!r} must be a path: {error}; correct it') from error
+        raise InputError(f'{text!r} must be a path: {error}; correct it', code='not_a_path') from error
 
 
 def read_text(path: str | PathLike[str], what: str) -> str:
@@ -43,7 +43,8 @@ def read_text(path: str | PathLike[str], what: str) -> str:
         with open(path, encoding='utf-8') as stream:
             text = stream.read(documents.LARGEST + 1)
     except (OSError, ValueError) as error:
-        raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path') from error
+        raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
+                         code='file_unreadable') from error
     return text
 
 
@@ -110,7 +111,7 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     except Exception as error:   # macros raise whatever their expressions do
         said = ' '.join(str(error).split())[:200] or type(error).__name__
         raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {said}; correct it, or expand it '
-                         'yourself to a .urdf') from error
+                         'yourself to a .urdf', code='xacro_fails') from error
 
 
 def read_calibration(path: str | PathLike[str]) -> Calibration:
@@ -265,7 +266,7 @@ def _beside(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside
     except (OSError, ValueError) as error:
-        raise InputError(f'{path} must be writable: {_why(error)}; choose another place') from error
+        raise InputError(f'{path} must be writable: {_why(error)}; choose another place', code='not_writable') from error
     finally:
         with suppress(OSError, ValueError):   # where nothing can be written, nothing can be taken away either
             beside.unlink(missing_ok=True)

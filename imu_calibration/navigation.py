@@ -174,7 +174,7 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
     edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
     if len(edges) < 2:
         length = reference.time[-1] - reference.time[0]
-        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; ask for less')
+        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; ask for less', code='too_short')
     ends = []
     for first, last in zip(edges[:-1], edges[1:] + 1):
         cut = slice(first, last)
@@ -193,7 +193,8 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
 def _checked(time, rate_s):
     time, rate_s = np.asarray(time, float), np.asarray(rate_s, float)
     if rate_s.shape != (len(time), 3) or np.any(np.diff(time) <= 0):
-        raise InputError(f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples')
+        raise InputError(f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples',
+                         code='shape_and_times')
     return time, rate_s
 
 

@@ -42,7 +42,7 @@ def config_file(name: str) -> Path:
     path = folder / name
     if not path.is_file():
         known = ', '.join(sorted(p.name for p in folder.glob('*.yaml')))
-        raise InputError(f"config file '{name}' does not exist in {folder}; the files there are {known}")
+        raise InputError(f"config file '{name}' does not exist in {folder}; the files there are {known}", code='config_file_unknown')
     return path
 
 

@@ -167,7 +167,7 @@ class Recording:
             return deserializer(message_type, self.source.definitions, self.source.ros1)
         except Exception as error:   # rosbags' parser raises many kinds
             raise InputError(f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
-                             f'{" ".join(str(error).split())}; record again with standard messages') from error
+                             f'{" ".join(str(error).split())}; record again with standard messages', code='definition_damaged') from error
 
     def close(self) -> None:
         """Close the files."""
@@ -230,7 +230,7 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
         if not names:
             raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}; {_listing(topics, fitting)}',
-                             key=key)
+                             key=key, code='topic_unknown')
         return names[0]
     if DEFAULT_TOPICS[message_type] in fitting:
         return DEFAULT_TOPICS[message_type]
@@ -238,9 +238,9 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
         return fitting[0]
     if fitting and not lenient:
         raise InputError(f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
-                         f'got {", ".join(fitting)}; choose one', key=key)
+                         f'got {", ".join(fitting)}; choose one', key=key, code='topic_ambiguous')
     if required:
-        raise InputError(f'{path} must have a {message_type} topic, got none; {_listing(topics, fitting)}')
+        raise InputError(f'{path} must have a {message_type} topic, got none; {_listing(topics, fitting)}', code='no_topic_of_type')
     return None
 
 

@@ -35,7 +35,8 @@ class BagWriter:
 
     def __init__(self, path: str | PathLike[str], storage: str = 'sqlite3', **options: str):
         if storage not in identifiers():
-            raise InputError(f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these')
+            raise InputError(f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these',
+                             code='storage_unknown')
         self.path = Path(path)
         self.topics, self.counts = {}, Counter()
         self.first_ns: int | None = None
@@ -100,7 +101,7 @@ def make_partial_folder(path: Path) -> Path:
     """Make the folder beside `path` in which it is built (raises InputError when `path` exists or cannot be written)."""
     path = Path(path)
     if path.exists():
-        raise InputError(f'{path} must not exist yet; remove it or choose another name')
+        raise InputError(f'{path} must not exist yet; remove it or choose another name', code='exists_already')
     partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

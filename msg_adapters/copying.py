@@ -76,7 +76,7 @@ def _check(recording, corrected_topic):
     bag, name = recording.source, recording.imu_topic
     if bag.ros1:
         raise InputError(f"{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the command "
-                         "'rosbags-convert' (pip install rosbags)")
+                         "'rosbags-convert' (pip install rosbags)", code='ros1_bag')
     if not is_standard(IMU_TYPE, *bag.definitions.get(IMU_TYPE, ('', ''))):
         raise InputError(f'{recording.path} must be a rosbag2 recording with the standard Imu definition; convert it first')
     foreign = [topic.name for topic in recording.topics if ' ' in topic.type]
@@ -84,7 +84,7 @@ def _check(recording, corrected_topic):
         raise InputError(f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them')
     if corrected_topic in recording.message_counts:
         raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already beside {name}; '
-                         'choose another name')
+                         'choose another name', code='topic_taken')
 
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):

@@ -145,7 +145,7 @@ class JointDecoder(Decoder):
             missing = min(([name for name in self.names if name not in names] for names in self.seen), key=len)
             raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
                              f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
-                             key='joint_topic')
+                             key='joint_topic', code='joint_names')
 
     def _checked(self, samples, n_messages):
         self.n_messages += n_messages

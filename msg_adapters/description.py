@@ -38,7 +38,7 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
     texts = [message.data for message in _messages(path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE)]
     if not texts:
         raise InputError(f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
-                         'topic, or give the file', key='urdf')
+                         'topic, or give the file', key='urdf', code='description_missing')
     return texts[-1]
 
 

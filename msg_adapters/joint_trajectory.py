@@ -60,7 +60,7 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
                 if all(len(row) == len(names) for row in values) and (values or name == 'position')}
     if 'position' not in complete:
         raise InputError(f'each point of a trajectory must have {len(names)} positions, one for each joint, some have not; '
-                         'give them all')
+                         'give them all', code='position_count')
     return TrajectoryPoints(names, time, **complete)
 
 

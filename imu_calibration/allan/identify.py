@@ -86,7 +86,7 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
     if seconds < LEAST_SAMPLES * found.period or not found.period:
         raise InputError(f'the IMU must rest for at least {LEAST_SAMPLES} samples, it rested for {seconds:.1f} s; '
-                         'record with the IMU lying still on something heavy, for an hour if you can')
+                         'record with the IMU lying still on something heavy, for an hour if you can', code='rest_too_short')
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
     trends = tuple(search.find(axis) for axis in range(6))
@@ -106,7 +106,7 @@ def _require_scatter(curve):
     frozen = [name for name, variance in zip(names, curve.variance.T) if np.sum(variance > 0) < LEAST_SCALES]
     if frozen:
         raise InputError(f'every axis must scatter at rest, {" and ".join(frozen)} stays on one step of its readings; '
-                         'record with a finer resolution')
+                         'record with a finer resolution', code='coarse_steps')
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:

@@ -187,7 +187,7 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: By
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
-            'or describe the table or arm that moved it', key='table')
+            'or describe the table or arm that moved it', key='table', code='too_few_attitudes')
     turns, dropped = collect_turns(time, imu, poses=poses, settings=settings, temperature_c=temperature_c)
     turns += [known_turn_data(time, imu, turn, poses=poses, settings=settings, temperature_c=temperature_c) for turn in known_turns]
     return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
@@ -273,7 +273,8 @@ def _check_temperature(model, poses):
 def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:
     """Return (the gyroscope's effects when nothing is asked for, what the poses say about g-sensitivity)."""
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
-        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them")
+        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them",
+                         code='choice_unknown')
     evidence = g_sensitivity_evidence(poses)
     wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and shown(evidence))
     return G_SENSITIVE if wanted else BASE, evidence
@@ -301,5 +302,5 @@ def _as_ranges(imu, stills):
     if not ranges:
         raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
                                  'got no interval at rest; hold the IMU still for a second or more in each attitude, '
-                                 'or describe the table or arm that moved it', key='table')
+                                 'or describe the table or arm that moved it', key='table', code='no_rest')
     return ranges

@@ -96,11 +96,12 @@ def _compensated(imu, calibration):
 def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     """Refuse IMUs that were not recorded at the same time."""
     if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
-        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics')
+        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics',
+                         code='too_few_samples')
     overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
     if overlap <= 0:
         raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; '
-                         'check the clocks')
+                         'check the clocks', code='no_overlap')
 
 
 def window_length(a: PairedImu, b: PairedImu, settings: ArmSettings) -> float:

@@ -192,7 +192,8 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
 def too_few_poses(count: int) -> NotObservableError:
     """Return the error of a recording with so few poses that none can be held out."""
     return NotObservableError(f'a diagnosis by hand needs at least {POSES_LEAST} poses held still, so that some can be held out, '
-                              f'{count} were found; hold the IMU still in more attitudes')
+                              f'{count} were found; hold the IMU still in more attitudes',
+                              code='too_few_poses')
 
 
 def _that_predict(inquiry, held_out, named):

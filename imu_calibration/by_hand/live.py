@@ -185,7 +185,7 @@ class LiveByHand:
         imu = store.samples()
         if imu is None or len(imu) < 3:
             raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes held still, no sample came yet; '
-                                     'check the topic')
+                                     'check the topic', code='no_samples')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
         self.result = calibrate_samples_by_hand(recording, self.options, provenance, stills=self.found.rests)
@@ -241,5 +241,5 @@ def _check_model(model):
     thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
     if thermal:
         raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
-                         "record a bag and run 'imu_calibration calibrate BAG', or leave it out")
+                         "record a bag and run 'imu_calibration calibrate BAG', or leave it out", code='offline_only')
     HandModel(model, STANDARD_GRAVITY)

@@ -65,7 +65,8 @@ class HandModel:
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
             raise InputError('calibration by hand knows gravity and the turns between poses, '
-                             f'{", ".join(strange)} cannot be seen from them; give a table, or leave it out', key='table')
+                             f'{", ".join(strange)} cannot be seen from them; give a table, or leave it out', key='table',
+                             code='table_needed')
 
     @cached_property
     def extras(self) -> list[Effect]:

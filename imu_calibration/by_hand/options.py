@@ -77,7 +77,8 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
 
     """
     if options.noise is not None:
-        raise InputError('noise that was measured apart weighs the windows of a table; by hand it must be left out', key='table')
+        raise InputError('noise that was measured apart weighs the windows of a table; by hand it must be left out', key='table',
+                         code='table_only')
     asked = (options.accelerometer_model, options.gyroscope_model)
     accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
                                 for sensor, text in zip(SENSORS, asked, strict=True))

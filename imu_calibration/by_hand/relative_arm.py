@@ -203,4 +203,4 @@ def _require_seen(seen, sd):
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
         raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
                                  f'it shows is not noise and the sd is {np.max(sd):.2g} m; '
-                                 f'twist fast about the axes other than {"xyz"[worst]} too')
+                                 f'twist fast about the axes other than {"xyz"[worst]} too', code='arm_not_observable')

@@ -126,7 +126,7 @@ class HandStore:
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not ({type(error).__name__}: {error}); '
-                                'remove it, or start without resume') from error
+                                'remove it, or start without resume', code='samples_damaged') from error
         if len(imu):
             self._parts, self._epoch = [imu], -1
 

@@ -111,7 +111,7 @@ def _reading(data):
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile,
             zlib.error) as error:
         raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or of '
-                            'another kind; remove the file') from error
+                            'another kind; remove the file', code='accumulator_damaged') from error
 
 
 def saved_model(data: bytes) -> SensorModel:
@@ -137,7 +137,7 @@ def _check(header, model):
     known = _model(header)
     if not known.has_columns_of(model):
         raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
-                            f'asked for is {_text(model)}; start without resume, or with the old model')
+                            f'asked for is {_text(model)}; start without resume, or with the old model', code='other_model')
 
 
 def _text(model):

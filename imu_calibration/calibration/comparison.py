@@ -66,7 +66,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     """
     common = [name for name in first.param_names if name in second.param_names]
     if not common:
-        raise InputError('two calibrations must have parameters in common, these have none; compare files of the same kind')
+        raise InputError('two calibrations must have parameters in common, these have none; compare files of the same kind',
+                         code='nothing_in_common')
     notes = _notes(first, second)
     a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
     difference = second.values[b] - first.values[a]

@@ -186,7 +186,7 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
         for name, value in entries.items():
             if name not in known[section]:
                 raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; '
-                                 f'those are {", ".join(known[section])}')
+                                 f'those are {", ".join(known[section])}', code='tolerance_name')
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
                 raise InputError(f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it")
     return mapping
@@ -264,7 +264,7 @@ def from_mapping(document: Any) -> Calibration:
         calibration = Calibration(**parts_of(document))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
         raise DocumentError(f'a calibration document must have the parts of {FORMAT}, something is missing or misshapen '
-                            f'({_one_line(error)}); write it anew') from error
+                            f'({_one_line(error)}); write it anew', code='document_parts') from error
     return check_numbers(calibration)
 
 
@@ -276,10 +276,10 @@ def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
         raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; "
-                            "give a file written by 'imu_calibration calibrate'")
+                            "give a file written by 'imu_calibration calibrate'", code='document_format')
     if int(number) > int(FORMAT.partition('/')[2]):
         raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; "
-                            "update imu_calibration")
+                            "update imu_calibration", code='document_newer')
 
 
 def calibration_to_text(calibration: Calibration) -> str:
@@ -300,5 +300,5 @@ def calibration_from_text(text: str) -> Calibration:
     try:
         mapping = from_text(text, 'calibration document')
     except InputError as error:
-        raise DocumentError(str(error)) from error
+        raise DocumentError(str(error), code='document_too_long') from error
     return from_mapping(mapping)

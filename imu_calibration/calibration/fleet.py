@@ -129,7 +129,7 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
     good = [(result.name, result.calibration) for result in results if result.calibration is not None]
     if not good:
         first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
-        raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}')
+        raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}', code='no_unit_calibrated')
     values, order, units = {}, [], {}
     for unit, calibration in good:
         for effect in calibration.model.effects:

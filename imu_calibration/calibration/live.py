@@ -237,7 +237,8 @@ class LiveCalibration:
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:
-            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out')
+            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out',
+                             code='temperature_missing')
         return self._collector
 
     def _with_earlier(self, gathered):

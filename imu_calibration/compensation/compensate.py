@@ -63,7 +63,7 @@ class Transfer:
         """
         if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
             raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
-                             'correct it')
+                             'correct it', code='pose_numbers')
         return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
 
     def is_close(self, other: 'Transfer | None') -> bool:
@@ -130,7 +130,8 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     """
     model, values = invertible_values(calibration)
     if temperature_c is None and model.needs_temperature:
-        raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature')
+        raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature',
+                         code='temperature_missing')
     with np.errstate(over='ignore', invalid='ignore'):
         true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration))
     beyond = left > CONVERGED

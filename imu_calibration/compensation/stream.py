@@ -40,7 +40,8 @@ class CompensationStream:
     def __init__(self, calibration: FittedErrors, temperature: TemperatureSamples | None = None, transfer: Transfer | None = None):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
         if invertible(calibration.model).needs_temperature and temperature is None:
-            raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature')
+            raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature',
+                             code='temperature_missing')
         if temperature is not None and invertible(calibration.model).uses('thermal branch'):
             self.temperature = replace(temperature, branch=ThermalBranch().of(temperature.temperature_c))
         self._vibration = BandVariance() if invertible(calibration.model).uses('vibration') else None
@@ -161,7 +162,8 @@ def refuse_corrected(topic: str) -> None:
 
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
-        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic", key='imu_topic')
+        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic", key='imu_topic',
+                         code='corrected_already')
 
 
 def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]) -> Transfer | None:
@@ -178,7 +180,7 @@ def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]
         return Transfer.from_pose(frame_id, xyz, rpy)
     if any(xyz) or any(rpy):
         raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well',
-                         key='target_frame')
+                         key='target_frame', code='frame_name_missing')
     return None
 
 

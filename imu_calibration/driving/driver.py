@@ -165,11 +165,12 @@ class Driver:
         """
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
             raise InputError(f'a motion may begin where the joints rest and nothing is wrong, the state is {self.state}: {self.reason}; '
-                             'start anew')
+                             'start anew', code='wrong_state')
         if self.position is None or self.is_silent(now):
-            raise InputError('joint states must come before anything moves, none came; publish them')
+            raise InputError('joint states must come before anything moves, none came; publish them', code='no_joint_states')
         if not self.rests:
-            raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest')
+            raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest',
+                             code='joints_moving')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
         is_small = np.all(np.abs(points.position - self.position) <= self.first_reach + STILL * self.tolerance)
@@ -188,7 +189,7 @@ class Driver:
         if beyond > MARGIN or max(speed, acceleration) > 1.0 + MARGIN or points.acceleration is None:
             raise InputError('a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
                              f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
-                             'acceleration; it is not sent')
+                             'acceleration; it is not sent', code='joint_limits')
 
     def observe(self, time: float, position: np.ndarray, rate: np.ndarray, *, now: float) -> bool:
         """

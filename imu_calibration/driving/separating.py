@@ -50,7 +50,7 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
     sensors = {name: sensor for sensor, name in options.catalogue.effects(table.joint_names)}
     for name in (suspect.effect, *suspect.mates):
         if name not in sensors:
-            raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has")
+            raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has", code='cause_unknown')
     causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
     planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
                              sizes=suspect.sizes, limits=limits)

@@ -51,7 +51,7 @@ class Catalogue:
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
             known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
-            raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}")
+            raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}", code='effect_unknown')
         return effects[sensor, name]
 
     def owner_of(self, name: str, joint_names: Sequence[str] = JOINTS) -> str:
@@ -84,7 +84,7 @@ class Catalogue:
         for effect in added:
             if effect.definition is None:
                 raise InputError(f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; "
-                                 "make it with `effects.term.term`")
+                                 "make it with `effects.term.term`", code='made_of_code')
         return {effect.name: effect.definition for effect in added}
 
     @classmethod
@@ -131,10 +131,10 @@ CATALOGUE = Catalogue()
 def _check(effect, taken):
     if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {'effects'}:
         raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; "
-                         "choose another one")
+                         "choose another one", code='effect_name')
     if effect.sensor not in SECTIONS:
         raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")
     strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
     if effect.compensation == 'exact' and strange:
         raise InputError(f"effect '{effect.name}' must do without {', '.join(sorted(strange))}, which compensation does not know; "
-                         "declare it with compensation 'none'")
+                         "declare it with compensation 'none'", code='time_unavailable')

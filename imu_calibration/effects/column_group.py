@@ -102,7 +102,7 @@ class ColumnGroup:
         if self._may_fail and not np.all(np.isfinite(result)):
             raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; "
                              "divide by nothing that "
-                             'passes through zero, and take no root or logarithm of what may be negative')
+                             'passes through zero, and take no root or logarithm of what may be negative', code='column_not_finite')
         return result
 
     def products(self, known: dict[str, Sum]) -> list[Sum]:

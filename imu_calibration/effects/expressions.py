@@ -93,7 +93,7 @@ class _Refused(Exception):
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place:place + 30].split())
     return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {KNOWN} with {", ".join(FUNCTIONS)} and '
-                      f'powers up to {HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it')
+                      f'powers up to {HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it', code='not_arithmetic')
 
 
 def _checked(node, text, depth):
@@ -192,7 +192,7 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
         case ast.Name():
             if node.id not in known:
                 raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
-                                 "which is not known there; declare the effect with compensation 'none'")
+                                 "which is not known there; declare the effect with compensation 'none'", code='variable_unavailable')
             return known[node.id]
         case ast.UnaryOp():
             return scaled(products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0)

@@ -202,7 +202,7 @@ class SensorModel:
                 for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
                         raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', "
-                                         "which other columns are called; rename it")
+                                         "which other columns are called; rename it", code='column_name_taken')
                     widths[group.name] = group.width
                 if effect.warp is not None:
                     widths[WARP + effect.name] = 3 * effect.size

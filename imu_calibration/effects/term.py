@@ -63,17 +63,18 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
 
     """
     if sensor not in SENSORS:
-        raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it")
+        raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it", code='sensor_unknown')
     numbers: dict[str, Any] = {'tolerance': tolerance, 'prior_sd': prior_sd, 'largest': largest, 'time_constant': time_constant}
     for key, value in numbers.items():
         if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf):
-            raise InputError(f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it")
+            raise InputError(f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it",
+                             code='tolerance_value')
     for key, value in {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}.items():
         if not isinstance(value, str):
-            raise InputError(f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it")
+            raise InputError(f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it", code='not_a_text')
     columns = (column,) if isinstance(column, str) else tuple(column)
     if len(columns) not in (1, 3):
-        raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it")
+        raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it", code='column_count')
     group = ColumnGroup(name, columns, name)
     try:
         settles, thermal, turns = (quantity in group.uses for quantity in ('time constant', 'temperature', 'thermal branch'))
@@ -123,4 +124,4 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
         return term(name, **definition)
     except TypeError as error:
         raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
-                         "correct it") from error
+                         "correct it", code='definition_keys') from error

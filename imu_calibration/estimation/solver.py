@@ -62,7 +62,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     """
     if not accumulator.rows:
         raise NotObservableError('at least one static window, spin or dynamic stretch must be found, none was; '
-                                 'let the table rest between moves, or check the joint states')
+                                 'let the table rest between moves, or check the joint states', code='no_windows')
     prior = prior or make_prior(model)
     system = WeightedSystem(accumulator, model, prior)
     values, free = start(system), ~fixed_parameters(model)
@@ -120,7 +120,7 @@ def _refuse(without, held, model, allow_holding):
                                  'record static positions in at least four different attitudes')
     if held.any() and not allow_holding:
         raise NotObservableError(f"every parameter must be determined, {len(names)} are not: {', '.join(names)}; "
-                                 'record more motion or allow holding')
+                                 'record more motion or allow holding', code='undetermined')
 
 
 def start(system: WeightedSystem) -> np.ndarray:

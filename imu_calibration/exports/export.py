@@ -113,7 +113,8 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
     if found is None or (target.needs_walk and not found.walk_known):
         lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings beside the calibration,'
         if target.only_noise:
-            raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise')
+            raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise',
+                             code='noise_missing')
         return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
     return target.noise(found), _walk_lines(found) if target.needs_walk else []
 

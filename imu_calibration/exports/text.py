@@ -129,4 +129,4 @@ def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
     curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
     if curved:
         raise InputError(f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
-                         'set it to 0, or calibrate with a temperature topic')
+                         'set it to 0, or calibrate with a temperature topic', code='not_linear')

@@ -76,7 +76,7 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
         raise
     except Exception as error:   # whatever a document does, it must not end the node
         what = shortened(f'{type(error).__name__}: {error}', 200)
-        raise DocumentError(f'a calibration must be usable, this one is not: {what}') from error
+        raise DocumentError(f'a calibration must be usable, this one is not: {what}', code='not_usable') from error
 
 
 def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
@@ -133,4 +133,4 @@ def _require_same_frame(calibration: Calibration, before: Adopted | None) -> Non
     known = '' if before is None else before.compensation.frame_id
     if known and calibration.frame_id and calibration.frame_id != known:
         raise DocumentError(f"a new calibration must be for the same sensor, '{known}', this one is for '{calibration.frame_id}'; "
-                            'restart the node for another sensor')
+                            'restart the node for another sensor', code='other_sensor')

@@ -137,7 +137,7 @@ def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicC
 
     """
     if how not in COMMANDS:
-        raise InputError(f"parameter 'command' must be one of {', '.join(COMMANDS)}, got '{how}'; choose one")
+        raise InputError(f"parameter 'command' must be one of {', '.join(COMMANDS)}, got '{how}'; choose one", code='choice_unknown')
     if how == 'topic':
         return TopicCommand(node)
     try:
@@ -145,7 +145,7 @@ def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicC
     except ImportError:
         if how == 'action':
             raise InputError("parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, "
-                             "or use topic") from None
+                             "or use topic", code='package_missing') from None
         return TopicCommand(node)
     from rclpy.action import ActionClient
     client = ActionClient(node, FollowJointTrajectory, 'follow_joint_trajectory')

@@ -118,7 +118,7 @@ def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float,
 def design_matrix(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
     """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `COLUMNS`."""
     if model not in COLUMNS:
-        raise InputError(f"model must be one of {', '.join(COLUMNS)}, got '{model}'; choose one of them")
+        raise InputError(f"model must be one of {', '.join(COLUMNS)}, got '{model}'; choose one of them", code='model_unknown')
     x, y, z = np.asarray(inputs, float).T
     known = {'bias': np.ones_like(x), 'x': x, 'y': y, 'z': z, 'xy': x * y, 'yz': y * z, 'xz': x * z, 'xx': x * x, 'yy': y * y, 'zz': z * z}
     return np.column_stack([known[name] for name in COLUMNS[model]])

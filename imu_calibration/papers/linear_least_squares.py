@@ -245,7 +245,8 @@ def _require_full_rank(design, norms, singular, right, names, rank_tolerance):
         directions = _echelon(right[weak], norms, names)
         raise NotObservableError(
             f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from {len(design)} rows; not determined: '
-            f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.')
+            f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.',
+            code='rank')
 
 
 def _echelon(weak, norms, names):

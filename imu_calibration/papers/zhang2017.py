@@ -137,12 +137,13 @@ def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *
     """
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
-        raise InputError('the three spin axes must be orthonormal for the closed form, got others; use the joint fit')
+        raise InputError('the three spin axes must be orthonormal for the closed form, got others; use the joint fit',
+                         code='not_orthonormal')
     cosines = np.asarray(directions, float) @ axes.T
     if np.any(np.abs(cosines) < 1e-12):
         sensor, spin = np.argwhere(np.abs(cosines) < 1e-12)[0]
         raise NotObservableError(f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
-                                 'skew the fixture, add oscillations, or use the joint fit')
+                                 'skew the fixture, add oscillations, or use the joint fit', code='square_axes')
     means_static, means_spin = np.asarray(means_static, float), np.asarray(means_spin, float)
     change = np.swapaxes(means_spin - means_static, -1, -2)
     numerator = 2 * change - np.sum(change, axis=-1, keepdims=True)

@@ -70,7 +70,7 @@ def refuse(findings: tuple[CheckFinding, ...]) -> None:
     """Raise the first finding that makes the result wrong as an InputError."""
     for finding in findings:
         if finding.severity == REFUSE:
-            raise InputError(finding.text, key=finding.key)
+            raise InputError(finding.text, key=finding.key, code=finding.check)
 
 
 def warnings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:

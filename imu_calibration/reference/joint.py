@@ -162,7 +162,7 @@ def joint_from_mapping(item: Any) -> Joint:
     require_keys(item, (*_KEYS, *LIMIT_KEYS.get(kind, ())), 'table joint')
     for key in ('name', 'axis'):
         if item.get(key) is None:
-            raise InputError(f'table: every joint must have name and axis, got {item!r}; add {key}')
+            raise InputError(f'table: every joint must have name and axis, got {item!r}; add {key}', code='keys_missing')
     values = {key: item[key] for key in _KEYS if item.get(key) is not None}
     if 'mimic' in values:
         values['mimic'] = _mimic(values['mimic'], item['name'])
@@ -178,7 +178,7 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
         unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
     endless = item.get('endless') or False
     if not isinstance(endless, bool):
-        raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it')
+        raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it', code='not_true_or_false')
     speed, acceleration = (None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, high=None,
                                                                                         advice='give a number')
                            for key in others)
@@ -190,7 +190,7 @@ def _require_limits(limits: JointLimits, what: str) -> None:
     if (lower is None) != (upper is None) or (lower is not None and upper is not None and lower > upper):
         raise InputError(f'table: the range of {what} must go from a smaller to a larger number, got [{lower}, {upper}]; correct it')
     if limits.endless and lower is not None:
-        raise InputError(f'table: {what} must have a range or be endless, got both; leave one out')
+        raise InputError(f'table: {what} must have a range or be endless, got both; leave one out', code='range_and_endless')
     for name in ('speed', 'acceleration'):
         value = getattr(limits, name)
         if value is not None and not value > 0:

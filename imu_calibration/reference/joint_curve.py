@@ -107,9 +107,11 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
 
 def _check(time, position):
     if not len(time) or not np.isfinite(position).all():
-        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; drop what is not a number')
+        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; drop what is not a number',
+                         code='not_finite')
     if np.any(np.diff(time) < 0):
-        raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those')
+        raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those',
+                         code='stamps_backwards')
 
 
 def _unwrapped(position):
@@ -123,7 +125,7 @@ def _place_knots(time):
     hole = np.max(np.diff(time), initial=0.0)
     if hole > _LONGEST_HOLE * step:
         raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
-                         'split them there')
+                         'split them there', code='gap')
     return Knots(float(time[0] - _MARGIN * step), step, int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN)
 
 

@@ -33,7 +33,7 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
         frame, quaternion = parents[frame]
         if frame in passed:
             raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or say where up is",
-                             key='up')
+                             key='up', code='frame_circle')
         mats.append(_matrix(quaternion))
     for matrix in reversed(mats):
         up = matrix.T @ up

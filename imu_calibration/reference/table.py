@@ -65,7 +65,7 @@ class Table:
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:
             raise InputError('table: gravity or latitude must be given, got neither; '
-                             'add gravity in m/s^2, or latitude in degrees (and height)')
+                             'add gravity in m/s^2, or latitude in degrees (and height)', code='gravity_missing')
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> 'Table':
@@ -163,11 +163,12 @@ def base_heading_deg(mat_nb: np.ndarray) -> float:
 
 def _require_joints(joints):
     if not joints:
-        raise InputError('table: joints must list at least one joint, got none; describe them from the base outwards')
+        raise InputError('table: joints must list at least one joint, got none; describe them from the base outwards', code='no_joint')
     names = [joint.name for joint in joints]
     for name in names:
         if not isinstance(name, str) or not name or names.count(name) > 1:
-            raise InputError(f'table: joint names must be different and not empty, got {names}; use the names of the joint states')
+            raise InputError(f'table: joint names must be different and not empty, got {names}; use the names of the joint states',
+                             code='joint_names')
     followers = {joint.name for joint in joints if joint.mimic is not None}
     for joint in joints:
         if joint.source in followers:

@@ -39,15 +39,17 @@ class TrajectoryPoints:
         for name, values in self.columns().items():
             if values.shape != shape:
                 raise InputError(f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape '
-                                 f'{values.shape}; give all or none')
+                                 f'{values.shape}; give all or none', code='position_count')
             if not np.all(np.isfinite(values)):
-                raise InputError(f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points')
+                raise InputError(f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points',
+                                 code='not_finite')
         if not np.all(np.diff(self.time, prepend=0.0) > 0):
-            raise InputError('the times of a trajectory must rise from above zero, they do not; correct time_from_start')
+            raise InputError('the times of a trajectory must rise from above zero, they do not; correct time_from_start',
+                             code='times_not_rising')
         if self.acceleration is not None and self.rate is None:
-            raise InputError('a trajectory with accelerations must have velocities, it has none; give both')
+            raise InputError('a trajectory with accelerations must have velocities, it has none; give both', code='velocities_missing')
         if self.rate is not None and len(self) and np.any(self.rate[-1]):
-            raise InputError('a trajectory must end at rest, its last point has a velocity; let it be zero')
+            raise InputError('a trajectory must end at rest, its last point has a velocity; let it be zero', code='not_at_rest')
 
     @classmethod
     def stop(cls, joint_names: Sequence[str]) -> TrajectoryPoints:
@@ -80,7 +82,7 @@ class TrajectoryPoints:
         own, wanted = list(self.joint_names), list(joint_names)
         if sorted(own) != sorted(wanted):
             raise InputError(f'a trajectory must name the joints {", ".join(wanted)} and no others, got {", ".join(own) or "none"}; '
-                             'name every joint once')
+                             'name every joint once', code='joint_names')
         order = [own.index(name) for name in wanted]
         columns: dict[str, Any] = {name: values[:, order] for name, values in self.columns().items()}
         return replace(self, joint_names=tuple(wanted), **columns)

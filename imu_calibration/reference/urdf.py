@@ -108,7 +108,7 @@ def _chain(robot, link):
     """Return the moving joints from the root to `link`, and the placement of the link behind the last of them."""
     if link not in robot.link_map:
         raise InputError(f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
-                         'name one of these', key='imu_link')
+                         'name one of these', key='imu_link', code='link_unknown')
     on_the_way = []
     while link in robot.parent_map:
         name, link = robot.parent_map[link]
@@ -166,7 +166,7 @@ def _with_limits(joints, entries, link):
     for entry in entries:
         name = entry.get('name') if isinstance(entry, Mapping) else None
         if name not in by_name:
-            raise InputError(f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}")
+            raise InputError(f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}", code='joint_unknown')
         known = by_name[name]
         require_keys(entry, ('name', *LIMIT_KEYS[known.type]), f"limits of joint '{name}'")
         given = limits_from_mapping(entry, known.type)

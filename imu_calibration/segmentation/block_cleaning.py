@@ -156,6 +156,6 @@ class BlockCleaner:
         missing = [name for name in self._names if name not in joints.names]
         if missing:
             raise InputError(f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
-                             'correct the names in the table or choose another joint topic')
+                             'correct the names in the table or choose another joint topic', code='joint_names')
         order = [joints.names.index(name) for name in self._names]
         return JointSamples(joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names)

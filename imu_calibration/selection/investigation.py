@@ -208,7 +208,8 @@ def _resolved(attempt, chosen):
 def too_few_windows(count: int) -> NotObservableError:
     """Return the error of a recording with so few windows that none can be held out."""
     return NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
-                              f'{count} were found; rest in more poses, or spin and swing the table')
+                              f'{count} were found; rest in more poses, or spin and swing the table',
+                              code='too_few_windows')
 
 
 def _agreed(attempt, explained, named):

@@ -82,7 +82,7 @@ def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Ca
     """
     for name in names:
         if name not in CAUSES:
-            raise InputError(f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them")
+            raise InputError(f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them", code='cause_unknown')
     return [_scaled(CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])), size) for name in CAUSES if name in names]
 
 

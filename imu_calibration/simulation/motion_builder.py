@@ -256,5 +256,6 @@ def stretch(build: Callable, duration: float) -> list[Segment]:
     length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]
     change = length[1] - length[0]
     if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
-        raise InputError(f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile')
+        raise InputError(f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile',
+                         code='too_short')
     return build(1.0 + (duration - length[0]) / change)

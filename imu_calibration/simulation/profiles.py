@@ -76,12 +76,13 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
 
     """
     if name not in _REGISTRY:
-        raise InputError(f"profile '{name}' is unknown; the profiles are {', '.join(profile_names())}")
+        raise InputError(f"profile '{name}' is unknown; the profiles are {', '.join(profile_names())}", code='profile_unknown')
     entry = _REGISTRY[name]
     joint_names = _joint_names(entry, table)
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
-        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'")
+        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'",
+                         code='joint_count')
     limits = limits_of(table) if isinstance(table, Table) and entry.table is None else free_limits(len(joint_names))
     build = within_limits if entry.adapts and not limits.endless.all() else entry.build if fits else _any_table
 
@@ -107,7 +108,7 @@ def _require_within(profile, limits):
             unit, factor = ('deg', np.degrees(1.0)) if limits.turns[column] else ('m', 1.0)
             lower, upper, least, most = (f'{factor * end:.4g}' for end in (limits.lower[column], limits.upper[column], *reached))
             raise InputError(f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would go from "
-                             f"{least} to {most}; choose 'within_limits'")
+                             f"{least} to {most}; choose 'within_limits'", code='joint_range')
 
 
 def _joint_names(entry, table):

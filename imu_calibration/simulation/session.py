@@ -71,7 +71,7 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     if not effect.plausible:
         or_else = ', or say in its definition how large it may be (largest)' if effect.definition else ''
         raise InputError(f"effect '{name}' cannot be simulated by name, for its size is not known; "
-                         f'simulate with a calibration that contains it{or_else}', key='calibration')
+                         f'simulate with a calibration that contains it{or_else}', key='calibration', code='size_unknown')
     rng = np.random.default_rng([seed, 11])
     values = share * effect.largest * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
     if effect.nonnegative:

@@ -66,7 +66,8 @@ class TableController:
         if settings.limits not in LIMIT_CHOICES:
             raise InputError(f"setting 'limits' must be one of {', '.join(LIMIT_CHOICES)}, got '{settings.limits}'; choose one")
         if settings.stall_joint and settings.stall_joint not in self.joint_names:
-            raise InputError(f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one")
+            raise InputError(f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one",
+                             code='joint_unknown')
         self._profile, self._repeat, self._n_followed = profile, repeat, 0
         self._home = np.clip(np.zeros(len(joint_names)), self.limits.lower, self.limits.upper)
         self._taken: list[tuple[float, JointTrajectory]] = []
@@ -93,7 +94,8 @@ class TableController:
         if not len(points):
             return self._take(begin, braking_from(start, self.limits))
         if 0 <= self.settings.refuse_after <= self._n_followed:
-            raise InputError(f'the controller takes no more than {self.settings.refuse_after} trajectories; it was told so')
+            raise InputError(f'the controller takes no more than {self.settings.refuse_after} trajectories; it was told so',
+                             code='trajectory_count')
         points = points.slowed(self.settings.speed_scaling)
         trajectory = trajectory_from(start, points)
         if self.settings.limits != 'none':
@@ -108,13 +110,13 @@ class TableController:
         beyond, speed, acceleration = excess(trajectory, self.limits)
         if beyond > ROUNDING:
             raise InputError(f'a trajectory must stay within the range of the joints, it leaves it by {beyond:.3g} rad or m; '
-                             'see the limits in the description of the table')
+                             'see the limits in the description of the table', code='joint_range')
         fastest = max(speed, np.sqrt(acceleration))
         if fastest <= 1.0 + ROUNDING:
             return trajectory
         if self.settings.limits == 'refuse':
             raise InputError(f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '
-                             f'{acceleration:.2f} times the other; give it more time')
+                             f'{acceleration:.2f} times the other; give it more time', code='joint_limits')
         return trajectory_from(start, points.slowed(1.0 / fastest))
 
     def at(self, time: np.ndarray) -> JointMotion:

@@ -58,7 +58,8 @@ def check_names(choices: Mapping[str, Any]) -> None:
     """Refuse choices that there are not."""
     strange = sorted(set(choices) - set(Choices.__annotations__))
     if strange:
-        raise InputError(f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}')
+        raise InputError(f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}',
+                         code='choice_unknown')
 
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:

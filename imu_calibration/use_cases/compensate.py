@@ -92,7 +92,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     if isinstance(recording, (ImuSamples, SampleBlock)):
         return _in_memory(recording, calibration, transfer, late=late, used=used)
     if output is not None and Path(output).exists():
-        raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it')
+        raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it', code='exists_already')
     topics = Topics(imu_topic, None, temperature_topic)
     bag = open_bag(recording, topics, want_joints=False)
     with bag, progress_bar('compensating', bag.message_counts.get(bag.imu_topic, 0)) as advance:

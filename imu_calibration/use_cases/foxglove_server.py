@@ -58,7 +58,7 @@ class FoxgloveServer(threading.Thread):
             self._server = sdk.start_server(name=name, host=host, port=port, context=context)
         except RuntimeError as error:
             raise InputError(f"a view needs an address that is free, {host}:{port} is not ({error}); choose another 'foxglove_port', "
-                             'or 0 for any') from error
+                             'or 0 for any', code='address_taken') from error
         self.address = f'ws://{host}:{self._server.port}'
         self._channels = {topic: channel_of(sdk, topic, context) for topic in topics}
         self._news: dict[str, Make] = {}

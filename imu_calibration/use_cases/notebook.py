@@ -36,7 +36,7 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
         try:
             return function(*arguments, **named)
         except ImuCalibrationError as error:
-            raise type(error)(error.told(hints)) from None
+            raise type(error)(error.told(hints), code=error.code) from None
     return told
 
 

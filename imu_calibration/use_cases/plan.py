@@ -277,7 +277,8 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
         if finding.get('indistinguishable_from'):
             sizes = {name: float(size['value']) for mate in finding.get('sizes_of_mates', {}).values() for name, size in mate.items()}
             return (finding['effect'], *finding['indistinguishable_from']), sizes
-    raise InputError('the diagnosis must have a finding with others that would do as well, it has none; nothing is left to be told apart')
+    raise InputError('the diagnosis must have a finding with others that would do as well, it has none; nothing is left to be told apart',
+                     code='nothing_to_separate')
 
 
 def summary(made: Plan) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from refusal import refused
 from test_adapters_copy import raw_messages
 from test_live_calibration import blocks
 
@@ -135,7 +136,7 @@ def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise
     known = live.solve(pending=True).solution.noise
     assert {sensor: known[sensor].bias_processes[:len(wanted)] for sensor, wanted in options.bias_processes.items()} == options.bias_processes
     assert question_about(live).snapshot.options.bias_processes == options.bias_processes
-    with pytest.raises(InputError, match='by hand it must be left out'):
+    with refused(InputError, 'table_only'):
         LiveByHand(options, LiveSettings())
 
 
@@ -184,7 +185,7 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
         live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), frames=None).compensation
         of_nodes.append(live.covariances(np.zeros((3, 3)), np.zeros((3, 3)))[0][0, 0])
     assert of_bags[1] / of_bags[0] == pytest.approx(4.0, rel=0.05) and of_nodes[1] / of_nodes[0] == pytest.approx(4.0, rel=0.02)
-    with pytest.raises(InputError, match='missing.yaml'):
+    with refused(InputError, 'file_unreadable', 'missing.yaml'):
         adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True), frames=None)
 
 

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from refusal import refused
 from scipy.stats import chi2
 
 from imu_calibration.diagnosis.diagnose import diagnose
@@ -144,7 +145,7 @@ def test_effects_without_their_data_are_not_testable():
 
 
 def test_too_few_windows_are_refused(empty):
-    with pytest.raises(NotObservableError, match='at least 8 windows'):
+    with refused(NotObservableError, 'too_few_windows', 8):
         diagnose(empty.windows[:4], empty.table, empty.model)
 
 

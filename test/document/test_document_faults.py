@@ -8,6 +8,7 @@ from datetime import date
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration import documents
 from imu_calibration.calibration import trust
@@ -183,5 +184,5 @@ def test_damaged_tables_and_tolerances_are_refused_in_one_line_or_can_be_used(go
 
 
 def test_a_misspelt_tolerance_is_told():
-    with pytest.raises(InputError, match='accel_size_effect'):
+    with refused(InputError, 'tolerance_name', 'accel_size_effect'):
         checked_tolerances({'accelerometer': {'size_effect': 1e-3}})

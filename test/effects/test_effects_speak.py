@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refused
 
 import imu_calibration as imu
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
@@ -230,13 +231,13 @@ def test_pickles_and_saved_sessions_carry_it():
     assert len(from_bytes(data, found.gathered_model).accumulator.rows) == len(found.gathered.accumulator.rows)
     other = replace(found.gathered_model,
                     catalogue=CATALOGUE.with_effects(term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})))
-    with pytest.raises(DocumentError, match='must hold the columns of the model'):
+    with refused(DocumentError, 'other_model'):
         from_bytes(data, other)
 
 
 def test_the_package_knows_nothing_of_what_others_added():
     assert not any(name in ADDED for _, name in CATALOGUE.effects())
-    with pytest.raises(InputError, match="no effect 'gyro_anisoelasticity'"):
+    with refused(InputError, 'effect_unknown', 'gyro_anisoelasticity'):
         SensorModel().with_effect('gyroscope', 'gyro_anisoelasticity').param_names  # noqa: B018
 
 
@@ -246,24 +247,23 @@ def test_the_package_knows_nothing_of_what_others_added():
                                     '+'.join(['f_x'] * 300),
                                     '(' * 300 + 'f_x' + ')' * 300, '', 'f_x := 2', 'True'])
 def test_a_column_is_arithmetic_and_nothing_else(column):
-    with pytest.raises(InputError, match='a column must be arithmetic'):
+    with refused(InputError, 'not_arithmetic', 'mine'):
         term('mine', sensor='gyroscope', column=column, unit='1', tolerance=1.0, text='')
 
 
-@pytest.mark.parametrize('changed, text', [
-    ({'sensor': 'thermometer'}, 'must belong to accelerometer or gyroscope'),
-    ({'column': ['f_x', 'f_y']}, 'one column, or one for each axis'),
-    ({'tolerance': -1.0}, 'the tolerance of effect .* a number above zero'), ({'tolerance': '1'}, 'a number above zero'),
-    ({'unit': None}, 'the unit .* must be a text'), ({'colour': 'red'}, 'must have sensor, column, unit, tolerance and text')])
-def test_a_definition_is_refused_in_one_line(changed, text):
-    with pytest.raises(InputError, match=text) as caught:
+@pytest.mark.parametrize('changed, code, value', [
+    ({'sensor': 'thermometer'}, 'sensor_unknown', 'thermometer'), ({'column': ['f_x', 'f_y']}, 'column_count', 2),
+    ({'tolerance': -1.0}, 'tolerance_value', -1.0), ({'tolerance': '1'}, 'tolerance_value', "'1'"),
+    ({'unit': None}, 'not_a_text', None), ({'colour': 'red'}, 'definition_keys', 'colour')])
+def test_a_definition_is_refused_in_one_line(changed, code, value):
+    with refused(InputError, code, 'mine', value) as caught:
         Catalogue.from_definitions({'mine': ADDED['gyro_anisoelasticity'] | changed})
     assert '\n' not in str(caught.value)
 
 
 @pytest.mark.parametrize('name', ['bias', 'lever_arm', 'not a name', '', 3])
 def test_a_name_must_be_free(name):
-    with pytest.raises(InputError, match='must have a name of its own'):
+    with refused(InputError, 'effect_name'):
         CATALOGUE.with_effects(replace(term('mine', **ADDED['gyro_anisoelasticity']), name=name))
 
 
@@ -279,24 +279,24 @@ def by_code(**changed):
 def test_what_a_single_sample_does_not_tell_cannot_be_undone():
     """Columns that compensation cannot know are refused when the effect is declared, and by the kernel itself."""
     late = by_code(groups=(ColumnGroup('mine', ('f_x * time',)),))
-    with pytest.raises(InputError, match='must do without time, which compensation does not know'):
+    with refused(InputError, 'time_unavailable', 'mine'):
         CATALOGUE.with_effects(late)
     model = SensorModel(catalogue=Catalogue((late,))).with_effect('gyroscope', 'mine')
     values = model.start()
     values[-1] = 1.0
-    with pytest.raises(InputError, match="must do without 'time' .*declare the effect with compensation 'none'"):
+    with refused(InputError, 'variable_unavailable', 'time', 'none'):
         make_kernel(replace(session('accel_triple_product').truth, model=model, values=values))
 
 
 def test_one_name_for_two_kinds_of_columns_is_refused():
     clash = by_code(groups=(ColumnGroup('rate', ('f_x',)),), coefficients=lambda values, point: {'rate': np.tile(values['mine'], 3)[None]})
     model = SensorModel(catalogue=CATALOGUE.with_effects(clash)).with_effect('gyroscope', 'mine')
-    with pytest.raises(InputError, match="call its columns otherwise than 'rate'"):
+    with refused(InputError, 'column_name_taken', 'rate'):
         model.layout('gyroscope')
 
 
 def test_an_effect_of_code_cannot_be_written_into_a_document():
-    with pytest.raises(InputError, match='must be made of text to be written'):
+    with refused(InputError, 'made_of_code', 'mine'):
         CATALOGUE.with_effects(by_code()).definitions({'mine'})
 
 

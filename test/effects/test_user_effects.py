@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration import documents, files
 from imu_calibration.cli.main import main
@@ -103,7 +104,7 @@ def test_what_cannot_be_told_from_another_is_no_size(z_of_y, said):
 
 def test_one_of_unknown_size_cannot_be_simulated_by_name_and_what_to_write_is_said():
     catalogue = CATALOGUE.with_effects(term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text='Mine.'))
-    with pytest.raises(InputError, match='its size is not known; .* or say in its definition how large'):
+    with refused(InputError, 'size_unknown', 'mine'):
         hidden_effect(SensorModel(catalogue=catalogue), 'mine')
 
 
@@ -117,7 +118,7 @@ def test_a_choice_may_be_a_mapping_too():
 @pytest.mark.parametrize('column', ['9**9**9', '(((9**9)**9)**9)**9', '1/0', 'f_x / (1 - 1)', '1e300 * 1e300', 'log(-1)', 'sqrt(0 - 2)',
                                     'exp(999)', '1' * 200])
 def test_numbers_cannot_grow_without_end(column):
-    with pytest.raises(InputError, match='a column must be arithmetic'):
+    with refused(InputError, 'not_arithmetic'):
         read(column)
 
 
@@ -126,7 +127,7 @@ def test_numbers_cannot_grow_without_end(column):
 def test_a_column_without_a_value_is_refused_in_one_line(column):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        with pytest.raises(InputError, match="the columns of 'mine' must be finite"):
+        with refused(InputError, 'column_not_finite', 'mine'):
             ColumnGroup('mine', (column,)).columns(reference(), {})
 
 

@@ -7,6 +7,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
@@ -239,33 +240,33 @@ mount: {rpy_deg: [0, 0, 90], xyz: null}
     assert table.mount_xyz is None
 
 
-@pytest.mark.parametrize(('change', 'says'), [
-    ({'gravity': None}, 'gravity or latitude must be given, got neither'),
-    ({'gravity': 1.0}, r'gravity must lie in \[1.5, 30\], got 1.0; give it in m/s\^2'),
-    ({'gravity': 'nine'}, "gravity must be a finite number, got 'nine'"),
-    ({'latitude': 91.0}, r'latitude must lie in \[-90, 90\]'),
-    ({'joint': []}, "key 'joint' is unknown; the keys here are joints, up"),
-    ({'joints': None}, 'joints must list at least one joint, got none'),
-    ({'joints': []}, 'joints must list at least one joint, got none'),
-    ({'joints': [{'name': 'a'}]}, "must have name and axis, got {'name': 'a'}; add axis"),
-    ({'joints': [{'name': 'a', 'axis': [0, 0, 0]}]}, r"axis of joint 'a' must not be zero, got \[0, 0, 0\]"),
-    ({'joints': [{'name': 'a', 'axis': [0, 1]}]}, "axis of joint 'a' must be three numbers"),
-    ({'joints': [{'name': 'a', 'axis': [0, 0, 1], 'angle': 3}]}, "key 'angle' is unknown; the keys here are name, axis, xyz"),
-    ({'joints': 2 * [{'name': 'a', 'axis': [0, 0, 1]}]}, 'joint names must be different'),
-    ({'joints': ['outer']}, 'table joint must be a mapping'),
-    ({'up': [0, 0, 0]}, 'up must not be zero'),
-    ({'up': 'z'}, 'up must be three numbers'),
-    ({'mount': {'rpy': [0, 0, 0]}}, "key 'rpy' is unknown; the keys here are rpy_deg, xyz"),
-    ({'mount': {'rpy_deg': [0, float('nan'), 0]}}, 'mount rpy_deg must be a finite number'),
+@pytest.mark.parametrize(('change', 'code', 'values'), [
+    ({'gravity': None}, 'gravity_missing', []),
+    ({'gravity': 1.0}, 'out_of_range', ['gravity', '[1.5, 30]', 1.0]),
+    ({'gravity': 'nine'}, 'not_finite', ['gravity', 'nine']),
+    ({'latitude': 91.0}, 'out_of_range', ['latitude', '[-90, 90]', 91.0]),
+    ({'joint': []}, 'key_unknown', ["'joint'", 'joints, up']),
+    ({'joints': None}, 'no_joint', ['joints']),
+    ({'joints': []}, 'no_joint', ['joints']),
+    ({'joints': [{'name': 'a'}]}, 'keys_missing', ["{'name': 'a'}", 'axis']),
+    ({'joints': [{'name': 'a', 'axis': [0, 0, 0]}]}, 'zero_vector', ["'a'", '[0, 0, 0]']),
+    ({'joints': [{'name': 'a', 'axis': [0, 1]}]}, 'three_numbers', ["'a'", '[0, 1]']),
+    ({'joints': [{'name': 'a', 'axis': [0, 0, 1], 'angle': 3}]}, 'key_unknown', ['angle', 'name, axis, xyz']),
+    ({'joints': 2 * [{'name': 'a', 'axis': [0, 0, 1]}]}, 'joint_names', ["['a', 'a']"]),
+    ({'joints': ['outer']}, 'not_a_mapping', ['joint']),
+    ({'up': [0, 0, 0]}, 'zero_vector', ['up', '[0, 0, 0]']),
+    ({'up': 'z'}, 'three_numbers', ['up', "'z'"]),
+    ({'mount': {'rpy': [0, 0, 0]}}, 'key_unknown', ["'rpy'", 'rpy_deg, xyz']),
+    ({'mount': {'rpy_deg': [0, float('nan'), 0]}}, 'not_finite', ['rpy_deg', 'nan']),
 ])
-def test_wrong_descriptions_are_refused_in_one_line(change, says):
-    with pytest.raises(InputError, match=says) as caught:
+def test_wrong_descriptions_are_refused_in_one_line(change, code, values):
+    with refused(InputError, code, *values) as caught:
         Table.from_mapping(THREE_AXES | change)
     assert '\n' not in str(caught.value)
 
 
 def test_something_else_than_a_mapping_is_refused():
-    with pytest.raises(InputError, match='table must be a mapping'):
+    with refused(InputError, 'not_a_mapping'):
         Table.from_mapping(['outer'])
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusal import refused
 from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
@@ -179,7 +180,7 @@ def test_joint_states_that_do_not_fit_are_counted_by_reason():
 def test_names_that_never_match_are_refused_with_what_came():
     decoder = JointDecoder(('outer', 'inner'))
     decoder.decode(Packed.join([serialize(joint_message((1, 0), '', ['pan', 'tilt'], [1, 2]))]))
-    with pytest.raises(InputError, match='joints of the table .outer, inner., got pan, tilt, which lacks outer, inner;'):
+    with refused(InputError, 'joint_names', 'outer, inner', 'pan, tilt'):
         decoder.check()
     with pytest.raises(InputError):
         decoder.decode(Packed.join([serialize(joint_message((1, 0), '', ['pan', 'tilt'], [1, 2]))] * 1000))
@@ -217,7 +218,7 @@ def test_a_trajectory_whose_points_say_different_things_gives_what_all_say():
     message.points[1].velocities = np.zeros(1)
     assert trajectory_from_message(message).rate is None
     message.points[0].positions = np.zeros(0)
-    with pytest.raises(InputError, match='2 positions, one for each joint, some have not'):
+    with refused(InputError, 'position_count', 2):
         trajectory_from_message(message)
 
 

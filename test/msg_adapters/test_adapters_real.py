@@ -4,6 +4,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from refusal import refused
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_typestore
@@ -54,7 +55,7 @@ def test_a_shaft_recording_is_read_whole(recordings):
 
 @pytest.mark.real_data
 def test_several_imus_without_the_default_name_are_refused_with_a_list(recordings):
-    with pytest.raises(InputError, match='/imu_1/data_raw, /imu_3/data_raw, .* choose one'):
+    with refused(InputError, 'topic_ambiguous', '/imu_1/data_raw', '/imu_3/data_raw'):
         open_recording(recordings / 'array_2', want_joints=False)
     with open_recording(recordings / 'array_2', imu_topic='imu_3/data_raw', want_joints=False) as recording:
         assert recording.imu_topic == '/imu_3/data_raw'
@@ -80,5 +81,5 @@ def test_ros1_bags_take_the_general_path(tmp_path):
     np.testing.assert_array_equal(np.concatenate([block.imu.force_s for block in blocks]), imu.force_s)
     np.testing.assert_array_equal(blocks[0].imu.stamp_ns, imu.stamp_ns)
     np.testing.assert_array_equal(blocks[0].joints.velocity, joints.velocity[:, [2, 0, 1]])
-    with pytest.raises(InputError, match='convert it with the command'):
+    with refused(InputError, 'ros1_bag'):
         copy_with_corrected(path, tmp_path / 'new', '/imu/data_raw', corrected_topic='/c', correct=None)

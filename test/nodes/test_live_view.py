@@ -17,6 +17,8 @@ from imu_calibration.use_cases.view_messages import BAND, HEALTH, PARAMETERS, RE
 
 pytest.importorskip('foxglove', reason='the extra view is not installed')
 pytest.importorskip('tornado', reason='tornado is not installed')
+from refusal import refused
+
 from imu_calibration.use_cases.foxglove_server import AGAIN, FoxgloveServer  # noqa: E402
 
 from ros.foxglove_client import FoxgloveClient  # noqa: E402
@@ -75,7 +77,7 @@ def test_what_cannot_be_shown_is_told_and_the_rest_goes_on(server):
 
 def test_a_port_that_is_taken_is_one_sentence(server):
     port = int(server.address.rpartition(':')[2])
-    with pytest.raises(InputError, match=f"127.0.0.1:{port} is not .*; choose another 'foxglove_port', or 0 for any"):
+    with refused(InputError, 'address_taken', f'127.0.0.1:{port}', 'foxglove_port'):
         FoxgloveServer('/other', host='127.0.0.1', port=port, topics=(), clock=int, complain=print)
 
 

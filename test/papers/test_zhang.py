@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError, NotObservableError
@@ -147,9 +148,9 @@ def test_averaging_rates_by_their_information_beats_the_plain_mean():
 
 def test_closed_form_refuses_axes_it_cannot_use():
     ideal = np.eye(3)
-    with pytest.raises(NotObservableError, match='square to spin axis'):
+    with refused(NotObservableError, 'square_axes'):
         zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, directions=ideal)
-    with pytest.raises(InputError, match='orthonormal'):
+    with refused(InputError, 'not_orthonormal'):
         zhang.closed_form(np.zeros((3, 3)), np.ones((3, 3)), 1.0, directions=COSINES, spin_axes=np.ones((3, 3)))
 
 
@@ -188,7 +189,7 @@ def test_z5_joint_fit_without_noise(design):
 def test_z5_start_from_the_identity_converges_or_says_singular(design):
     runs, start = design_runs(design), np.array([0, 1.0, 0, 0, 0, 0, 0])
     if design == 'Z0':
-        with pytest.raises(NotObservableError, match='r_y; r_z'):
+        with refused(NotObservableError, 'rank', 'r_y', 'r_z'):
             fit_joint(runs, predict(runs, TRUTH[0]), start)
     else:
         np.testing.assert_allclose(fit_joint(runs, predict(runs, TRUTH[0]), start).values[0, 4:], ARMS[0], atol=1e-12)
@@ -263,7 +264,7 @@ def test_z7_weak_directions_carry_parameter_names():
 
 def test_z7_a_single_oscillation_axis_is_refused():
     runs = [face(sign * axis, 0.1 * MG) for sign in (1, -1) for axis in np.eye(3)] + [oscillation((1, 1, 1), 10, 1.0, noise_sd=MG)]
-    with pytest.raises(NotObservableError, match='rank 6') as caught:
+    with refused(NotObservableError, 'rank', 6) as caught:
         fit_joint(runs, predict(runs, TRUTH[0]))
     assert 'r_x' in str(caught.value) and 'bias' not in str(caught.value)
     show('Z7', 'single (1,1,1) oscillation', 'refused', 'refused')

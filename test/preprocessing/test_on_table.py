@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.errors import InputError
@@ -54,20 +55,20 @@ def joints(block, names=None, sign=1.0):
 ], ids=('another IMU', 'exchanged joints', 'wrong signs', 'apart in time', 'farther apart than is looked for'))
 def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
     block, table = gimbals
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         calibrate(change(block), table)
-    assert all(word in str(refused.value) for word in words) and '\n' not in str(refused.value)
-    assert ('--imu-topic' in refused.value.told({'imu_topic': '--imu-topic'})) == ('right topic' in str(refused.value))
+    assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
+    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == ('right topic' in str(caught.value))
 
 
-@pytest.mark.parametrize(('seconds', 'words'), [(0.5, 'about 0.5 s behind'), (-0.5, 'about 0.5 s ahead of'), (2.0, 'about 2.0 s behind')])
-def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, words):
-    with pytest.raises(InputError, match=words):
+@pytest.mark.parametrize(('seconds', 'delay', 'side'), [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')])
+def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, delay, side):
+    with refused(InputError, 'on_table', delay, side):
         calibrate(later(shaft[0], seconds), shaft[1])
 
 
 def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
-    with pytest.raises(InputError, match="minus the reference's x"):
+    with refused(InputError, 'handedness', 'x'):
         calibrate(joints(shaft[0], sign=-1.0), shaft[1])
 
 
@@ -100,7 +101,7 @@ def frozen(block, *, joint, start, stop):
 def test_one_joint_that_stands_still_is_named_with_the_time(gimbals, joint):
     block, table = gimbals
     count = len(block.joints.position)
-    with pytest.raises(InputError, match=f'{table.joint_names[joint]} stands still from .* while the IMU turns about its axis'):
+    with refused(InputError, 'frozen', table.joint_names[joint], ' s to '):
         calibrate(frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table)
 
 
@@ -110,7 +111,7 @@ def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_without_rests_is_named(
     moving = np.flatnonzero(np.abs(rate[:, 0]) > 1.0)
     start = moving[len(moving) // 2]
     rate[start:start + 1000] = rate[start]
-    with pytest.raises(InputError, match='the gyroscope must measure all the time, it repeats one reading from .* while the joints turn'):
+    with refused(InputError, 'frozen', 'gyroscope', ' s to '):
         calibrate(replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1])
 
 
@@ -119,23 +120,23 @@ def test_a_wrong_gain_is_no_frozen_joint(gimbals):
 
 
 def test_diagnose_refuses_the_same(gimbals):
-    with pytest.raises(InputError, match='does not turn when the table does'):
+    with refused(InputError, 'on_table', '0 %'):
         diagnose(still(gimbals[0]), gimbals[1])
 
 
-@pytest.mark.parametrize(('gain', 'noise', 'refused'), [(1.0, 0.1, False), (0.7, 0.1, False), (1e-5, 1e-3, True), (1e-5, 1.0, True), (1.0, 2.0, True)])
-def test_gain_and_coherence_decide(gain, noise, refused):
+@pytest.mark.parametrize(('gain', 'noise', 'fails'), [(1.0, 0.1, False), (0.7, 0.1, False), (1e-5, 1e-3, True), (1e-5, 1.0, True), (1.0, 2.0, True)])
+def test_gain_and_coherence_decide(gain, noise, fails):
     rng = np.random.default_rng(1)
     told = rng.normal(size=(5000, 3))
     felt = gain * told + noise * rng.normal(size=(5000, 3))
     found = same_motion((felt.T @ told, told.T @ told, felt.T @ felt), [], None)
-    assert (found is not None) == refused
+    assert (found is not None) == fails
 
 
 @pytest.mark.real_data
 def test_the_imu_on_the_bench_is_refused(recordings):
     folder = recordings / 'shaft_yaw_medium'
-    with pytest.raises(InputError, match='does not turn when the table does'):
+    with refused(InputError, 'on_table', '0 %'):
         calibrate(folder, folder / 'table.yaml', imu_topic='/imu_fixed/data_raw')
 
 
@@ -143,5 +144,5 @@ def test_a_live_session_tells_the_same_causes(gimbals):
     block, table = gimbals
     session = LiveCalibration(table)
     session.push(joints(block, ('middle', 'outer', 'inner')))
-    with pytest.raises(InputError, match='outer turns as middle should'):
+    with refused(InputError, 'on_table', 'outer', 'middle'):
         session.solve(pending=True)

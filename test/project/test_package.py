@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
+from refusal import refused
 
 import imu_calibration
 from imu_calibration import resources
@@ -218,7 +219,7 @@ def test_config_files_are_found_in_the_checkout():
 
 
 def test_an_unknown_config_file_is_refused_with_those_there_are():
-    with pytest.raises(InputError, match="'nothing.yaml' does not exist in .*; the files there are .*tolerances.yaml"):
+    with refused(InputError, 'config_file_unknown', 'nothing.yaml', 'tolerances.yaml'):
         resources.config_file('nothing.yaml')
 
 

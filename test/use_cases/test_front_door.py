@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from refusal import refused
 
 import imu_calibration as imu
 from imu_calibration import files
@@ -114,7 +115,7 @@ def test_load_gives_what_was_saved(found, tmp_path):
     np.testing.assert_array_equal(loaded.values, found.calibration.values)
     assert str(loaded) == str(found.calibration)
     (tmp_path / 'broken.yaml').write_text('format: something')
-    with pytest.raises(DocumentError, match="must say 'format"):
+    with refused(DocumentError, 'document_format', 'something'):
         imu.load(tmp_path / 'broken.yaml')
 
 
@@ -132,7 +133,7 @@ def test_a_calibration_compensates_arrays_as_the_stream_does(found, samples):
 
 def test_arms_need_times_and_a_model_without_them_does_not(found):
     readings = np.tile([0.1, 0.2, 9.8], (5, 1)), np.zeros((5, 3))
-    with pytest.raises(InputError, match='needs the time of each reading'):
+    with refused(InputError, 'time_missing'):
         found.calibration.compensate(*readings)
     plain = imu.calibrate(SESSION, TABLE, accelerometer_model='bias+matrix', model_as_asked=True).calibration
     force, _ = plain.compensate(*readings)
@@ -140,13 +141,12 @@ def test_arms_need_times_and_a_model_without_them_does_not(found):
     np.testing.assert_allclose(force @ matrix.reshape(3, 3).T + bias, readings[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize(('arguments', 'words'), [
-    ((np.zeros(3), np.zeros((1, 3))), r'specific force must be an array of shape \(n, 3\), got \(3,\)'),
-    ((np.zeros((2, 3)),), 'angular rate must be an array of shape .* got none'),
-    ((np.zeros((2, 3)), np.zeros((3, 3))), 'same instants, got 2 and 3'),
-    ((np.zeros((2, 3)), np.zeros((2, 3)), [0.0]), r'one time for each reading, shape \(2,\), got \(1,\)')])
-def test_arrays_that_do_not_fit_are_refused(found, arguments, words):
-    with pytest.raises(InputError, match=words):
+@pytest.mark.parametrize(('arguments', 'code', 'values'), [
+    ((np.zeros(3), np.zeros((1, 3))), 'shape', ['force', '(n, 3)', '(3,)']), ((np.zeros((2, 3)),), 'shape', ['rate', '(n, 3)']),
+    ((np.zeros((2, 3)), np.zeros((3, 3))), 'lengths_differ', ['2 and 3']),
+    ((np.zeros((2, 3)), np.zeros((2, 3)), [0.0]), 'time_shape', ['(2,)', '(1,)'])])
+def test_arrays_that_do_not_fit_are_refused(found, arguments, code, values):
+    with refused(InputError, code, *values):
         found.calibration.compensate(*arguments[:2], time=arguments[2] if len(arguments) > 2 else [0.0, 0.01])
 
 
@@ -158,7 +158,7 @@ def test_thermal_calibrations_take_one_temperature_or_many():
     np.testing.assert_array_equal(one, many)
     np.testing.assert_array_equal(one, topic)
     assert np.abs(one - session.truth.compensate(raw, temperature_c=25.0).force_s).max() > 1e-4
-    with pytest.raises(InputError, match='needs temperatures'):
+    with refused(InputError, 'temperature_missing'):
         session.truth.compensate(raw)
 
 
@@ -172,7 +172,7 @@ def test_compensating_a_bag_in_memory_and_into_a_bag_is_the_same(found, samples,
     np.testing.assert_array_equal(memory.imu.force_s, inside.imu.force_s)
     np.testing.assert_allclose(read.force_s, inside.imu.force_s, atol=1e-6)   # the filter's period is the median step of the first block
     np.testing.assert_array_equal(read.rate_s, inside.imu.rate_s)
-    with pytest.raises(InputError, match='must not exist yet'):
+    with refused(InputError, 'exists_already', tmp_path / 'out'):
         imu.compensate(SESSION, found.calibration, output=tmp_path / 'out')
 
 
@@ -180,11 +180,11 @@ def test_errors_speak_of_arguments_that_the_function_has(tmp_path):
     session = imu.simulate('quick', seed=2)
     from msg_adapters.write import write_session
     write_session(tmp_path / 'bag', session.samples.imu.select(slice(0, 9)), imu_topic='/imu/data_corrected')
-    with pytest.raises(InputError, match=r'name the raw topic \(argument imu_topic\)$'):
+    with refused(InputError, 'corrected_already', '/imu/data_corrected', '(argument imu_topic)'):
         imu.compensate(tmp_path / 'bag', session.truth)
-    with pytest.raises(InputError, match=r'got /none; choose one of /imu/data_corrected \(argument imu_topic\)$'):
+    with refused(InputError, 'topic_unknown', '/none', '/imu/data_corrected', '(argument imu_topic)'):
         imu.calibrate(tmp_path / 'bag', session.table, imu_topic='/none')
-    with pytest.raises(InputError, match='gravty cannot be chosen; the choices are .* gravity'):
+    with refused(InputError, 'choice_unknown', 'gravty', 'gravity'):
         imu.calibrate(tmp_path / 'bag', gravty=9.8)
 
 
