@@ -10,6 +10,7 @@ over all parameters and seeds.
 
 import argparse
 import os
+import resource
 import sys
 import time
 from pathlib import Path
@@ -22,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
 from imu_calibration.calibration.options import CalibrationOptions, choose_model  # noqa: E402
 from imu_calibration.calibration.status import tolerances_of  # noqa: E402
+from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.effects.named_models import NAMED_MODELS  # noqa: E402
 from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
 from imu_calibration.planning.belief import exact_information  # noqa: E402
@@ -39,6 +41,7 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 
 from worlds.random_tables import random_table  # noqa: E402
+from worlds.stands import STANDS, stand  # noqa: E402
 
 RATE = 100.0
 MARKS = np.linspace(0.1, 1.0, 19)
@@ -100,13 +103,55 @@ def one_table(number, seeds):
             'reported': float(np.median(reported)) if seeds else np.nan, 'planning': taken, 'motions': len(plan.motions)}
 
 
+def planned_session(plan, table, seed):
+    """Return (whether every parameter is determined and both sensors help, what is not) of a simulated session that follows the plan."""
+    profile = Profile('plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names))
+    model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
+    samples = simulate(model, random_values(model, 'industrial', seed), table, profile=profile, seed=seed)
+    found = calibrate(SampleBlock(*samples), table).calibration
+    wanted = {name for name, flag in zip(plan.model.param_names, plan.wanted, strict=True) if flag}
+    weak = [name for name, status in zip(found.param_names, found.status, strict=True) if name in wanted and status != 'determined']
+    weak += [sensor for sensor in SENSORS if found.decision.get(sensor) != 'helps']
+    return not weak, weak
+
+
+def stands(sessions, first, names):
+    """Print the targets of the six stands: time over the bound at a quarter of the default tolerances, memory, and planned sessions."""
+    noise, done, passed = noise_of_grade(GRADES['industrial'].noise, RATE), 0, 0
+    print('stand                 plan s  bound s  ratio  planning s  most MB  default plan s  bound s')
+    plans = {}
+    for name in names:
+        table = stand(name)
+        model, quarter = choose_model(CalibrationOptions(), table), {}
+        for effect in model.effects:
+            quarter.setdefault(effect.sensor, {})[effect.name] = 0.25 * effect.tolerance
+        began = time.process_time()
+        plan = make_planner(table, noise=noise, tolerances=quarter).plan()
+        taken, memory = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        plans[name] = make_planner(table, noise=noise).plan()
+        print(f'{name:<21} {plan.seconds:6.1f}  {plan.lower_bound_seconds:7.1f}  {plan.seconds / plan.lower_bound_seconds:5.2f}  {taken:10.1f}  '
+              f'{memory:7.0f}  {plans[name].seconds:14.1f}  {plans[name].lower_bound_seconds:7.1f}', flush=True)
+    for number in range(sessions):
+        name = list(plans)[number % len(plans)]
+        good, weak = planned_session(plans[name], stand(name), first + number)
+        done, passed = done + 1, passed + good
+        if not good:
+            print(f'session {first + number} on {name}: {", ".join(weak)}', flush=True)
+    print(f'{passed} of {done} planned sessions with every parameter determined and both sensors of help (target 35 of 40); ratio at most 1.25; '
+          'seven joints at most 500 MB and 10 s')
+
+
 def main():
-    """Print a row for each table and what all of them come to."""
+    """Print a row for each table, and a summary; or the targets of the six stands."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('--tables', type=int, default=20)
     parser.add_argument('--seeds', type=int, default=5)
     parser.add_argument('--first', type=int, default=0)
+    parser.add_argument('--sessions', type=int, default=0, help='print the targets of the six stands with so many sessions instead')
+    parser.add_argument('--stands', nargs='*', choices=STANDS, default=STANDS)
     options = parser.parse_args()
+    if options.sessions:
+        return stands(options.sessions, options.first, options.stands)
     rows = []
     print('table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted  reported/predicted  planning s')
     for number in range(options.first, options.first + options.tables):

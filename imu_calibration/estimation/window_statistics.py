@@ -16,6 +16,10 @@ from imu_calibration.segmentation.window import Window
 
 SLOW_TIME = 0.25
 """Length of the pieces whose means tell correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
+BATCHES = 16
+"""Pieces of a window at rest whose means give the noise at low frequency."""
+BATCH_DOF = 2 * (BATCHES - 1)**2 / (3 * BATCHES - 4)
+"""Degrees of freedom of that estimate: differences of neighbours are correlated (von Neumann)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +158,7 @@ def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     return rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
 
 
-def batch_statistics(output: np.ndarray, batches: int = 16) -> tuple[np.ndarray, np.ndarray]:
+def batch_statistics(output: np.ndarray, batches: int = BATCHES) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the variance of each column and the factor by which means of it scatter more than white noise.
 

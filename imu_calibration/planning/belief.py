@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -93,7 +94,8 @@ class Belief:
         return spread
 
 
-def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise: dict[str, NoiseModel]) -> np.ndarray:
+def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise: dict[str, NoiseModel], *,
+                      factor: float = 1.0) -> np.ndarray:
     """
     Return the information about z of the windows of a whole plan, as the calibration weighs them, shape (n, n).
 
@@ -104,40 +106,42 @@ def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise
         Middles of the windows since the beginning, s.
     noise : dict
         Sensor -> NoiseModel.
+    factor : float
+        On the variance of the noise within windows.
 
     """
-    total = np.sum([window.within for window in windows], axis=0)
+    total = np.sum([window.within for window in windows], axis=0) / factor
     for sensor in SENSORS:
         model = noise[sensor]
-        variance = np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
+        variance = factor * np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
         whitening = Whitening(variance, times, [np.arange(len(times))], processes=model.bias_processes)
         rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(-1, len(total))
         total = total + rows.T @ rows
     return total
 
 
-def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0) -> np.ndarray:
+def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0, factor: float = 1.0) -> np.ndarray:
     """
     Return an information matrix that bounds from above what a window adds in any plan, shape (n, n).
 
-    For the given share of the covariance of the bias processes; the rest is left to `common_variance`.
+    For the given share of the covariance of the bias processes, the remainder is `common_variance`; `factor` as in `exact_information`.
 
     The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an Ornstein-Uhlenbeck process seen at the middles
     of the windows, whose inverse is tridiagonal. Its rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller
     distance to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g is at least half the window's
     own length. A larger covariance says less: with every G_j replaced by its bound the means are independent, and information adds up.
     """
-    total = window.within.copy()
+    total = window.within / factor
     for sensor in SENSORS:
         model = noise[sensor]
         floor = share * sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
-        variance = window.variance[sensor] + model.offset_sd**2 + floor
+        variance = factor * window.variance[sensor] + model.offset_sd**2 + floor
         rows = window.means[sensor]
         total += rows.T @ (rows / variance[:, None])
     return total
 
 
-def common_variance(noise: NoiseModel, seconds: float) -> float:
+def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarray | float:
     """
     Return c such that the bias processes seen at any instants within so many seconds have a covariance of at least ``c 1 1'``.
 
@@ -145,3 +149,30 @@ def common_variance(noise: NoiseModel, seconds: float) -> float:
     it all the time; of several processes the inverses add up.
     """
     return sum(process.sd**2 * 2 * process.time / (seconds + 2 * process.time) for process in noise.bias_processes)
+
+
+def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) -> np.ndarray:
+    """
+    Return the variance of a constant bias that is observed all the time, beside white noise and the bias processes, shape of `seconds`.
+
+    For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a + b cosh(k (t - T / 2))`` with
+    ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is ``1 / integral(h)``. Of several processes the variances add up
+    (parallel sums are concave), with the white noise counted beside any one of them.
+
+    Parameters
+    ----------
+    white : float
+        Variance of the mean over one second.
+    seconds : ndarray
+
+    """
+    seconds = np.asarray(seconds, float)
+    best = white / seconds
+    for chosen in noise.bias_processes:
+        k = np.sqrt(1 / chosen.time**2 + 2 * chosen.sd**2 / (chosen.time * white))
+        level, steep = 1 / (chosen.time * k)**2, np.tanh(k * seconds / 2)
+        information = (level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))) / white
+        others = tuple(process for process in noise.bias_processes if process is not chosen)
+        rest = common_variance(replace(noise, bias_processes=others), seconds)
+        best = np.maximum(best, 1 / information + rest)
+    return best

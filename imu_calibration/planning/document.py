@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.planning.motions import PlannedMotion
 from imu_calibration.planning.planner import Plan
+from imu_calibration.planning.situation import PROBABILITY
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 
 FORMAT = 'imu_calibration/plan/1'
@@ -20,6 +21,7 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
         'format': FORMAT,
         'seconds': round(plan.seconds, 3),
         'lower_bound_seconds': None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3),
+        'probability': PROBABILITY,
         'joints': list(plan.motions[0].joint_names) if plan.motions else [],
         'motions': [_motion(motion, float(begin), float(end)) for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True)],
         'parameters': {name: {'sd': float(f'{plan.sd[k]:.6g}'), 'tolerance': float(f'{plan.tolerances[k]:.6g}'),

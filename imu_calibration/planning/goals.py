@@ -30,12 +30,12 @@ class Goal(Protocol):
 
 
 class WithinTolerances:
-    """Every parameter asked for within its tolerance: ``sum_i max(0, ln(sd_i / tolerance_i))``."""
+    """Every requested parameter within its tolerance: ``sum_i w_i max(0, ln(sd_i / tolerance_i))``, all weights 1 unless given."""
 
     words = ''
 
-    def __init__(self, coordinates: Coordinates):
-        self.coordinates = coordinates
+    def __init__(self, coordinates: Coordinates, weights: np.ndarray | float = 1.0):
+        self.coordinates, self.weights = coordinates, weights
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
         """Return standard deviations of the parameters asked for, in tolerances, shape (k, p)."""
@@ -43,8 +43,8 @@ class WithinTolerances:
         return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return the sum of logarithms of what is in excess."""
-        return np.maximum(np.log(margin * self.excess(covariance)), 0.0).sum(axis=1)
+        """Return the weighted sum of the logarithms of the excess."""
+        return (self.weights * np.maximum(np.log(margin * self.excess(covariance)), 0.0)).sum(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the parameters outside their tolerance."""

@@ -28,7 +28,7 @@ from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.goals import ToldApart, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.search import Offers, exchanged, greedy
+from imu_calibration.planning.search import Offers, exchanged, greedy, meets
 from imu_calibration.planning.situation import Situation
 from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
@@ -37,6 +37,8 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 DONE = 'all that was wanted is reached'
 STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
+WORTH, LEAST_WEIGHT = 1.1, 0.03
+"""A plan this many times longer than the bound is searched again, each parameter with at least this share of the largest weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +122,7 @@ class Planner:
         self.situation, self.known = situation, known
         self._belief = situation.belief(known)
         self._visited: set[int] = set()
+        self._first: list[int] | None = None if known is None else []
 
     def take(self, calibration: Calibration) -> None:
         """Replace what was hoped for by what a calibration knows: its covariance, for the parameters that the model shares with it."""
@@ -137,16 +140,19 @@ class Planner:
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
         missing = self.situation.goal.missing(self._belief.known)
-        if not self.situation.goal.left(self._belief.known[None])[0] > 0:
-            return NextMotion(None, STUCK if missing else DONE, missing=missing)
         place = self.situation.place_near(position)
-        choice = Offers(self.situation, self._belief, place)
-        number = choice.best if self._visited or self.known is not None else self.situation.first_rest(place)
-        if self._visited and choice.hopeless(number):
+        if self._first is None:
+            self._first = [] if self.known is not None else self.situation.first_rests(place)
+        if not self._first and not self.situation.goal.left(self._belief.known[None])[0] > 0:
+            return NextMotion(None, STUCK if missing else DONE, missing=missing)
+        choice, must = Offers(self.situation, self._belief, place), bool(self._first)
+        number = self._first.pop(0) if must else choice.best
+        if not must and self._visited and choice.hopeless(number):
             return NextMotion(None, STUCK, missing=missing)
         self._belief.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
-        return NextMotion(motion, f'it gains most per second for {", ".join(missing[:3])}', motion.seconds_from(position), missing)
+        reason = 'a session begins with rests in attitudes far apart' if must else f'it gains most per second for {", ".join(missing[:3])}'
+        return NextMotion(motion, reason, motion.seconds_from(position), missing)
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
         """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""
@@ -178,13 +184,27 @@ class Planner:
         situation = self.situation
         start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
         place = situation.place_near(start)
-        first = () if self.known is not None else (situation.first_rest(place),)
+        first = () if self.known is not None else situation.first_rests(place)
         self.within(longest)
-        sequence = greedy(situation, place, known=self.known, first=first, progress=progress, longest=longest)
-        sequence = exchanged(situation, sequence, place, known=self.known, fixed=len(first))
-        with_bound = with_bound and isinstance(situation.goal, WithinTolerances)
-        bound = situation.lower_bound(self.known) if with_bound else float('nan')
+        sequence = self._sequence(place, first, progress=progress, longest=longest)
+        bound, goal = float('nan'), situation.goal
+        if with_bound and isinstance(goal, WithinTolerances):
+            windows, _, seconds = situation.timed(sequence, place)
+            factor = situation.variance_factor(windows, self.known)
+            bound = situation.lower_bound(self.known, factor=factor)
+            if seconds > WORTH * bound:   # what limits the relaxed plan counts more: a second attempt
+                weights = situation.relaxation(self.known, factor=factor).weights
+                situation.goal = WithinTolerances(situation.coordinates, np.maximum(weights / weights.max(), LEAST_WEIGHT))
+                other = self._sequence(place, first, progress=None, longest=longest)
+                situation.goal = goal
+                windows, _, less = situation.timed(other, place)
+                if less < seconds and meets(situation, other, place, known=self.known):
+                    sequence, bound = other, situation.lower_bound(self.known, factor=situation.variance_factor(windows, self.known))
         return self._plan_of(sequence, start, place, bound)
+
+    def _sequence(self, place, first, *, progress, longest):
+        sequence = greedy(self.situation, place, known=self.known, first=first, progress=progress, longest=longest)
+        return exchanged(self.situation, sequence, place, known=self.known, fixed=len(first))
 
     def within(self, seconds: float) -> None:
         """Spend no time on causes that no plan of so many seconds tells apart."""
@@ -193,12 +213,12 @@ class Planner:
 
     def _plan_of(self, sequence, start, place, bound):
         situation, coordinates = self.situation, self.situation.coordinates
-        covariance, _ = situation.covariance_after(sequence, place, self.known)
+        covariance, cautious = (situation.covariance_after(sequence, place, self.known, cautious=each)[0] for each in (False, True))
         steps = [situation.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), start,
                     np.array([seconds for _, seconds in steps[1:]]), coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(covariance),
+                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(cautious),
                     situation.goal.words)
 
     def _named(self, number: int) -> PlannedMotion:

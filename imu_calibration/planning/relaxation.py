@@ -27,6 +27,8 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 
 ROUNDS = 600
 """Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
+LONGEST = 1e7
+"""Tolerances that are not met after every motion has taken this time are out of reach, s."""
 CLOSE = 1.01
 """The search ends when the relaxed value is within this factor of the certificate."""
 
@@ -43,11 +45,13 @@ class Relaxation:
     """Matrix X: what a unit of information is worth, s, shape (n, n)."""
     relaxed_seconds: float
     """Time of the relaxed plan, s; the value of the programme lies between this and the bound."""
+    weights: np.ndarray
+    """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
 
 
 def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray, rounds: int = ROUNDS) -> Relaxation:
     """
-    Return the relaxed plan with the best certificate found.
+    Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
     Visits and weights are improved by turns with multiplicative steps: visits of motions that are worth more than they cost grow (the
     algorithm of A-optimal design), and so do the weights of parameters that are further from their tolerance than others.
@@ -65,12 +69,14 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
 
     """
     if _worst(known, asked) <= 1.0:
-        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0)
+        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0, np.full(len(asked), 1.0 / len(asked)))
+    if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
+        return Relaxation(np.nan, np.full(len(seconds), np.nan), np.full_like(known, np.nan), np.nan, np.full(len(asked), 1.0 / len(asked)))
     kept = np.arange(len(seconds))
     flat = information.reshape(len(seconds), -1)
     share = np.full(len(seconds), 1.0 / len(seconds)) / seconds
     weights = np.full(len(asked), 1.0 / len(asked))
-    best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf)
+    best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf, weights)
     for number in range(rounds):
         total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
         covariance = inverse_normal(total)   # what nobody can reach is all but singular
@@ -86,7 +92,7 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
             if bound > best.seconds:
-                best = Relaxation(float(bound), scale * share, factor * prices, relaxed)
+                best = Relaxation(float(bound), scale * share, factor * prices, relaxed, weights)
             if relaxed < CLOSE * best.seconds:
                 break
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))

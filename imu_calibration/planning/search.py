@@ -20,11 +20,11 @@ LEAST_GAIN = 2e-3
 class Offers:
     """The gain of every motion from where the joints are."""
 
-    def __init__(self, situation: Situation, belief: Belief, place: int, *, margin: float = 1.0):
+    def __init__(self, situation: Situation, belief: Belief, place: int, *, margin: float = 1.0, factor: float = 1.0):
         self.places = situation.repertoire.place_of
         self.seconds = situation.seconds + situation.way_seconds[place, self.places]
         size = belief.size
-        self.information = situation.information + situation.way_information(place)
+        self.information = (situation.information + situation.way_information(place)) / factor
         self.possible = self.seconds > 0
         after = belief.after(self.information, self.seconds)
         before = situation.goal.left(belief.known[None], margin)[0]
@@ -62,15 +62,21 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         Time at most, s.
 
     """
-    belief, place, chosen, spent, margin = situation.belief(known), start, [], 0.0, 1.0
+    belief, place, chosen, spent, margin, factor = situation.belief(known), start, [], 0.0, 1.0, 0.0
+    taken: list[tuple[np.ndarray, float]] = []
     beginning = situation.goal.left(belief.known[None])[0]
     while len(chosen) < MOST_MOTIONS and spent < longest:
-        choice = Offers(situation, belief, place, margin=margin)
+        if factor != (factor := situation.variance_factor(situation.timed(chosen, start)[0], known)):
+            belief = situation.belief(known)
+            for information, seconds in taken:
+                belief.take(information / factor, seconds)
+        choice = Offers(situation, belief, place, margin=margin, factor=factor)
         must = len(chosen) < len(first)
         number = first[len(chosen)] if must else choice.best
         if not must and (choice.hopeless(number) or spent + float(choice.seconds[number]) > longest):
             break
-        belief.take(choice.information[number], float(choice.seconds[number]))
+        taken.append((factor * choice.information[number], float(choice.seconds[number])))
+        belief.take(choice.information[number], taken[-1][1])
         chosen.append(number)
         spent += float(choice.seconds[number])
         place = int(situation.repertoire.place_of[number])
@@ -87,14 +93,14 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
 
 def meets(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
     """Return whether motions reach the goal."""
-    return bool(situation.goal.left(situation.covariance_after(sequence, start, known)[0][None])[0] == 0.0)
+    return bool(situation.goal.left(situation.covariance_after(sequence, start, known, cautious=True)[0][None])[0] == 0.0)
 
 
 def exchanged(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
               fixed: int = 0) -> list[int]:
     """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
     def left(trial):
-        return float(situation.goal.left(situation.covariance_after(trial, start, known)[0][None])[0])
+        return float(situation.goal.left(situation.covariance_after(trial, start, known, cautious=True)[0][None])[0])
 
     best, goal = list(sequence), left(sequence) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):

@@ -7,19 +7,25 @@ from functools import cached_property
 
 import numpy as np
 
+from imu_calibration.chances import chi2_isf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.planning.belief import Belief, additive_bound, common_variance, exact_information
+from imu_calibration.estimation.window_statistics import BATCH_DOF
+from imu_calibration.planning.belief import Belief, additive_bound, common_variance, exact_information, least_bias_variance
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.goals import Goal, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion
-from imu_calibration.planning.relaxation import Relaxation, relax
+from imu_calibration.planning.relaxation import LONGEST, Relaxation, relax
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.windows import PlannedWindow, WindowPredictor
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 FIRST_REST = 4.0
-"""Seconds of the first rest at least: what the noise of the IMU is read from."""
+"""Seconds of the first rest at least, from which the noise of the IMU is estimated."""
+LEAST_RESTS = 6
+"""Rests with which a session begins: with the motions between them, 11 windows for the proof and for a diagnosis, which hold out some."""
+PROBABILITY = 0.95
+"""Probability that a calibration of the plan reports every parameter within its tolerance."""
 COMMON_SHARES = (0.5, 0.9)
 """Shares of the biases' covariance that are tried as common to a session in the lower bound."""
 ROUNDS_OF_LENGTH = 3
@@ -106,54 +112,87 @@ class Situation:
         turns = np.where(self.repertoire.limits.endless, np.round(away / (2 * np.pi)), 0.0)
         return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
 
-    def first_rest(self, place: int) -> int:
-        """Return the rest with which a session begins, at the place where rest is nearest: it shows the noise, and moves little."""
-        rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE and motion.seconds >= FIRST_REST]
-        return min(rests, key=lambda k: (self.way_seconds[place, self.repertoire.place_of[k]], self.seconds[k]))
+    def first_rests(self, place: int) -> list[int]:
+        """Return the rests with which a session begins, in attitudes far apart, each place the nearest one; the first rest is longer."""
+        rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
+        left, chosen = {int(self.repertoire.place_of[k]): None for k in rests}, []
+        left = dict.fromkeys(list(left)[:LEAST_RESTS])   # places are in the order of their distance in attitude
+        while len(chosen) < LEAST_RESTS and (left or len(chosen) > 1):
+            if not left:   # a chain with few attitudes returns to them
+                left = dict.fromkeys(int(self.repertoire.place_of[k]) for k in chosen if self.repertoire.place_of[k] != place)
+            place = min(left, key=lambda at: self.way_seconds[place, at])
+            del left[place]
+            here = [k for k in rests if self.repertoire.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)]
+            chosen.append(min(here, key=self.seconds.__getitem__))
+        return chosen
 
-    def lower_bound(self, known: np.ndarray | None = None) -> float:
+    def variance_factor(self, windows: Sequence[PlannedWindow], known: np.ndarray | None = None) -> float:
         """
-        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s.
+        Return the factor on the variance of the noise that its estimate exceeds on none of six axes, with the chance PROBABILITY.
+
+        ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest, weighted by its samples. Where something is
+        known, the noise was estimated from the rests of a whole session already. Causes to be told apart have a chance in their goal.
+        """
+        counts = np.array([window.samples for window in windows if window.kind == 'static'])
+        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if known is None else LEAST_RESTS)
+        if not isinstance(self.goal, WithinTolerances):
+            return 1.0
+        return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
+
+    def least_session(self) -> float:
+        """Return the least time of the rests with which a session begins, and of the ways between them, s."""
+        rests = self.first_rests(0)
+        away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
+        return float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf)) if len(rests) > 1 else 0.0
+
+    def lower_bound(self, known: np.ndarray | None = None, *, factor: float = 1.0) -> float:
+        """
+        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s; else NaN.
+
+        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is out of reach.
 
         With nothing known of the biases, a share of their wander is common to a whole session no longer than T, which keeps their
         parameters from being known better however much is measured: every plan takes at least ``min(T, value(T))``, the value that of the
         relaxation for sessions of T. The best T is looked for; without any T the share is zero.
         """
-        best = self.relaxation(known).seconds
-        if known is not None or best == 0:
+        best = self.relaxation(known, factor=factor).seconds
+        if known is not None or not np.isfinite(best):
             return best
-        floor = self._bias_floor()
+        floor = self._bias_floor(factor)
+        if not np.isfinite(floor):
+            return float('nan')
         for share in COMMON_SHARES if floor > 0.3 * best else ():
             seconds = max(best, floor)
             for _ in range(ROUNDS_OF_LENGTH):
-                value = self.relaxation(known, common=(share, seconds)).seconds
+                value = self.relaxation(known, common=(share, seconds), factor=factor).seconds
                 best = max(best, min(seconds, value))
                 if value < 1.05 * seconds:
                     break
                 seconds = float(np.sqrt(seconds * min(value, 9.0 * seconds)))
-        return max(best, floor)
+        return max(best, floor, self.least_session())
 
-    def _bias_floor(self) -> float:
-        """Return how long the biases alone must be watched, whatever else is known, s."""
+    def _bias_floor(self, factor: float) -> float:
+        """Return how long the biases alone must be observed, whatever else is known, s; infinite where they are out of reach."""
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
         for sensor in SENSORS:
             for parameter in range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names))):
                 prior = coordinates.prior_sd[parameter]**2
                 wanted = coordinates.tolerances[parameter]**2
                 room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
-                lengths = np.geomspace(0.1, 1e6, 600)
-                enough = [common_variance(self.noise[sensor], seconds) <= room for seconds in lengths]
-                floor = max(floor, float(lengths[np.argmax(enough) - 1]) if not enough[0] else 0.0)
+                lengths, axis = np.geomspace(0.01, LONGEST, 2000), (parameter - model.part(sensor, Role.OFFSET).start) % 3
+                white = factor * self.noise[sensor].low_variance[axis] / self.rate
+                enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
+                floor = max(floor, float(lengths[max(np.argmax(enough) - 1, 0)]) if enough.any() else np.inf)
         return floor
 
-    def relaxation(self, known: np.ndarray | None = None, *, common: tuple[float, float] | None = None) -> Relaxation:
+    def relaxation(self, known: np.ndarray | None = None, *, common: tuple[float, float] | None = None, factor: float = 1.0) -> Relaxation:
         """Return the relaxed plan; `common`: (share of the biases' covariance, seconds of the longest session that counts)."""
         share, seconds = common or (0.0, 0.0)
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
         everything = [*(self.windows[number] for number in own), *(self.way_windows[key] for key in edges)]
         empty = np.zeros_like(self.coordinates.prior_information)
-        most = np.array([sum((additive_bound(window, self.noise, share=1.0 - share) for window in windows), empty)
+        most = np.array([sum((additive_bound(window, self.noise, share=1.0 - share, factor=factor) for window in windows), empty)
                          for windows in everything])
         cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
         prior = self.coordinates.prior_information + (0.0 if known is None else known)
@@ -194,12 +233,13 @@ class Situation:
             place = target
         return windows, np.array(times), float(now)
 
-    def covariance_after(self, sequence: Sequence[int], start: int, known: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-        """Return (covariance of z, total time) after motions one after the other from a place."""
+    def covariance_after(self, sequence: Sequence[int], start: int, known: np.ndarray | None = None, *,
+                         cautious: bool = False) -> tuple[np.ndarray, float]:
+        """Return (covariance of z, total time) after motions one after the other from a place; `cautious`: with `variance_factor`."""
         windows, times, seconds = self.timed(sequence, start)
         total = self.coordinates.prior_information + (0.0 if known is None else known)
         if windows:
-            total = total + exact_information(windows, times, self.noise)
+            total = total + exact_information(windows, times, self.noise, factor=self.variance_factor(windows, known) if cautious else 1.0)
         return np.linalg.inv(total), seconds
 
     def best_covariance(self, seconds: float, known: np.ndarray | None = None) -> np.ndarray:

@@ -31,6 +31,8 @@ WINDOWS = {'rest': 'static', 'spin': 'spin'}
 class PlannedWindow:
     """One window of a planned motion, as the calibration will cut it."""
 
+    kind: str
+    """As the calibration will call it."""
     middle: float
     """Time since the motion began, s."""
     length: float
@@ -120,4 +122,4 @@ class WindowPredictor:
                 variance[sensor][axis] += reference
                 means[sensor][axis] = mean @ slope[:, axis]
                 within += centred.T @ (centred * weight[:, None])
-        return PlannedWindow(middle, length, samples, means, variance, within)
+        return PlannedWindow(kind, middle, length, samples, means, variance, within)

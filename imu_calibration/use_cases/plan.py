@@ -136,7 +136,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     progress : callable, optional
         Told the share of the way that is done.
     with_bound : bool
-        Whether the lower bound on the time is worked out as well.
+        Whether the lower bound on the time is computed; a plan far above it is searched a second time.
     choices
         tolerances, noise, accelerometer_model, gyroscope_model, reference_model, catalogue, gravity: see `Choices`.
 
@@ -291,7 +291,7 @@ def summary(made: Plan) -> list[str]:
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
     lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters come within their tolerance']
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
-        lines.append(f'no plan of these motions takes less than {made.lower_bound_seconds:.0f} s')
+        lines.append(f'no plan of these motions with the same probability (95 %) takes less than {made.lower_bound_seconds:.0f} s')
     if made.missing:
         lines.append(f'outside their tolerance whatever these joints do within their limits: {", ".join(made.missing)}')
     return lines
