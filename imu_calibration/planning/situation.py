@@ -182,7 +182,7 @@ class Situation:
                 lengths, axis = np.geomspace(0.01, LONGEST, 2000), (parameter - model.part(sensor, Role.OFFSET).start) % 3
                 white = factor * self.noise[sensor].low_variance[axis] / self.rate
                 enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
-                floor = max(floor, float(lengths[max(np.argmax(enough) - 1, 0)]) if enough.any() else np.inf)
+                floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf)
         return floor
 
     def relaxation(self, known: np.ndarray | None = None, *, common: tuple[float, float] | None = None, factor: float = 1.0) -> Relaxation:
