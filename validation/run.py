@@ -67,19 +67,16 @@ def document(sections):
     return '\n\n'.join(parts + [section.markdown() for section in sections]) + '\n'
 
 
-def update_readme(sections, readme=ROOT / 'README.md'):
-    """Write the README's section with the headlines of this run."""
+def update_evidence(sections, evidence=ROOT / 'docs' / 'evidence.md'):
+    """Write the section of docs/evidence.md with the headlines of this run."""
     rows = [row for section in sections for row in section.rows]
     judged = [row for row in rows if row.holds is not None]
     table = claims_table([row for row in rows if row.headline])
-    new = text('readme', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table)
-    page = readme.read_text()
+    new = text('evidence', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table)
+    page = evidence.read_text()
     before, _, rest = page.partition(HEADING)
     _, mark, after = rest.partition('\n## ')
-    if not rest:   # the first time, before the speed
-        before, mark, after = page.partition('\n## Speed')
-        before, mark = before + '\n', '\n## Speed'
-    readme.write_text(before + new + '\n' + mark + after)
+    evidence.write_text(before + new + '\n' + mark + after)
 
 
 def main():
@@ -102,7 +99,7 @@ def main():
     else:
         (options.output / 'validation.md').write_text(document(sections))
         if options.output == ROOT / 'docs':
-            update_readme(sections)
+            update_evidence(sections)
         print(f'written: {options.output / "validation.md"}')
     return 0 if all(whole for _, whole in results) else 1
 

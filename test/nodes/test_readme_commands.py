@@ -1,4 +1,4 @@
-"""Every `ros2` command of the README and of docs/on-your-robot.md, as printed, from where they put the user: ~/ws with the package built in it."""
+"""Every `ros2` command of docs/ros.md and of the README, as printed, from where they put the user: ~/ws with the package built in it."""
 
 import os
 import re
@@ -28,7 +28,7 @@ ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': 
 """Beginnings of questions -> what stands in the answer."""
 
 
-PAGES = ('README.md', 'docs/on-your-robot.md')
+PAGES = ('docs/ros.md', 'README.md')
 
 
 def commands():

@@ -173,10 +173,10 @@ def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
             assert oldest[distribution(name)].startswith(least), requirement
 
 
-def test_the_readme_opens_with_the_equation_and_the_two_commands():
-    opening = (ROOT / 'README.md').read_text().partition('\n## ')[0]
-    assert 'measured = bias + matrix @ (true + lever-arm terms) + further effects' in opening
-    assert re.search(r'^make demo\b', opening, re.M) and re.search(r'^make test\b', opening, re.M)
+def test_the_readme_is_short_and_has_the_equation():
+    text = (ROOT / 'README.md').read_text()
+    assert len(text.split()) <= 1000
+    assert 'measured = bias + matrix @ (true + lever-arm terms) + further effects' in text
 
 
 def test_every_file_that_a_make_target_runs_exists():

@@ -64,14 +64,14 @@ def test_a_section_shows_what_does_not_hold(tmp_path):
     assert '1 of 2 claims hold. Those that do not:' in text and text.count('| second | 2 | 3.0 \\| 4 | **no** |') == 2
 
 
-def test_the_readme_quotes_the_document():
-    """Every figure of the README's table stands in docs/validation.md; only a run writes both."""
-    part = (ROOT / 'README.md').read_text().partition('\n## How good is it\n')[2].partition('\n## ')[0]
+def test_the_evidence_quotes_the_document():
+    """Every figure of the table in docs/evidence.md is in docs/validation.md; only a run writes both."""
+    part = (ROOT / 'docs' / 'evidence.md').read_text().partition('\n## How good is it\n')[2].partition('\n## ')[0]
     written = (ROOT / 'docs' / 'validation.md').read_text()
     rows = [line.split('|') for line in part.splitlines() if line.startswith('| ')][2:]
     assert len(rows) >= 5
     for row in rows:
-        assert row[3].strip() in written, f'{row[3].strip()!r} of the README is not in docs/validation.md'
+        assert row[3].strip() in written, f'{row[3].strip()!r} of docs/evidence.md is not in docs/validation.md'
     date = written.partition('one run on ')[2][:10]
     assert date in part
 

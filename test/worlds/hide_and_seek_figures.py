@@ -1,4 +1,4 @@
-"""The figures of hide and seek as text: the table in docs/hide-and-seek.md and the sentence in the README, written from the record."""
+"""The figures of hide and seek as text: the table in docs/hide-and-seek.md and the sentence in docs/evidence.md, written from the record."""
 
 import re
 from datetime import date
@@ -18,7 +18,7 @@ MARKS = ('<!-- {}: begin -->', '<!-- {}: end -->')
 
 
 def write_figures(rows, docs):
-    """Put the figures of a record between the marks in docs/hide-and-seek.md and README.md; other text stays."""
+    """Put the figures of a record between the marks in docs/hide-and-seek.md and docs/evidence.md; other text stays."""
     parts = {}
     for row in rows:
         parts.setdefault(row['part'], []).append(row)
@@ -27,7 +27,7 @@ def write_figures(rows, docs):
         _replace(docs / 'hide-and-seek.md', missed(parts), 'missed')
     if 'beyond' in parts:
         _replace(docs / 'hide-and-seek.md', beyond_table(parts['beyond']), 'beyond')
-    _replace(docs.parent / 'README.md', _sentence(rows, parts))
+    _replace(docs / 'evidence.md', _sentence(rows, parts))
 
 
 def _replace(path, text, what='figures'):

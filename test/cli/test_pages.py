@@ -1,0 +1,62 @@
+"""Every plain command of the README and of docs/turntable.md runs as printed, in a folder with recordings of the names that they use."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imu_calibration
+from imu_calibration.cli.main import main
+from imu_calibration.samples import ImuSamples
+from msg_adapters.write import write_session
+
+from worlds.hand_sessions import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / 'bags' / 'sample_session'
+
+
+def commands(page):
+    """Commands in the fenced blocks of a page that call the offline tool."""
+    parts = re.split(r'^ *```\w*\n?', (ROOT / page).read_text(), flags=re.MULTILINE)
+    lines = [line.strip() for block in parts[1::2] for line in block.splitlines()]
+    return [line for line in lines if line.startswith('imu_calibration ')]
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Recordings under the names of the pages: by hand, at rest, on the table of the sample session."""
+    place = tmp_path_factory.mktemp('user')
+    by_hand = simulate(7, n_poses=14)[0]
+    rng = np.random.default_rng(1)
+    still = ImuSamples(10**18 + 5_000_000 * np.arange(60_000), rng.normal([0, 0, 9.81], 0.01, (60_000, 3)), rng.normal(0, 1e-3, (60_000, 3)), 'imu_link')
+    for name, imu in (('my_bag', by_hand), ('my_drive', by_hand), ('still_bag', still)):
+        write_session(place / name, imu)
+    for name in ('session', 'later_session'):
+        shutil.copytree(SAMPLE, place / name)
+    shutil.copytree(SAMPLE, place / 'bags' / 'sample_session')
+    shutil.copy(SAMPLE / 'table.yaml', place / 'table.yaml')
+    return place
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('page', ['README.md', 'docs/turntable.md'])
+def test_commands_run_as_printed(page, folder, monkeypatch, tmp_path, capsys):
+    shutil.copytree(folder, tmp_path / 'user')
+    monkeypatch.chdir(tmp_path / 'user')
+    found = commands(page)
+    assert len(found) >= 6
+    for command in found:
+        code = main(shlex.split(command)[1:])
+        assert code in (0, 3), f'{command}\n{capsys.readouterr().err}'
+
+
+def test_arrays_calibrate_as_the_readme_shows(tmp_path):
+    code = re.search(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL).group(1)
+    imu = simulate(7, n_poses=14)[0]
+    names = {'time': imu.stamp_ns * 1e-9, 'force': imu.force_s, 'rate': imu.rate_s}
+    exec(code.replace("'result'", repr(str(tmp_path / 'result'))), names)
+    assert (tmp_path / 'result' / 'calibration.yaml').is_file() and imu_calibration.load(tmp_path / 'result' / 'calibration.yaml')
