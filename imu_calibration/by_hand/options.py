@@ -11,6 +11,10 @@ from imu_calibration.errors import InputError
 from imu_calibration.settings import setting
 
 
+GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9
+"""Smallest and largest gravity on the surface of the Earth with a margin, m/s^2: 9.764 on a mountain in Peru, 9.834 in the Arctic."""
+
+
 @dataclass(frozen=True)
 class ByHandSettings:
     """Numbers for calibration by hand."""
@@ -73,7 +77,7 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     Raises
     ------
     InputError
-        When an effect does not exist, or something is asked for that only a table makes use of.
+        When an effect does not exist, gravity is not that of a place on the Earth, or something is asked for that only a table makes use of.
 
     """
     if options.noise is not None:
@@ -82,6 +86,9 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     asked = (options.accelerometer_model, options.gyroscope_model)
     accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
                                 for sensor, text in zip(SENSORS, asked, strict=True))
+    if options.gravity is not None and not GRAVITY_LEAST <= options.gravity <= GRAVITY_MOST:
+        raise InputError(f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of the Earth, '
+                         f'got {options.gravity:g}; give the local gravity in m/s^2, or none', key='gravity')
     gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, 0.0)
     return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope,
                        catalogue=options.catalogue)

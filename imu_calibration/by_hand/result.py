@@ -9,7 +9,7 @@ from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.constants import STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import Role
 from imu_calibration.segmentation.window import Window, WindowKind
 
@@ -66,13 +66,12 @@ class HandResult(CalibrationResult):
         return {}
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
-        """Return noise and gravity: there is no other reference. The gravity of a default value is in the sd already."""
-        model, values = self.calibration.model, self.calibration.values
-        noise = 'noise, scatter of poses and turns, as this recording shows them'
-        if self.gravity == STANDARD_GRAVITY:
-            noise += ', and the gravity, which was not given'
-            return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.sd}, {'noise': noise})
-        part, gravity = model.part('accelerometer', Role.LINEAR), np.zeros(len(values))
-        gravity[part] = np.abs(values[part]) * errors.gravity / self.gravity
-        return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.sd, 'gravity': gravity},
-                           {'noise': noise, 'gravity': f'gravity known to {errors.gravity:.2g} m/s²'})
+        """Return noise and gravity: there is no other reference. The sds contain the uncertainty of a gravity that was not given."""
+        model, values, sd = self.calibration.model, self.calibration.values, self.calibration.sd
+        known = self.options.gravity is not None
+        gravity_sd, part, gravity = errors.gravity if known else STANDARD_GRAVITY_SD, model.part('accelerometer', Role.LINEAR), np.zeros(len(sd))
+        gravity[part] = np.abs(values[part]) * gravity_sd / self.gravity
+        noise = sd if known else np.sqrt(np.maximum(sd**2 - gravity**2, 0.0))
+        return ErrorBudget(tuple(model.param_names), {'noise': noise, 'gravity': gravity},
+                           {'noise': 'noise, scatter of poses and turns, as this recording shows them',
+                            'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²'})

@@ -10,11 +10,13 @@ from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import unpack
-from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.by_hand.options import HandOptions, hand_options
 from imu_calibration.by_hand.poses import average_poses
 from imu_calibration.by_hand.turns import at_range_end, rising, sample_times
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.earth import EARTH_RATE
 from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
@@ -260,3 +262,21 @@ def test_times_of_a_sensor_that_is_polled_at_uneven_moments_are_its_stamps():
     stamps = 10**18 + np.round(1e9 * polled).astype(np.int64)
     found = sample_times(ImuSamples(stamps, steady.force_s, rate, 'imu_link'))
     np.testing.assert_allclose(found, 1e-9 * (stamps - stamps[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize('gravity', [981.0, -9.81, float('nan')])
+def test_a_gravity_of_no_place_on_the_earth_is_refused(gravity):
+    with pytest.raises(InputError) as refused:
+        hand_options(CalibrationOptions(gravity=gravity))
+    assert refused.value.key == 'gravity'
+
+
+def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_standard_one_as_known():
+    imu, ranges, _ = hold_and_turn(3, n_poses=14)
+    unknown, given = (calibrate_samples_by_hand(HandRecording(imu, None, {}), CalibrationOptions(gravity=gravity, as_asked=True), stills=ranges)
+                      for gravity in (None, STANDARD_GRAVITY))
+    scale = unknown.calibration.param_names.index('accelerometer.matrix.xx')
+    budgets = [result.error_budget() for result in (unknown, given)]
+    assert budgets[0].causes['gravity'][scale] == pytest.approx(STANDARD_GRAVITY_SD / STANDARD_GRAVITY, rel=0.05)
+    assert budgets[0].causes['noise'][scale] == pytest.approx(budgets[1].causes['noise'][scale], rel=0.05)
+    assert budgets[1].causes['gravity'][scale] < 0.1 * budgets[0].causes['gravity'][scale]
