@@ -10,7 +10,6 @@ from imu_calibration.effects.named_models import parse_effects
 from imu_calibration.errors import InputError
 from imu_calibration.settings import setting
 
-
 GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9
 """Smallest and largest gravity on the surface of the Earth with a margin, m/s^2: 9.764 on a mountain in Peru, 9.834 in the Arctic."""
 
@@ -77,7 +76,7 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     Raises
     ------
     InputError
-        When an effect does not exist, gravity is not that of a place on the Earth, or something is asked for that only a table makes use of.
+        When an effect does not exist, gravity is impossible, or something is requested that needs a table.
 
     """
     if options.noise is not None:

@@ -69,7 +69,8 @@ class HandResult(CalibrationResult):
         """Return noise and gravity: there is no other reference. The sds contain the uncertainty of a gravity that was not given."""
         model, values, sd = self.calibration.model, self.calibration.values, self.calibration.sd
         known = self.options.gravity is not None
-        gravity_sd, part, gravity = errors.gravity if known else STANDARD_GRAVITY_SD, model.part('accelerometer', Role.LINEAR), np.zeros(len(sd))
+        gravity_sd = errors.gravity if known else STANDARD_GRAVITY_SD
+        part, gravity = model.part('accelerometer', Role.LINEAR), np.zeros(len(sd))
         gravity[part] = np.abs(values[part]) * gravity_sd / self.gravity
         noise = sd if known else np.sqrt(np.maximum(sd**2 - gravity**2, 0.0))
         return ErrorBudget(tuple(model.param_names), {'noise': noise, 'gravity': gravity},
