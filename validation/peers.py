@@ -135,7 +135,7 @@ def trials(section):
     rows = []
     for kind, make in TRIALS.items():
         found = trial(make)
-        mine, peers = found['ours'], np.min([errors for name, errors in found.items() if name != 'ours'], axis=0)
+        mine, peers = found['ours'], np.nanmin([errors for name, errors in found.items() if name != 'ours'], axis=0)
         section.claim(f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope, against the best peer', f'at most {WITHIN} of it',
                       '; '.join(f'{1e3 * a:.2f} against {1e3 * b:.2f} {unit}' for a, b, unit in zip(mine, peers, ('mm/s²', 'mrad/s'))),
                       np.all(mine <= WITHIN * peers))
