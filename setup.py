@@ -36,7 +36,12 @@ setup(
     name=NAME,
     version='0.1.0',
     description='Calibration and compensation of inertial measurement units, offline and live on ROS 2',
+    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     license='Apache-2.0',
+    classifiers=['Development Status :: 4 - Beta', 'Intended Audience :: Science/Research', 'Operating System :: POSIX :: Linux',
+                 'Programming Language :: Python :: 3.11', 'Programming Language :: Python :: 3.12',
+                 'Programming Language :: Python :: 3.13', 'Topic :: Scientific/Engineering'],
     maintainer='imu_calibration maintainers',
     maintainer_email='imu_calibration@users.noreply.github.com',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_adapters', 'msg_adapters.*']),
@@ -50,9 +55,10 @@ setup(
     python_requires='>=3.11',
     install_requires=[
         'numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11',
-        'lz4', 'backports.zstd; python_version < "3.14"', 'urdfdom-py', 'xacro',
+        'lz4', 'backports.zstd; python_version < "3.14"',
     ],
-    extras_require={'dask': ['dask', 'distributed'], 'view': ['foxglove-sdk']},
+    # urdfdom-py brings lxml (12 MB), which only robot descriptions need.
+    extras_require={'arm': ['urdfdom-py', 'xacro'], 'dask': ['dask', 'distributed'], 'view': ['foxglove-sdk']},
     zip_safe=False,
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={

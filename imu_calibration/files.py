@@ -105,7 +105,10 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     if not allow_xacro:
         raise InputError(f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
                          'if you trust its author', key='allow_xacro')
-    import xacro
+    try:
+        import xacro
+    except ImportError as error:
+        raise InputError("a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'") from error
     try:
         return xacro.process_file(str(path)).toxml()
     except Exception as error:   # macros raise whatever their expressions do

@@ -5,6 +5,7 @@ In: topics, services, parameters. Out: topics, diagnostics, files.
 Read `calibration_node` and `compensator_node` first.
 """
 
-from imu_calibration.nodes.early_end import end_quietly_while_importing
+from imu_calibration.nodes.early_end import end_quietly_while_importing, require_rclpy
 
 end_quietly_while_importing()
+require_rclpy()

@@ -1,8 +1,9 @@
-"""A node that is asked to end while its modules are still being imported: it ends at once, without a traceback."""
+"""The first moments of a node: it ends without a traceback where ROS is not installed or an interrupt comes while modules are imported."""
 
 import os
 import signal
 import sys
+from importlib.util import find_spec
 
 NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 """Executables of this package; the nodes of other packages that import it keep their own interrupt."""
@@ -13,6 +14,14 @@ def end_quietly_while_importing() -> None:
     if is_node_process():
         # Nothing is open yet; an exception would go through whatever is being imported.
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(0))
+
+
+def require_rclpy() -> None:
+    """End a node's process with one line and exit code 1 where ROS is not installed; does nothing in other programs."""
+    if is_node_process() and find_spec('rclpy') is None:
+        print('a node needs ROS 2 (rclpy), it is not installed; source a ROS 2 Jazzy workspace, or use the command line imu_calibration, '
+              'which needs no ROS', file=sys.stderr)
+        raise SystemExit(1)
 
 
 def is_node_process() -> bool:

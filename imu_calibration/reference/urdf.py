@@ -89,8 +89,11 @@ def _read(text):
     """Return the robot that the parser makes of what the text says about links and joints."""
     from xml.etree import ElementTree
 
-    from urdf_parser_py.urdf import Robot
-    from urdf_parser_py.xml_reflection.core import ParseError
+    try:
+        from urdf_parser_py.urdf import Robot
+        from urdf_parser_py.xml_reflection.core import ParseError
+    except ImportError as error:
+        raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'") from error
     try:
         root = ElementTree.fromstring(text)
         if root.tag != 'robot':

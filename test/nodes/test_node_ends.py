@@ -172,3 +172,25 @@ def test_the_first_line_names_the_topics(node, topics, tmp_path):
         station.until(lambda: (tmp_path / 'out.txt').read_text().strip(), 'the first line')
         station.spin_for(0.2)
     assert topics in (tmp_path / 'out.txt').read_text().splitlines()[0]
+
+
+def test_a_node_without_ros_ends_with_one_line(monkeypatch, capsys):
+    from imu_calibration.nodes import early_end
+    early_end.require_rclpy()   # this process is no node
+    monkeypatch.setattr(early_end, 'is_node_process', lambda: True)
+    monkeypatch.setattr(early_end, 'find_spec', lambda name: None)
+    with pytest.raises(SystemExit) as ended:
+        early_end.require_rclpy()
+    assert ended.value.code == 1 and capsys.readouterr().err.count('\n') == 1
+
+
+@pytest.mark.parametrize('module', ['urdf_parser_py.urdf', 'xacro'])
+def test_a_robot_description_without_its_packages_is_refused_with_the_extra(monkeypatch, tmp_path, module):
+    from imu_calibration import files
+    from imu_calibration.errors import InputError
+    from imu_calibration.reference.urdf import table_from_urdf
+    monkeypatch.setitem(sys.modules, module, None)
+    path = tmp_path / ('arm.xacro' if module == 'xacro' else 'arm.urdf')
+    path.write_text('<robot name="a"><link name="base"/></robot>')
+    with pytest.raises(InputError, match=r'imu_calibration\[arm\]'):
+        table_from_urdf(files.read_robot_description(path, allow_xacro=True), 'base', {'gravity': 9.8})
