@@ -1,9 +1,10 @@
 """Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
 
+import re
 from enum import StrEnum
 from typing import Any
 
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, shortened
 
 LARGEST = 2_000_000
 """Characters of a document at most; the covariance of a hundred parameters takes 300 000."""
@@ -13,6 +14,8 @@ LONGEST = 5000
 """Characters of one text or number at most; a number in base sixty takes time with the square of its length."""
 NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
 """What the parser raises for dates and numbers that are none."""
+NUMBER, LONGEST_NUMBER = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
+"""What may be a number, and its characters at most; larger whole numbers do not fit into a float."""
 DEEPEST = 20
 """Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
 
@@ -48,13 +51,29 @@ def to_text(document: dict[str, Any]) -> str:
 
 
 def from_text(text: str, what: str = 'document') -> dict[str, Any]:
+    """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
+    document = parsed(text, what)
+    if not isinstance(document, dict):
+        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file')
+    return document
+
+
+def parsed(text: str, what: str, aliases: bool = False) -> Any:
     """
-    Return the mapping in a YAML text.
+    Return the content of a YAML text.
+
+    Parameters
+    ----------
+    text : str
+    what : str
+        What it is, for errors.
+    aliases : bool
+        Whether a part may stand for an earlier one; recorders write so.
 
     Raises
     ------
     InputError
-        When the text is not YAML or not a mapping, or too large, too deep or built on aliases; a text of a few lines could otherwise
+        When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a text of a few lines could otherwise
         take all memory.
 
     """
@@ -62,28 +81,51 @@ def from_text(text: str, what: str = 'document') -> dict[str, Any]:
     loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
     _within_limits(len(text), LARGEST, what, 'characters')
     try:
-        _look_through(yaml.parse(text, Loader=loader), what)
-        document = yaml.load(text, Loader=loader)
+        _look_through(yaml.parse(text, Loader=loader), what, aliases)
+        return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
-        line = ' '.join(str(error).split())
-        raise InputError(f'a {what} must be YAML, this is not: {line}; correct the file') from error
-    if not isinstance(document, dict):
-        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file')
-    return document
+        raise InputError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file') from error
 
 
-def _look_through(events, what):
+def _look_through(events, what, aliases):
     """Refuse what would take long or much memory to build, from the parser's events, which take neither."""
-    depth = 0
-    for count, event in enumerate(events):
+    count, sizes, open_parts = 0, {}, []   # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
+    for event in events:
         kind = type(event).__name__
-        depth += kind.endswith('StartEvent') - kind.endswith('EndEvent')
-        if kind == 'AliasEvent':
+        if kind.endswith(('StreamStartEvent', 'DocumentStartEvent', 'StreamEndEvent', 'DocumentEndEvent')):
+            continue
+        if kind.endswith('EndEvent'):
+            anchor, start, *_ = open_parts.pop()
+            sizes[anchor] = count - start
+            continue
+        if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise InputError(f'a {what} must say everything where it stands, this one has YAML aliases (*{event.anchor}); write it without',
                              code='yaml_alias')
-        _within_limits(depth - 2, DEEPEST, what, 'levels')   # the stream and the document are levels too
+        if open_parts and open_parts[-1][2] is not None:
+            _check_key(event, open_parts[-1], what)
+        count += sizes[event.anchor] if kind == 'AliasEvent' else 1
+        if kind == 'ScalarEvent':
+            sizes[event.anchor] = 1
+            if event.implicit[0] or event.tag:   # else it is a quoted text
+                _within_limits(len(event.value), LONGEST, what, 'characters in a row')
+                if NUMBER.fullmatch(event.value):
+                    _within_limits(len(event.value), LONGEST_NUMBER, what, 'characters in a number')
+        elif kind != 'AliasEvent':
+            open_parts.append([event.anchor, count, set() if kind == 'MappingStartEvent' else None, True])
+        _within_limits(len(open_parts), DEEPEST, what, 'levels')
         _within_limits(count, MOST_PARTS, what, 'parts')
-        _within_limits(len(getattr(event, 'value', '')), LONGEST, what, 'characters in a row')
+
+
+def _check_key(event, mapping, what):
+    """Refuse a key that the open mapping has already, and one that merges another mapping into it."""
+    mapping[3] = not mapping[3]
+    if mapping[3]:   # this is a value
+        return
+    key = getattr(event, 'value', None)
+    if key in mapping[2] or (key == '<<' and event.implicit[0]):
+        raise InputError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
+                         f'{event.start_mark.line + 1}; remove it')
+    mapping[2].update([key] if key is not None else [])
 
 
 def _within_limits(number, limit, what, unit):

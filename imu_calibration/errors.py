@@ -93,4 +93,4 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
         gets no hint.
 
     """
-    return f'{text} ({hints[key]})' if key in hints else text
+    return printable(f'{text} ({hints[key]})' if key in hints else text)

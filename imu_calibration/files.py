@@ -1,6 +1,7 @@
 """Files that the verbs read and write: whole or not at all."""
 
 import hashlib
+import io
 import os
 import zlib
 from collections.abc import Callable, Iterator
@@ -9,7 +10,9 @@ from errno import EISDIR
 from itertools import count
 from os import PathLike
 from pathlib import Path
+from secrets import token_hex
 from stat import S_ISDIR
+from tempfile import TemporaryFile
 from typing import Any
 
 from imu_calibration import documents
@@ -19,6 +22,7 @@ from imu_calibration.calibration.document import Calibration, calibration_from_t
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
+from imu_calibration.regular_files import open_regular
 
 
 def user_path(text: str) -> Path:
@@ -40,7 +44,7 @@ def user_path(text: str) -> Path:
 def read_text(path: str | PathLike[str], what: str) -> str:
     """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
     try:
-        with open(path, encoding='utf-8') as stream:
+        with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
             text = stream.read(documents.LARGEST + 1)
     except (OSError, ValueError) as error:
         raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
@@ -51,7 +55,8 @@ def read_text(path: str | PathLike[str], what: str) -> str:
 def read_bytes(path: str | PathLike[str], what: str) -> bytes:
     """Return the bytes of a file, or refuse in one line."""
     try:
-        return Path(path).read_bytes()
+        with open_regular(path) as stream:
+            return stream.read()
     except (OSError, ValueError) as error:
         raise InputError(f'the {what} {path} must be readable: {_why(error)}; correct the path') from error
 
@@ -135,9 +140,8 @@ def make_folder(path: str | PathLike[str]) -> Path:
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f'.write_test_{os.getpid()}'
-        probe.touch()
-        probe.unlink()
+        with TemporaryFile(dir=folder):
+            pass
     except (OSError, ValueError) as error:
         raise InputError(f'the output folder {folder} must be writable: {_why(error)}; choose another one') from error
     return folder
@@ -192,7 +196,7 @@ def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) ->
     """
     path = Path(path)
     with _beside(path) as beside:
-        with open(beside, 'wb') as stream:
+        with open(beside, 'xb') as stream:
             stream.write(data)
             if to_disk:
                 stream.flush()
@@ -212,7 +216,8 @@ def try_place(path: Path) -> None:
     """
     path = Path(path)
     with _beside(path) as beside:
-        beside.write_bytes(b'.')
+        with open(beside, 'xb') as stream:
+            stream.write(b'.')
         with suppress(FileNotFoundError):
             if S_ISDIR(os.stat(path).st_mode):
                 raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
@@ -262,9 +267,9 @@ def _ending(path: Path) -> str:
 
 @contextmanager
 def _beside(path):
-    """Give a name in the same folder that no other process uses; what fails becomes one line, and nothing is left under that name."""
-    # A name as long as allowed leaves no room for an ending.
-    beside = path.parent / f'.{os.getpid()}.{_ending(path)}'
+    """Give a name in the same folder that nobody can guess, for a file to be made; an error becomes one line, and that file is removed."""
+    # A link placed under a known name would be followed; a name as long as allowed leaves no room for an ending.
+    beside = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside

@@ -1,11 +1,11 @@
 """Recordings: which topics to read, and their samples block by block in file order."""
 
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, shortened
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.csv_bag import CsvBag
 from msg_adapters.csv_log import SUFFIXES, is_csv
@@ -155,19 +155,20 @@ class Recording:
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
             standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
-            deserialize = None if standard else self._general(message_type)
+            deserialize = None if standard else self.deserializer(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
             else:
                 decoders[topic] = Decoder(message_type, deserialize)
         return decoders
 
-    def _general(self, message_type):
+    def deserializer(self, message_type: str) -> Callable:
+        """Return a function from message bytes to a message object (raises InputError for a definition that cannot be used)."""
         try:
             return deserializer(message_type, self.source.definitions, self.source.ros1)
         except Exception as error:   # rosbags' parser raises many kinds
             raise InputError(f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
-                             f'{" ".join(str(error).split())}; record again with standard messages', code='definition_damaged') from error
+                             f'{shortened(str(error), 200)}; record again with standard messages', code='definition_damaged') from error
 
     def close(self) -> None:
         """Close the files."""
@@ -191,6 +192,8 @@ def _open_source(path):
     if not path.exists():
         raise InputError(f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file, got {path}, which does not '
                          'exist; check the path')
+    if not (path.is_dir() or path.is_file()):
+        raise InputError(f'a recording must be a folder or a regular file, got {path}, which is a pipe or a device; give a file')
     try:
         if is_csv(path):
             return CsvBag(path)
@@ -198,7 +201,7 @@ def _open_source(path):
     except InputError:
         raise
     except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
-        came = ' '.join(str(error).split())
+        came = shortened(str(error), 300)
         raise InputError(f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file) or a text log '
                          f'({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or write the data as CSV and use the verb '
                          'convert') from error

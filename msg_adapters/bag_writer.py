@@ -2,10 +2,12 @@
 
 import os
 import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -93,8 +95,15 @@ class BagWriter:
     def __enter__(self):
         return self
 
-    def __exit__(self, kind, *_):
-        self.close() if kind is None else self.abort()
+    def __exit__(self, kind, error, _):
+        try:
+            if kind is None:
+                return self.close()
+        except (OSError, sqlite3.Error) as failure:
+            error = failure
+        self.abort()
+        if isinstance(error, (OSError, sqlite3.Error)):
+            raise InputError(f'{self.path} must be writable to its end, got: {error}; free space or choose another output') from error
 
 
 def make_partial_folder(path: Path) -> Path:
@@ -102,10 +111,9 @@ def make_partial_folder(path: Path) -> Path:
     path = Path(path)
     if path.exists():
         raise InputError(f'{path} must not exist yet; remove it or choose another name', code='exists_already')
-    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
+    partial = path.with_name(f'.{path.name}.{os.getpid()}.{token_hex(8)}.partial')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
     except OSError as error:
         raise InputError(f'{path.parent} must be a folder that can be written: {error.strerror}; choose another output') from error

@@ -1,13 +1,23 @@
-"""Compressed files, chunks and messages; a stream that is cut off gives what came before the cut."""
+"""Compressed files, chunks and messages, within limits; a stream that is cut off gives what came before the cut."""
 
+import bz2
+import shutil
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from msg_adapters.mcap_records import McapDamage
 
 PIECE = 1 << 20
+LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
+"""Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes."""
+MOST_FRAMES = 10_000
+"""Frames of one stream; each costs time and gives at least a megabyte in files that compress in parallel."""
+FILE_BASE, FILE_RATIO = 256 << 20, 100
+"""A file may grow to this many bytes, plus this many times its compressed size; recordings of sensors shrink by a factor of ten at most."""
 
 
 @cache
@@ -20,35 +30,53 @@ def zstd() -> ModuleType:
     return module
 
 
-def decompress_chunk(compression: str, packed: memoryview) -> bytes:
-    """Return the content of a chunk, or what can be had of it (raises McapDamage)."""
-    if compression not in ('zstd', 'lz4'):
-        raise McapDamage(f'a chunk with the unknown compression {compression!r}')
-    whole, partial = _decompressors(compression)
+def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
+    """Return the content of a chunk, at most the `size` bytes that its header declares, or what can be had of it (raises McapDamage)."""
+    if size > LARGEST_CHUNK:
+        raise McapDamage(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
     try:
-        try:
-            return whole(packed)
-        except _errors():
-            return partial(packed)   # what comes before the cut
+        return decompress(compression, packed, size)
+    except KeyError as error:
+        raise McapDamage(f'a chunk with the unknown compression {compression!r}') from error
     except _errors() as error:
         raise McapDamage(f'a chunk that cannot be decompressed ({error})') from error
 
 
-def _decompressors(compression):
-    """Return (function for a whole stream, function that takes a stream which is cut off)."""
-    if compression == 'zstd':
-        return zstd().decompress, zstd().ZstdDecompressor().decompress
-    from lz4 import frame
-    return frame.decompress, frame.LZ4FrameDecompressor().decompress
+def decompress(compression: str, packed: bytes | memoryview, limit: int) -> bytes:
+    """Return at most `limit` bytes of a stream: zstd, lz4 or bz2 (raises KeyError for another compression, `_errors` for damaged data)."""
+    make, parts, n_bytes = _decompressor(compression), [], 0
+    for _ in range(MOST_FRAMES):
+        decompressor = make()
+        parts.append(decompressor.decompress(packed, limit - n_bytes))
+        n_bytes += len(parts[-1])
+        packed = decompressor.unused_data if decompressor.eof else b''
+        if not packed or n_bytes >= limit:
+            break
+    return parts[0] if len(parts) == 1 else b''.join(parts)
+
+
+def _decompressor(compression: str) -> Callable[[], Any]:
+    if compression == 'lz4':
+        from lz4 import frame
+        return frame.LZ4FrameDecompressor
+    return {'zstd': zstd().ZstdDecompressor, 'bz2': bz2.BZ2Decompressor}[compression]
 
 
 def _errors():
-    return zstd().ZstdError, RuntimeError, EOFError
+    return zstd().ZstdError, RuntimeError, EOFError, OSError, ValueError
 
 
 def decompress_message(data: bytes) -> bytes:
-    """Return one message of a bag that is compressed by message."""
-    return zstd().decompress(data)
+    """Return one message of a bag that is compressed by message (raises ValueError beyond `LARGEST_MESSAGE`)."""
+    plain = decompress('zstd', data, LARGEST_MESSAGE)
+    if len(plain) == LARGEST_MESSAGE:
+        raise ValueError(f'a message of {LARGEST_MESSAGE} bytes or more')
+    return plain
+
+
+def largest_content(file_size: int) -> int:
+    """Return how many bytes a compressed file of a size may contain."""
+    return FILE_BASE + FILE_RATIO * file_size
 
 
 def decompress_file(source: Path, target: Path) -> str | None:
@@ -56,20 +84,26 @@ def decompress_file(source: Path, target: Path) -> str | None:
     Decompress a zstd file into another; return the error that ended it early, or None.
 
     What was decompressed before the damage is written in any case.
+
+    Raises
+    ------
+    ValueError
+        When it is much larger than a recording would be, or than the free space.
+
     """
     module, source = zstd(), Path(source)
+    limit = min(largest_content(source.stat().st_size), shutil.disk_usage(target.parent).free * 9 // 10)
     with source.open('rb') as packed, Path(target).open('wb') as plain:
-        decompressor, started = module.ZstdDecompressor(), True
+        decompressor, n_frames, data, started = module.ZstdDecompressor(), 0, b'', True
         try:
-            while data := packed.read(PIECE):
-                while data:
-                    plain.write(decompressor.decompress(data))
-                    data = b''
-                    if decompressor.eof:   # a file may hold several frames
-                        data, decompressor = decompressor.unused_data, module.ZstdDecompressor()
-                        started = bool(data)
-                    else:
-                        started = True
+            while data or not decompressor.needs_input or (data := packed.read(PIECE)):
+                plain.write(decompressor.decompress(data, PIECE))
+                data, started = b'', True
+                if decompressor.eof:   # a file may hold several frames
+                    data, decompressor, n_frames = decompressor.unused_data, module.ZstdDecompressor(), n_frames + 1
+                    started = bool(data)
+                if plain.tell() > limit or n_frames > MOST_FRAMES:
+                    raise ValueError(f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are accepted')
         except module.ZstdError as error:
             return str(error)
     return 'the stream is cut off' if started else None

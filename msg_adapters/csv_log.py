@@ -1,6 +1,7 @@
 """Text logs (CSV) as recordings: columns and units are found from the header and, where the header has none, from the physics."""
 
 import csv
+import io
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.errors import InputError, shortened
 from imu_calibration.preflight.chunks import ChunkSeries
 from imu_calibration.preflight.turning import relate_turns
+from imu_calibration.regular_files import open_regular
 from imu_calibration.samples import EPOCH, FIRST_NS, ImuSamples, JointSamples, TemperatureSamples
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
@@ -188,12 +190,16 @@ def _parse(text):
     return Columns(quantity, names, unit, joint, 'given')
 
 
+def _opened(path):
+    return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', errors='replace')
+
+
 class _Table:
     """Header and columns of a text log."""
 
     def __init__(self, path):
         self.path = path
-        with path.open(encoding='utf-8-sig', errors='replace', newline='') as file:
+        with _opened(path) as file:
             head = file.read(HEAD_BYTES)
         lines = head.splitlines()
         if not lines or '\0' in head:
@@ -234,7 +240,7 @@ class _Table:
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
-        with self.path.open(encoding='utf-8-sig', errors='replace') as file:
+        with _opened(self.path) as file:
             lines = file.read().splitlines()[self.first:]
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]

@@ -95,7 +95,7 @@ class Decoder:
             return None
         try:
             return self.read_row(message)
-        except (AttributeError, TypeError, ValueError, IndexError) as error:   # fields of another definition
+        except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:   # fields of another definition
             return self._drop(error, 1)
 
     def _drop(self, error, n_messages):

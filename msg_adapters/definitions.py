@@ -1,6 +1,7 @@
 """Message definitions: the standard ones, and whether a bag's own definition is the standard one."""
 
 from collections.abc import Callable
+from itertools import count
 from typing import NamedTuple
 
 from msg_adapters.imu import IMU_TYPE
@@ -9,6 +10,8 @@ from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 SEPARATOR = '=' * 80
+LONGEST, MOST_ELEMENTS = 100_000, 10_000
+"""Characters of a definition and elements of a message at most, an array counted by its elements."""
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
 
 _PARTS = {
@@ -71,7 +74,7 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
         return False
     try:
         return _flatten(text) == _flatten(standard_definition(message_type).text)
-    except (KeyError, IndexError, RecursionError):
+    except (KeyError, IndexError, RecursionError, ValueError):
         return False
 
 
@@ -92,20 +95,54 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY).fielddefs)
     encoding, text = definitions.get(message_type, ('', ''))
+    if len(text) > LONGEST:
+        raise ValueError(f'a definition of {len(text)} characters, at most {LONGEST} are accepted')
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
     elif text:
         parts = [part.split('\n', 1)[1] for part in text.split(SEPARATOR + '\n')[1:]] if text.startswith(SEPARATOR) else [text]
         for part in parts:
             types.update(get_types_from_idl(part))
+    _require_size(types, message_type)
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     return lambda data: deserialize(data, message_type)
 
 
+def _require_size(types, message_type):
+    """Refuse a type with far too many elements, one that contains itself, and sequences of nothing: a message of few bytes fills memory."""
+    known = {}
+
+    def elements(name):
+        if known.setdefault(name, -1) >= 0:
+            return known[name]
+        known[name] = sum(_of(description) for _, description in types[name][1])
+        if known[name] > MOST_ELEMENTS:
+            raise ValueError(f'{name} has more than {MOST_ELEMENTS} elements')
+        return known[name]
+
+    def _of(description):
+        kind, content = description
+        if kind.name == 'NAME':
+            if known.get(content) == -1:
+                raise ValueError(f'{content} contains itself')
+            return elements(content)
+        if kind.name == 'BASE':
+            return 1
+        one = _of(content[0])
+        if one == 0:
+            raise ValueError(f'{message_type} has a sequence of elements without fields')
+        return one * content[1] if kind.name == 'ARRAY' else one
+
+    elements(message_type)
+
+
 def _flatten(text):
-    """List the plain fields of a ros2msg definition in order, those of nested types by their path."""
+    """List the plain fields of a ros2msg definition in order, those of nested types by their path (raises ValueError for far too many)."""
+    if len(text) > LONGEST:
+        raise ValueError('too long')
+    n_lines = count()
     first, *others = text.replace('\r', '').split(SEPARATOR + '\n')
     nested = {}
     for part in others:
@@ -114,6 +151,8 @@ def _flatten(text):
 
     def expand(body, prefix):
         for line in body.split('\n'):
+            if next(n_lines) > MOST_ELEMENTS:
+                raise ValueError('too many fields')
             words = line.split('#')[0].split()
             if not words or '=' in line.split('#')[0]:   # empty, or a constant
                 continue

@@ -1,19 +1,20 @@
 """What a recording says about the robot: its description, the frame of the IMU, how the robot's root stands."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, TypeVar
 
 import numpy as np
 
 from imu_calibration.errors import InputError
 from msg_adapters.bag import open_recording
-from msg_adapters.definitions import deserializer
 from msg_adapters.stamps import clean_name
 
 DESCRIPTION_TOPIC = '/robot_description'
 STRING_TYPE = 'std_msgs/msg/String'
 STATIC_TOPIC = '/tf_static'
 TF_TYPE = 'tf2_msgs/msg/TFMessage'
+T = TypeVar('T')
 
 
 def frame_of(path: str, imu_topic: str | None = None) -> str:
@@ -27,7 +28,7 @@ def frame_of(path: str, imu_topic: str | None = None) -> str:
 
 def description_in(path: str, imu_topic: str | None = None) -> str:
     """
-    Return the last robot description of a recording.
+    Return the last robot description of a recording that can be decoded.
 
     Raises
     ------
@@ -35,7 +36,7 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
         When it holds none.
 
     """
-    texts = [message.data for message in _messages(path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE)]
+    texts = list(_messages(path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE, lambda message: str(message.data)))
     if not texts:
         raise InputError(f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
                          'topic, or give the file', key='urdf', code='description_missing')
@@ -44,20 +45,22 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
 
 def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str, str, np.ndarray]]:
     """Return (parent, child, quaternion x y z w of the child in the parent) of every static transform of a recording."""
-    return [row for message in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE) for row in transform_rows(message)]
+    return [row for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows) for row in rows]
 
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
     """Return (parent, child, quaternion) of each transform of a TFMessage, as an object of rclpy or rosbags."""
     return [(clean_name(t.header.frame_id).lstrip('/'), clean_name(t.child_frame_id).lstrip('/'),
-             np.array([getattr(t.transform.rotation, a) for a in 'xyzw'])) for t in message.transforms]
+             np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw'])) for t in message.transforms]
 
 
-def _messages(path, imu_topic, topic, message_type) -> Iterator[Any]:
-    """Yield the messages of a topic as objects, none when the recording lacks it."""
+def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], T]) -> Iterator[T]:
+    """Yield what `read` returns for each message of a topic that can be decoded, nothing when the recording lacks it."""
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
-            deserialize = deserializer(message_type, recording.source.definitions, recording.source.ros1)
-            for raw in recording.source.raw_stretches([topic]):
-                for k in range(len(raw.packed)):
-                    yield deserialize(raw.packed.message(k))
+            deserialize = recording.deserializer(message_type)
+            for found in recording.source.stretches([topic]):
+                packed = found[topic].packed
+                for k in range(len(packed)):
+                    with suppress(Exception):   # rosbags raises many kinds on broken bytes
+                        yield read(deserialize(packed.message(k)))

@@ -136,7 +136,7 @@ def imu_from_rows(rows: Sequence[Any]) -> ImuSamples:
 
 
 def _reading(vector, covariance):
-    return (np.nan,) * 3 if covariance[0] == -1.0 else (vector.x, vector.y, vector.z)
+    return (np.nan,) * 3 if covariance[0] == -1.0 else (float(vector.x), float(vector.y), float(vector.z))
 
 
 def _open_message(data):

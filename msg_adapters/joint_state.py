@@ -12,6 +12,8 @@ from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, ali
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
+MOST_JOINTS, LARGEST_HEAD = 1000, 1 << 16
+"""Joints of a message and bytes of their names; comparing names takes time with the square of either."""
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
 
@@ -29,7 +31,10 @@ def find_joint_layout(data: bytes) -> MessageLayout:
     header = open_header(data)
     walk = _Walk(bytes(data), header)
     try:
-        names = tuple(walk.string() for _ in range(walk.count()))
+        n_names = walk.count()
+        names = tuple(walk.string() for _ in range(min(n_names, MOST_JOINTS)))
+        if n_names > MOST_JOINTS or walk.position > LARGEST_HEAD:
+            raise MessageError(f'a JointState must have at most {MOST_JOINTS} joints with {LARGEST_HEAD} bytes of names, got {n_names} joints')
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
@@ -59,8 +64,8 @@ def joint_row(message: Any, joint_names: Sequence[str]) -> tuple[int, list[float
     """Return (stamp_ns, positions, velocities) of a message object of rclpy or rosbags (raises UnusableMessage)."""
     columns = joint_columns(list(map(clean_name, message.name)), len(message.position), joint_names)
     has_velocity = len(message.velocity) == len(message.name)
-    velocity = [message.velocity[k] for k in columns] if has_velocity else [np.nan] * len(columns)
-    return header_stamp_ns(message), [message.position[k] for k in columns], velocity
+    velocity = [float(message.velocity[k]) for k in columns] if has_velocity else [np.nan] * len(columns)
+    return header_stamp_ns(message), [float(message.position[k]) for k in columns], velocity
 
 
 def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float]]], joint_names: Sequence[str]) -> JointSamples:
@@ -73,7 +78,7 @@ def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float
 def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
     """Return where in a message that names `names` the joints stand (raises UnusableMessage)."""
     names = list(names)
-    if any(name not in names for name in joint_names):
+    if len(names) > MOST_JOINTS or any(name not in names for name in joint_names):
         raise UnusableMessage(MISSING_JOINT)
     if n_positions != len(names):
         raise UnusableMessage(NO_POSITION)

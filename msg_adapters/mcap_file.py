@@ -2,6 +2,7 @@
 
 import os
 import struct
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
@@ -12,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters.compressed import decompress_chunk
+from imu_calibration.regular_files import open_regular
+from msg_adapters.compressed import decompress_chunk, largest_content
 from msg_adapters.layout import Packed
 from msg_adapters.mcap_records import (
     CHANNEL,
@@ -40,6 +42,8 @@ from msg_adapters.mcap_records import (
 from msg_adapters.read_ahead import read_ahead
 from msg_adapters.storage import StorageFile, Stretch
 
+FIRST_BYTES = 1 << 16
+"""Read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while nothing else lies between them."""
 STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
@@ -60,10 +64,10 @@ class McapFile(StorageFile):
 
     def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
         self.path, self.unpack = Path(path), unpack
-        self.file = open(path, 'rb', buffering=0)
+        self.file = open_regular(path)
         self.size = os.fstat(self.file.fileno()).st_size
         self.schemas, self.channels, self.lost = {}, {}, {}
-        self.chunk_starts, self.complete = [], False
+        self.chunk_starts, self.complete, self.n_unpacked = [], False, 0
         self.statistics: Any = None
         try:
             if self._read(0, len(MAGIC)) != MAGIC:
@@ -151,6 +155,9 @@ class McapFile(StorageFile):
         content = memoryview(self._read(position, length))
         try:
             records, whole = unpack_chunk(content, decompress_chunk)
+            self.n_unpacked += len(records)
+            if self.n_unpacked > largest_content(self.size):
+                raise McapDamage('chunks that expand far beyond the size of the file')
         except McapDamage as damage:
             self._lose(f'messages in {damage}', max(sum(len(offsets) for _, offsets in indexes), 1))
             return
@@ -170,6 +177,8 @@ class McapFile(StorageFile):
         Messages outside of chunks come many at once, with (buffer, Messages, other records) in place of None.
         """
         position = len(MAGIC)
+        self.n_unpacked = 0
+        ahead = FIRST_BYTES
         while position is not None:
             prefix = self._read(position, PREFIX.size)
             opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
@@ -177,12 +186,13 @@ class McapFile(StorageFile):
             if opcode in (DATA_END, FOOTER):
                 return
             if not is_record(opcode) or behind > self.size:
-                if opcode == CHUNK:
-                    yield CHUNK, position + PREFIX.size, self.size - position - PREFIX.size, None
+                if opcode == CHUNK:   # up to the next one, so that no byte is read twice
+                    yield CHUNK, position + PREFIX.size, (self._following(position) or self.size) - position - PREFIX.size, None
                 position = self._resume(position)
             elif opcode == MESSAGE:
-                buffer = np.frombuffer(self._read(position, max(STRETCH_BYTES, behind - position)), np.uint8)
+                buffer = np.frombuffer(self._read(position, max(ahead, behind - position)), np.uint8)
                 messages, others, end = walk(buffer)
+                ahead = min(2 * ahead, STRETCH_BYTES) if 2 * end > len(buffer) else FIRST_BYTES
                 if end:
                     yield MESSAGE, position, end, (buffer[:end], messages, others)
                 position = position + end if end else self._resume(position)
@@ -192,9 +202,14 @@ class McapFile(StorageFile):
 
     def _resume(self, position):
         """Count the damage at `position` and return the start of the next chunk that the summary knows, or None."""
-        following = min((start for start in self.chunk_starts if start > position), default=None)
+        following = self._following(position)
         self._lose('bytes that are no whole record', max((following or self.size) - position, 1))
         return following
+
+    def _following(self, position):
+        """Return the first known start of a chunk behind `position`, or None."""
+        place = bisect_right(self.chunk_starts, position)
+        return self.chunk_starts[place] if place < len(self.chunk_starts) else None
 
     def _indexes_behind(self, position):
         """Return (channel id, offsets) from the MessageIndex records that start at `position`."""
@@ -225,13 +240,14 @@ class McapFile(StorageFile):
             opcode, length = PREFIX.unpack_from(summary, position)
             content = summary[position + PREFIX.size:position + PREFIX.size + length]
             if opcode == FOOTER:
-                return
+                break
             if opcode == STATISTICS:
                 self.statistics = parse_statistics(content)
             elif opcode == CHUNK_INDEX:
                 self.chunk_starts.append(struct.unpack_from('<Q', content, 16)[0])
             self._register([(opcode, content)])
             position += PREFIX.size + length
+        self.chunk_starts.sort()
 
     def _scan(self):
         """Find channels and counts without a summary, by the message indexes where there are any."""

@@ -18,6 +18,8 @@ PREFIX = struct.Struct('<BQ')
 """Opcode and length of the content, in front of every record."""
 MESSAGE_PREFIX = PREFIX.size + 22
 """Bytes of a Message record in front of its data: prefix, channel, sequence, two times."""
+MOST_OTHERS = 1 << 17
+"""Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels."""
 RUN = 8
 """After so many records of one size, the next ones are looked for by stride."""
 
@@ -95,7 +97,7 @@ def unpack_chunk(content: memoryview, decompress: Callable) -> tuple[bytes | mem
     content : buffer
         Content of the Chunk record, perhaps cut off.
     decompress : callable
-        (compression, bytes) -> bytes; gives what can be had of a stream that is cut off.
+        (compression, bytes, size) -> at most that many bytes; gives what can be had of a stream that is cut off.
 
     Returns
     -------
@@ -112,7 +114,7 @@ def unpack_chunk(content: memoryview, decompress: Callable) -> tuple[bytes | mem
     except (struct.error, UnicodeDecodeError):
         raise McapDamage('a chunk without its header') from None
     packed = content[40 + length:40 + length + packed_size]
-    records = packed if compression == '' else decompress(compression, packed)
+    records = packed if compression == '' else decompress(compression, packed, size)
     whole = len(records) == size and len(packed) == packed_size
     if whole and crc and zlib.crc32(records) != crc:
         raise McapDamage('a chunk whose checksum does not fit')
@@ -165,6 +167,8 @@ def walk(buffer: np.ndarray) -> tuple[Messages, list[tuple[int, bytes]], int]:
         if not is_record(opcode) or opcode in (CHUNK, DATA_END, FOOTER) or behind > end or (opcode == MESSAGE and length < 22):
             break
         if opcode != MESSAGE:
+            if len(others) == MOST_OTHERS:
+                break
             others.append((opcode, bytes(view[position + PREFIX.size:behind])))
         else:
             run = run + 1 if length == previous else 0

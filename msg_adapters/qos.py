@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+from imu_calibration.documents import parsed
+from imu_calibration.errors import InputError
+
 _NAMES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
@@ -12,11 +15,10 @@ _NAMES = {
 
 def spelled_out(profiles: Sequence) -> list:
     """Return offered_qos_profiles as a list of mappings with names in place of numbers; empty when they make no sense."""
-    import yaml
     if isinstance(profiles, str):
         try:
-            profiles = yaml.safe_load(profiles)
-        except yaml.YAMLError:
+            profiles = parsed(profiles, 'QoS profile')
+        except InputError:
             profiles = []
     if not isinstance(profiles, list) or not all(isinstance(profile, dict) for profile in profiles):
         return []

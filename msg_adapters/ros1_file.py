@@ -1,13 +1,16 @@
 """ROS 1 bags as far as rosbags reads them, one raw message at a time."""
 
+import bz2
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from msg_adapters.compressed import LARGEST_CHUNK, decompress
 from msg_adapters.layout import Packed
 from msg_adapters.stamps import clean_name
 from msg_adapters.storage import Arrived
@@ -25,6 +28,7 @@ class Ros1File:
         from rosbags.rosbag1 import Reader
         self.reader = Reader(Path(path))
         self.reader.open()
+        self.reader.chunks = {place: _bounded(chunk) for place, chunk in self.reader.chunks.items()}
         self.lost = {}
         self.counts = {}
         self.types = {}
@@ -66,6 +70,13 @@ class Ros1File:
         """Close the file."""
         with suppress(Exception):
             self.reader.close()
+
+
+def _bounded(chunk: Any) -> Any:
+    """Return a chunk of rosbags' reader that decompresses within limits."""
+    from lz4 import frame
+    compression = {bz2.decompress: 'bz2', frame.decompress: 'lz4'}.get(chunk.decompressor)
+    return chunk if compression is None else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
 
 
 def _arrived(pending):

@@ -8,9 +8,13 @@ from pathlib import Path, PurePath
 from tempfile import mkdtemp
 from typing import Any
 
+from imu_calibration import documents
+from imu_calibration.errors import InputError, shortened
+from imu_calibration.regular_files import open_regular
 from msg_adapters.compressed import decompress_file, decompress_message
 from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
 from msg_adapters.qos import spelled_out
+from msg_adapters.stamps import clean_name
 from msg_adapters.storages import STORAGES, suffixes
 
 COMPRESSED = ('.zstd', '.zst')
@@ -98,9 +102,12 @@ class Rosbag2:
         n_read = 0
         for file in self.files:
             file.lost.clear()
-            for stretch in read(file):
-                n_read += count(stretch)
-                yield stretch
+            try:
+                for stretch in read(file):
+                    n_read += count(stretch)
+                    yield stretch
+            except Exception as error:   # whatever hostile or damaged files make the readers raise
+                file.lost[f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'] = 1
         announced = sum(self._announced().get(topic, 0) for topic in topics)
         if self.lost and announced > n_read:
             self._lost['messages that the metadata announce and the files do not hold'] = announced - n_read
@@ -120,7 +127,7 @@ class Rosbag2:
         if not self.path.is_dir():
             return [self.path]
         if self.metadata.get('relative_file_paths'):
-            return [self.path / PurePath(name).name for name in self.metadata['relative_file_paths']]
+            return [self.path / name for name in dict.fromkeys(PurePath(name).name for name in self.metadata['relative_file_paths'])]
         return sorted((path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()), key=_natural)
 
     def _open(self, path, unpack):
@@ -130,6 +137,8 @@ class Rosbag2:
             if reader is None:
                 raise ValueError(f'a storage file must end in {", ".join(suffixes())}, with {" or ".join(COMPRESSED)} behind it when '
                                  'compressed')
+            if path.exists() and not path.is_file():
+                raise ValueError('it is not a regular file')
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(reader(plain, unpack))
             self._lost.update(self.files[-1].lost)
@@ -160,13 +169,17 @@ class Rosbag2:
 
 def read_metadata(folder: Path) -> dict[str, Any]:
     """Return the content of metadata.yaml; empty when there is none or it is damaged, as after a crash of the recorder."""
-    import yaml
     try:
-        information = yaml.load((folder / 'metadata.yaml').read_text(encoding='utf-8'), getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
-        information = information['rosbag2_bagfile_information']
-        topics = information['topics_with_message_count']
-        _ = [(topic['topic_metadata']['name'], int(topic['message_count'])) for topic in topics], information['relative_file_paths']
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        with open_regular(folder / 'metadata.yaml') as file:
+            text = (file.read(documents.LARGEST + 1) or b'').decode()
+        information = documents.parsed(text, 'metadata', aliases=True)['rosbag2_bagfile_information']
+        for entry in information['topics_with_message_count']:
+            topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])
+            topic['name'], topic['type'] = clean_name(topic['name']), clean_name(topic['type'])
+        information['relative_file_paths'] = [str(name) for name in information['relative_file_paths']]
+        if 'duration' in information:
+            int(information['duration']['nanoseconds'])
+    except (OSError, InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return {}
     return information
 

@@ -21,6 +21,9 @@ from msg_adapters.storage import StorageFile, Stretch
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
 STRETCH_ROWS = 8192
+TABLES = ('topics', 'messages', 'message_definitions')
+MOST_TABLES, MOST_TOPICS = 1000, 100_000
+"""Entries of the schema and of the table of topics that are read."""
 
 
 class SqliteFile(StorageFile):
@@ -56,8 +59,10 @@ class SqliteFile(StorageFile):
             raise
 
     def _read_topics(self):
+        self._require_tables()
         self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
-        for topic_id, name, message_type, encoding in self.connection.execute('SELECT id, name, type, serialization_format FROM topics'):
+        for topic_id, name, message_type, encoding in self.connection.execute('SELECT id, name, type, serialization_format FROM topics')\
+                .fetchmany(MOST_TOPICS):
             if not (isinstance(topic_id, int) and isinstance(name, str) and isinstance(message_type, str)):
                 self._lose('topics without a name or type', 1)
                 continue
@@ -65,8 +70,17 @@ class SqliteFile(StorageFile):
             self.topic_ids[topic].append(topic_id)
             self.types[topic] = clean_name(message_type if encoding == 'cdr' else f'{message_type} ({encoding})')
         with suppress(sqlite3.Error):   # before schema version 4 there are no definitions
-            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')
+            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions').fetchmany(MOST_TOPICS)
             self.definitions = {clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows}
+
+    def _require_tables(self):
+        """Refuse views, virtual tables and generated columns: they are programs that can give rows without end."""
+        for kind, name, text in self.connection.execute('SELECT type, name, sql FROM sqlite_master').fetchmany(MOST_TABLES):
+            if str(name).lower() not in TABLES or kind == 'index':
+                continue
+            columns = self.connection.execute(f'PRAGMA table_xinfo({str(name).lower()})').fetchall()
+            if kind != 'table' or 'VIRTUAL' in str(text).upper().split()[:2] or any(column[6] for column in columns):
+                raise ValueError(f"'{name}' must be a plain table, got a {kind} with {len(columns)} columns")
 
     def count(self) -> dict[str, int]:
         """Return topic -> messages by counting them."""
@@ -128,7 +142,7 @@ class SqliteFile(StorageFile):
 
     def _by_id(self, row_id):
         try:
-            return self.connection.execute('SELECT data FROM messages WHERE id = ?', (row_id,)).fetchone()[0]
+            return memoryview(self.connection.execute('SELECT data FROM messages WHERE id = ?', (row_id,)).fetchone()[0]).tobytes()
         except (sqlite3.Error, TypeError):
             self._lose('unreadable rows', 1)
             return None
@@ -139,9 +153,12 @@ class SqliteFile(StorageFile):
         while going:
             rows = []
             going = self._fetch(cursor, rows)
-            if rows:
-                ids, received, messages = zip(*rows, strict=True)
-                packed, received = Packed.join(list(map(bytes, messages))), np.array(received, dtype=np.int64)
+            usable = [row for row in rows if tuple(map(type, row)) == (int, int, bytes)]
+            if len(usable) < len(rows):
+                self._lose('rows with values of other types', len(rows) - len(usable))
+            if usable:
+                ids, received, messages = zip(*usable, strict=True)
+                packed, received = Packed.join(messages), np.array(received, dtype=np.int64)
                 yield Stretch(np.array(ids), lambda index, packed=packed: (index, packed.select(index)), received.__getitem__)
 
     def _fetch(self, cursor, rows):

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imu_calibration.regular_files import open_regular
+
 INTERIOR, LEAF = 0x05, 0x0D
 STRETCH_PAGES = 1024
 MAX_DEPTH = 20
@@ -59,7 +61,7 @@ class PageReader:
     """
 
     def __init__(self, path: Path, root: int):
-        self.file = open(path, 'rb', buffering=0)
+        self.file = open_regular(path)
         header = self.file.read(100)
         size = int.from_bytes(header[16:18], 'big')
         self.page_size = 65536 if size == 1 else size
@@ -67,7 +69,7 @@ class PageReader:
         self.n_pages = os.fstat(self.file.fileno()).st_size // self.page_size
         self.root = root
         self.damaged_pages, self.damaged_rows, self.last_id = 0, 0, None
-        for _ in self._leaf_groups(np.array([root]), 0):
+        for _ in self._leaves():
             pass
         self.scanning = self.damaged_pages > 0
         if self.scanning:
@@ -84,7 +86,7 @@ class PageReader:
                 yield self._read(np.arange(first, min(first + STRETCH_PAGES, self.n_pages + 1)))
             return
         waiting, n_waiting = [], 0
-        for leaves in self._leaf_groups(np.array([self.root]), 0):
+        for leaves in self._leaves():
             waiting.append(leaves)
             n_waiting += len(leaves)
             if n_waiting >= STRETCH_PAGES:
@@ -121,9 +123,17 @@ class PageReader:
         self.last_id = int(before[-1])
         return ids > before[:-1]
 
+    def _leaves(self):
+        """Yield arrays of the numbers of all leaves below the root."""
+        self.is_seen = np.zeros(self.n_pages + 1, dtype=bool)
+        yield from self._leaf_groups(np.array([self.root]), 0)
+
     def _leaf_groups(self, pages, depth):
-        """Yield arrays of leaf page numbers below `pages`, all of one level."""
+        """Yield arrays of leaf page numbers below `pages`, all of one level; a page that several others or itself list counts once."""
         inside = pages[(pages >= 1) & (pages <= self.n_pages)]
+        inside = inside[~self.is_seen[inside]]
+        inside = inside[np.sort(np.unique(inside, return_index=True)[1])]
+        self.is_seen[inside] = True
         self.damaged_pages += len(pages) - len(inside)
         kind = next((kind for kind in map(self._kind, inside) if kind in (INTERIOR, LEAF)), None)
         if kind == LEAF:

@@ -17,6 +17,8 @@ FRAME_OFFSET = ENCAPSULATION_SIZE + 8
 
 LONGEST_NAME = 256
 """Bytes of a name; ROS 2 itself allows 255 for a topic."""
+LONGEST_FRAME = 4096
+"""Bytes of a frame_id in a message that is used; comparing frames takes time with the square of their length."""
 
 _STARTS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
@@ -76,6 +78,8 @@ def open_header(data: bytes) -> Header:
     if len(data) < FRAME_OFFSET + 4:
         raise MessageError(f'a stamped message has at least {FRAME_OFFSET + 4} bytes, got {len(data)}')
     sec, nanosec, length = _STARTS[order].unpack_from(data, ENCAPSULATION_SIZE)
+    if length > LONGEST_FRAME:
+        raise MessageError(f'a frame_id must have at most {LONGEST_FRAME} bytes, got {length}')
     end = FRAME_OFFSET + 4 + length
     if end > len(data):
         raise MessageError(f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}')
@@ -100,4 +104,7 @@ def from_ns(stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def header_stamp_ns(message: Any) -> int:
     """Return the header stamp of a message object, from rclpy or from rosbags (ROS 1 messages say nsec)."""
     stamp = message.header.stamp
-    return to_ns(int(stamp.sec), int(stamp.nanosec))
+    stamp_ns = to_ns(int(stamp.sec), int(stamp.nanosec))
+    if abs(stamp_ns) >= 2**63:
+        raise MessageError(f'a stamp must fit into 64 bits, got {stamp_ns} ns')
+    return stamp_ns

@@ -10,6 +10,10 @@ import numpy as np
 from msg_adapters.layout import Packed, is_any
 
 
+LARGEST_STRETCH = 64 << 20
+"""Bytes of the messages of a stretch when they are decompressed one by one."""
+
+
 class Stretch(NamedTuple):
     """Consecutive messages of a file, of all topics."""
 
@@ -84,7 +88,11 @@ class StorageFile:
         mine, packed = stretch.pack(mine)
         if self.unpack is None:
             return mine, packed
-        messages = [self._unpacked(packed.message(k)) for k in range(len(packed))]
+        messages, n_bytes = [], 0
+        for k in range(len(packed)):
+            messages.append(self._unpacked(packed.message(k)) if n_bytes < LARGEST_STRETCH else
+                            self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1))
+            n_bytes += len(messages[-1] or b'')
         kept = np.array([message is not None for message in messages], dtype=bool)
         return mine[kept], Packed.join([message for message in messages if message is not None])
 

@@ -30,7 +30,7 @@ def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamp
 
 def temperature_row(message: Any) -> tuple[int, float]:
     """Return (stamp_ns, temperature) of a message object of rclpy or rosbags."""
-    return header_stamp_ns(message), message.temperature
+    return header_stamp_ns(message), float(message.temperature)
 
 
 def temperature_from_rows(rows: Sequence[tuple[float, float]]) -> TemperatureSamples:

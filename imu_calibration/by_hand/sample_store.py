@@ -1,12 +1,12 @@
 """What a live calibration by hand keeps of its stream: every sample as long as they fit, then what tells least goes first."""
 
 import io
-import zipfile
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from imu_calibration.errors import DocumentError
+from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.regular_files import load_arrays
 from imu_calibration.samples import ImuSamples
 
 FORMAT = 'imu_calibration/hand_samples/1'
@@ -119,14 +119,17 @@ class HandStore:
 
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            with load_arrays(data) as arrays:
                 if str(arrays['format']) != FORMAT:
                     raise DocumentError(f"saved samples must say '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
                                         'without resume')
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not ({type(error).__name__}: {error}); '
-                                'remove it, or start without resume', code='samples_damaged') from error
+        except ImuCalibrationError:
+            raise
+        except Exception as error:   # damaged archives and arrays raise many kinds
+            raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not '
+                                f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
+                                code='samples_damaged') from error
         if len(imu):
             self._parts, self._epoch = [imu], -1
 

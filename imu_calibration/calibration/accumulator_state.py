@@ -2,8 +2,6 @@
 
 import io
 import json
-import zipfile
-import zlib
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -16,10 +14,11 @@ from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError, shortened
+from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 from imu_calibration.reference.joint import JointNames
+from imu_calibration.regular_files import load_arrays
 
 FORMAT = 'imu_calibration/accumulator/2'
 _MODEL = ('accelerometer', 'gyroscope', 'reference')
@@ -102,16 +101,17 @@ def from_bytes(data: bytes, model: SensorModel) -> Gathered:
 def _reading(data):
     """Give (header, arrays) of an archive; whatever is damaged becomes one line."""
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
             if header.get('format') != FORMAT:
                 raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove "
                                     'the file')
             yield header, arrays
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, IndexError, OverflowError, zipfile.BadZipFile,
-            zlib.error) as error:
+    except ImuCalibrationError:
+        raise
+    except Exception as error:   # damaged archives, arrays and headers raise many kinds
         raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or of '
-                            'another kind; remove the file', code='accumulator_damaged') from error
+                            f'another kind ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
 
 
 def saved_model(data: bytes) -> SensorModel:

@@ -86,7 +86,8 @@ def units_csv(results: Sequence[UnitResult]) -> str:
         if result.calibration is not None:
             known = dict(zip(result.calibration.param_names, zip(result.calibration.values, result.calibration.sd)))
             dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
-        row = [result.name, result.verdict, *result.verdicts.values(), result.exit_code, result.error, dropped]
+        name = f"'{result.name}" if result.name[:1] in '=+-@\t\r' else result.name   # a spreadsheet would calculate it
+        row = [name, result.verdict, *result.verdicts.values(), result.exit_code, result.error, dropped]
         rows.append(row + [number for name in names for number in known.get(name, ('', ''))])
     return _csv(rows)
 

@@ -69,7 +69,7 @@ def _document(look):
 def _show_topics(out, looks):
     """Print the topics; those that are read come with what their stamps say."""
     from rich.table import Table
-    used = {getattr(look.recording, attribute): look.streams[name] for look in looks for attribute, name in TOPICS
+    used = {getattr(look.recording, attribute): look.streams.get(name) for look in looks for attribute, name in TOPICS
             if getattr(look.recording, attribute)}
     table = Table(box=None, pad_edge=False, header_style='dim')
     for heading in ('topic', 'type', 'messages', 'Hz', 'seconds', 'gaps', 'stamp step', ''):

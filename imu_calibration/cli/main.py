@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import signal
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -14,6 +15,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code (see `parser.EXIT_CODES`)."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    with contextlib.suppress(ValueError):   # in the main thread alone: partial results are then removed as after Ctrl+C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from imu_calibration.cli.parser import check_verb, make_parser
         check_verb(arguments)
@@ -26,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: Namespace) -> int:
     """Run the verb that was parsed and print its document where --json asks for it; return the exit code."""
     from imu_calibration.cli.hints import hints_of
-    from imu_calibration.errors import ImuCalibrationError
+    from imu_calibration.errors import ImuCalibrationError, printable
     from imu_calibration.progress import listening
     prog = f'imu_calibration {options.verb}'
     try:
@@ -44,6 +47,10 @@ def run(options: Namespace) -> int:
     except BrokenPipeError:
         sys.stdout = None   # a later flush would fail again
         return 1
+    except (OSError, MemoryError, RecursionError) as error:
+        text, code = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), 1
+        print(f'{prog}: {text}', file=sys.stderr)
+        document = {'error': text, 'key': None}
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.json:

@@ -6,7 +6,7 @@ from typing import Any
 
 from imu_calibration.calibration.result import summary
 from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
-from imu_calibration.errors import with_hint
+from imu_calibration.errors import printable, with_hint
 from imu_calibration.preflight.finding import CheckFinding, Severity
 from imu_calibration.use_cases.calibrate import Calibrated
 
@@ -16,14 +16,14 @@ def console() -> Any:
     import sys
 
     from rich.console import Console
-    return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+    return Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
 
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
     """Print what looks wrong with a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
     import sys
     for item in found:
-        print(f'warning: {item["text"]}', file=sys.stderr)
+        print(f'warning: {printable(item["text"])}', file=sys.stderr)
 
 
 STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}

@@ -5,7 +5,7 @@ from argparse import Namespace
 from typing import Any
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, printable
 
 EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
@@ -95,10 +95,11 @@ class NodeWatcher:
         for status in array.status:
             node, _, name = status.name.partition(': ')
             if node == self.name:
-                values = {pair.key: pair.value for pair in status.values}
-                self.statuses[name], self.heard = NodeStatus(status.level[0], status.message, values), time.monotonic()
+                values = {printable(pair.key): printable(pair.value) for pair in status.values}
+                self.statuses[printable(name)] = NodeStatus(status.level[0], printable(status.message), values)
+                self.heard = time.monotonic()
             else:
-                self.others.add(node)
+                self.others.add(printable(node))
 
     def _draw(self, array):
         self.picture = next((marker.text for marker in array.markers if marker.ns == 'text'), self.picture)   # the planner adds its own

@@ -17,9 +17,12 @@ from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
 from imu_calibration.effects.regressors import LEVER
+from imu_calibration.errors import InputError
 
 SETTLED = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) after which there is nothing left to gain."""
+LONGEST = 200_000
+"""Characters of a kernel at most; compiling so many takes about a second and 100 MB."""
 BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
 """What is known of a sample before either sensor is corrected."""
 
@@ -47,7 +50,11 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
 
     """
     namespace = dict(SCALAR_FUNCTIONS)
-    exec(compile(kernel_text(calibration, transfer), '<compensation kernel>', 'exec'), namespace)
+    text = kernel_text(calibration, transfer)
+    if len(text) > LONGEST:
+        raise InputError(f'the effects of a calibration must expand to at most {LONGEST} characters of arithmetic, got {len(text)}; '
+                         'use fewer or shorter effects')
+    exec(compile(text, '<compensation kernel>', 'exec'), namespace)
     return namespace['kernel']
 
 

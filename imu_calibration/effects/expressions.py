@@ -43,6 +43,8 @@ QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
 LONGEST, DEEPEST, HIGHEST_POWER, MOST_PRODUCTS, LARGEST = 400, 30, 9, 200, 1e30
 """Characters, depth, exponents, products and size of numbers at most, so that no document costs more than arithmetic should."""
+LONGEST_EXPANDED = 5000
+"""Characters of a column at most when it is multiplied out: nested powers of a function multiply its text by nine at each level."""
 UNBOUNDED = ('sqrt', 'exp', 'expm1', 'log')
 """Functions without a finite value everywhere."""
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
@@ -240,7 +242,11 @@ def _multiplied(left, right):
     if len(left) * len(right) > MOST_PRODUCTS:
         raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; '
                          'write it shorter')
-    return added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
+    result = added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
+    if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
+        raise InputError(f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out, this one has more; '
+                         'write it without powers inside of powers')
+    return result
 
 
 def as_text(terms: dict[tuple[str, ...], float]) -> str:

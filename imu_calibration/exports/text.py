@@ -44,8 +44,8 @@ def read_yaml(content: bytes, what: str) -> dict:
 def read_json(content: bytes, what: str) -> dict:
     """Return the mapping in a JSON file."""
     try:
-        found = json.loads(text_of(content, what))
-    except ValueError as error:
+        found = json.loads(text_of(content, what), parse_int=lambda digits: int(digits) if len(digits) < 100 else float(digits))
+    except (ValueError, RecursionError) as error:
         raise InputError(f'the {what} must be JSON: {shortened(str(error))}; give another file') from error
     if not isinstance(found, dict):
         raise InputError(f'the {what} must hold a mapping, got {type(found).__name__}; give another file')
@@ -72,7 +72,7 @@ def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -
     """
     try:
         array = np.asarray(mapping[name], float)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
                          'correct it') from error
     if array.size != np.prod(shape, dtype=int) or not np.all(np.isfinite(array)):

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from imu_calibration.errors import printable
+
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
 REMINDER = 60.0
 """Seconds after which what still holds is said again."""
@@ -19,7 +21,8 @@ MOST_KINDS = 1000
 
 
 def say(logger: Any, level: str, line: str) -> None:
-    """Log a line; rclpy ties a place in the code to one severity, so each has a place of its own."""
+    """Log a line without control characters; rclpy ties a place in the code to one severity, so each has a separate place."""
+    line = printable(line)
     if level == ERROR:
         logger.error(line)
     elif level == WARNING:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.errors import InputError
+from imu_calibration.documents import LARGEST
+from imu_calibration.errors import InputError, printable, shortened
 from imu_calibration.reference.checked_values import require_keys, three_numbers
 from imu_calibration.reference.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping
 from imu_calibration.reference.rotations import rotation_from_rpy, rpy_from_rotation
@@ -91,20 +92,23 @@ def _read(text):
 
     try:
         from urdf_parser_py.urdf import Robot
-        from urdf_parser_py.xml_reflection.core import ParseError
     except ImportError as error:
         raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'") from error
     try:
+        if len(text) > LARGEST:
+            raise ValueError(f'it has {len(text)} characters, at most {LARGEST} are accepted')
         root = ElementTree.fromstring(text)
+        for element in root.iter():
+            element.attrib.update((key, printable(value)) for key, value in element.items())
         if root.tag != 'robot':
             raise ValueError(f'its outermost element is <{root.tag}>')
         bare = ElementTree.Element('robot', root.attrib)
         for element in (child for child in root if child.tag in _READ):
             ElementTree.SubElement(bare, element.tag, element.attrib).extend(child for child in element if child.tag in _READ[element.tag])
         return Robot.from_xml_string(ElementTree.tostring(bare))
-    except (ElementTree.ParseError, ParseError, ValueError, AssertionError, KeyError, TypeError) as error:
-        raise InputError(f'a robot description must be a URDF, this is none: {" ".join(str(error).split())[:200]}; give the .urdf or '
-                         '.xacro of the robot') from error
+    except Exception as error:   # the parsers raise many kinds
+        raise InputError(f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give the .urdf or .xacro of '
+                         'the robot') from error
 
 
 def _chain(robot, link):

@@ -20,6 +20,7 @@ STYLE: Any = {
     'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5,
     'legend.handlelength': 1.4, 'figure.facecolor': 'none', 'axes.facecolor': 'none', 'savefig.facecolor': 'none', 'lines.linewidth': 1.5,
     'axes.unicode_minus': True, 'axes.formatter.useoffset': False, 'svg.fonttype': 'none', 'path.simplify': True,
+    'text.parse_math': False,
 }
 
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'

@@ -124,7 +124,7 @@ def test_adapters_know_no_node_and_no_command_line(path):
     assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes')
 
 
-ORDER = (('chances', 'constants', 'errors', 'progress'), ('samples', 'settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
+ORDER = (('chances', 'constants', 'errors', 'progress', 'regular_files'), ('samples', 'settings', 'documents', 'units'), ('reference',), ('navigation', 'segmentation', 'effects'),
          ('estimation', 'preflight', 'simulation', 'compensation'), ('selection', 'allan'), ('beyond',), ('calibration', 'papers'), ('planning',), ('driving',), ('by_hand', 'exports'), ('diagnosis',), ('report',),
          ('files', 'resources'), ('use_cases',), ('cli', 'nodes'), ('ros2', '__main__'))
 """Packages and root modules from the ground up: each may import what stands in an earlier row."""

@@ -1,0 +1,249 @@
+"""Documents that were made to exhaust memory or time, or to deceive: one line and exit code 1."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from imu_calibration.by_hand.sample_store import HandStore
+from imu_calibration.calibration.accumulator_state import saved_model
+from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.cli.fleet_run import units_csv
+from imu_calibration.documents import from_text, to_text
+from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.files import make_folder, write_text
+from imu_calibration.reference.urdf import root_of
+from imu_calibration.report.figures import draw
+from msg_adapters.imu import IMU_TYPE
+
+from worlds.compensation_cases import random_calibration
+from worlds.limited import limited, refused, survived
+from worlds.small_bags import write_small_bag
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """A recording of a second."""
+    return write_small_bag(tmp_path / 'bag')
+
+
+def with_effects(columns):
+    """A calibration that carries accelerometer effects with these columns."""
+    document = yaml.safe_load(calibration_to_text(random_calibration(0, (), verdict='good')))
+    names = [f'mine_{k}' for k in range(len(columns))]
+    document['effects'] = {name: {'sensor': 'accelerometer', 'column': column, 'unit': '1', 'tolerance': 1e-3, 'text': 'mine'}
+                           for name, column in zip(names, columns, strict=True)}
+    document['accelerometer']['effects'] += names
+    document['accelerometer'] |= {name: {'value': [0.1] * 3, 'sd': [0.1] * 3, 'unit': '1', 'status': ['determined'] * 3} for name in names}
+    old = len(document['covariance']['names'])
+    document['covariance']['names'] += [f'accelerometer.{name}.{axis}' for name in names for axis in 'xyz']
+    matrix = 0.01 * np.eye(len(document['covariance']['names']))
+    matrix[:old, :old] = document['covariance']['matrix']
+    document['covariance']['matrix'] = matrix.tolist()
+    return to_text(document)
+
+
+def test_nested_powers_in_a_calibration_are_refused_before_they_are_multiplied_out(tmp_path, bag):
+    """29 kB took all memory: each level of abs(...)**9 multiplies the text of the compensation by nine."""
+    column = 'f_x'
+    for _ in range(9):
+        column = f'abs({column})**9'
+    (tmp_path / 'calibration.yaml').write_text(with_effects([column] * 20))
+    ended = refused('compensate', bag, '--calibration', tmp_path / 'calibration.yaml', '--output', tmp_path / 'corrected')
+    assert 'multiplied out' in ended.err and not (tmp_path / 'corrected').exists()
+
+
+# Places
+
+def test_a_pipe_as_calibration_is_refused_and_not_waited_for(tmp_path, bag):
+    os.mkfifo(tmp_path / 'calibration.yaml')
+    for path in (tmp_path / 'calibration.yaml', '/dev/zero'):
+        ended = refused('compensate', bag, '--calibration', path, '--output', tmp_path / 'corrected')
+        assert 'regular file' in ended.err
+
+
+def test_a_saved_session_that_grows_a_thousandfold_is_refused():
+    """2.9 MB became 2.9 GB."""
+    for load in (load_accumulator, load_samples):
+        ended = limited(load)
+        assert ended.code == 'refused' and ended.megabytes < 200, ended
+
+
+def load_accumulator():
+    """Load zeros in place of an accumulator."""
+    return _refusal(saved_model, ('header', 'counts'))
+
+
+def load_samples():
+    """Load zeros in place of samples."""
+    return _refusal(HandStore(1000).load, ('format', 'stamp_ns', 'force_s', 'rate_s', 'frame_id'))
+
+
+def _refusal(load, names):
+    import io
+    target = io.BytesIO()
+    head = io.BytesIO()
+    np.save(head, np.zeros(0))
+    with zipfile.ZipFile(target, 'w', zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name in names:
+            with archive.open(f'{name}.npy', 'w') as member:
+                member.write(head.getvalue().replace(b'(0,)', b'(%d,)' % (1 << 25)))
+                for _ in range(1 << 5):
+                    member.write(bytes(8 << 20))
+    try:
+        load(target.getvalue())
+    except DocumentError as error:
+        return 'refused' if 'are accepted' in str(error) else str(error)
+
+
+@pytest.mark.parametrize('damage', [b'', b'PK', b'(' * 5000])
+def test_damaged_sessions_are_one_line(damage):
+    import io
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, 'w') as archive:
+        archive.writestr('header.npy', b'\x93NUMPY\1\0' + len(damage).to_bytes(2, 'little') + damage)
+    for data in (damage, target.getvalue()):
+        with pytest.raises(DocumentError):
+            saved_model(data)
+
+
+def test_a_link_under_a_guessable_name_is_not_followed(tmp_path):
+    """In a shared folder anybody can place a link under the name of a temporary file."""
+    import zlib
+    victim = tmp_path / 'victim'
+    victim.write_text('untouched')
+    for name in (f'.{os.getpid()}.{zlib.crc32(b"result.yaml"):08x}', f'.write_test_{os.getpid()}'):
+        os.symlink(victim, tmp_path / name)
+    write_text(tmp_path / 'result.yaml', 'new')
+    make_folder(tmp_path)
+    assert victim.read_text() == 'untouched' and (tmp_path / 'result.yaml').read_text() == 'new'
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert (tmp_path / 'result.yaml').stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+# Names
+
+def test_a_name_is_neither_a_formula_nor_mathematics(tmp_path):
+    def paint(figure):
+        figure.add_subplot().set_title('$\\bad{$')
+    assert 'bad' in draw('x', (2, 2), paint, label='x')
+    result = UnitResult('=cmd|calc!A1')
+    assert list(csv.reader(units_csv([result]).splitlines()))[1][0] == "'=cmd|calc!A1"
+
+
+class UnitResult:
+    """A unit that was refused."""
+
+    calibration, verdict, verdicts, exit_code, error = None, '', {'accelerometer': '', 'gyroscope': ''}, 1, 'refused'
+
+    def __init__(self, name):
+        self.name = name
+
+
+# Text that breaks its parser
+
+def test_deep_and_long_texts_are_one_line(tmp_path, bag):
+    (tmp_path / 'deep.json').write_text('[' * 100_000)
+    refused('import', tmp_path / 'deep.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml')
+    (tmp_path / 'digits.json').write_text('{"value0": {"calib_accel_bias": [' + '9' * 4000 + ', 0, 0]}}')
+    refused('import', tmp_path / 'digits.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml')
+    (tmp_path / 'table.yaml').write_text('joints: [{name: outer, axis: [0, 0, 1]}]\ngravity: ' + '9' * 4000)
+    assert 'digits' in refused('calibrate', bag, '--table', tmp_path / 'table.yaml', '--output', tmp_path / 'out').err.replace('characters', 'digits')
+    (tmp_path / 'arm.urdf').write_text('<robot name="x">' + '<link name="a">' * 5000 + '</link>' * 5000 + '</robot>')
+    refused('plan', '--urdf', tmp_path / 'arm.urdf', '--output', tmp_path / 'out')
+
+
+@pytest.mark.parametrize('text', ['', '<robot>', '<robot/>', '<robot name="a"><link name="x&#10;&#27;[2J"/></robot>', 'x' * 3_000_000,
+                                  '<robot name="a">' + '<joint>' * 256 + '</joint>' * 256 + '</robot>'])
+def test_descriptions_are_refused_or_have_clean_names(text):
+    try:
+        assert root_of(text).isprintable()
+    except InputError as error:
+        assert '\n' not in str(error)
+
+
+def test_a_damaged_description_in_a_recording_is_left_out(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = [writer.add_connection(topic, kind, typestore=store) for topic, kind in (
+            ('/imu/data_raw', IMU_TYPE), ('/robot_description', 'std_msgs/msg/String'), ('/tf_static', 'tf2_msgs/msg/TFMessage'))]
+        for topic in topics[1:]:
+            for data in (b'', b'\0\1', b'\0\1\0\0\xff\xff\xff\x7f', b'\0\1\0\0\xff\xff\xff\xff' + b'x' * 99):
+                writer.write(topic, 1, data)
+    refused('calibrate', tmp_path / 'bag', '--imu-link', 'imu_link', '--output', tmp_path / 'out')
+    assert 'must hold the robot description' in refused('inspect', tmp_path / 'bag', '--imu-link', 'imu_link').err
+
+
+@pytest.mark.parametrize('change', [lambda text: text.replace('float64', 'string'), lambda text: text.replace('float64 x', 'float64[3] x'),
+                                    lambda text: text.replace('int32 sec', 'float64 sec'), lambda text: 'int32 x\n', lambda text: text + '\n@!',
+                                    lambda text: 'module sensor_msgs { module msg { struct Imu { double x; }; }; };'])
+@pytest.mark.parametrize('language', ['ros2msg', 'ros2idl', 'x'])
+def test_definitions_of_another_kind_are_one_line(tmp_path, change, language):
+    """An IDL definition ended `inspect` with KeyError 'imu'."""
+    import sqlite3
+    bag = write_small_bag(tmp_path / 'bag')
+    connection = sqlite3.connect(bag / 'bag_0.db3')
+    for number, text in connection.execute('SELECT id, encoded_message_definition FROM message_definitions').fetchall():
+        connection.execute('UPDATE message_definitions SET encoding = ?, encoded_message_definition = ? WHERE id = ?', (language, change(text), number))
+    connection.commit()
+    connection.close()
+    survived('inspect', bag)
+
+
+@pytest.mark.parametrize('text, place', [('a: 1\nb: 2\na: 3\n', 'line 3'), ('x: {a: 1, a: 2}', 'line 1'), ('- a\n', 'mapping'), ('<<: {a: 1}', 'line 1')])
+def test_a_key_that_comes_twice_is_an_error(text, place):
+    with pytest.raises(InputError, match=place):
+        from_text(text)
+    assert from_text('a: {a: 1}\nb: [{a: 1}, {a: 2}]\n? [1]\n: a'.replace('? [1]\n: a', 'c: a')) == {'a': {'a': 1}, 'b': [{'a': 1}, {'a': 2}], 'c': 'a'}
+
+
+# Ends
+
+def compensate_on_a_small_disk(arguments):
+    """Run a verb that cannot write more than 20 kB into a file."""
+    import resource
+
+    from imu_calibration.cli.main import main
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+    return main(arguments)
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
+    bag = write_small_bag(tmp_path / 'bag', storage=storage)
+    write_text(tmp_path / 'calibration.yaml', calibration_to_text(random_calibration(0, (), verdict='good')))
+    before = sorted(path.name for path in tmp_path.iterdir())
+    for arguments in (['compensate', str(bag), '--calibration', str(tmp_path / 'calibration.yaml'), '--anyway'], ['simulate']):
+        ended = limited(compensate_on_a_small_disk, [*arguments, '--output', str(tmp_path / 'out')])
+        assert ended.code == 1 and ended.err.count('\n') == 1, ended
+        assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_what_was_decompressed_is_removed_on_sigterm(tmp_path):
+    from msg_adapters.compressed import zstd
+    bag, temporary = write_small_bag(tmp_path / 'bag'), tmp_path / 'temporary'
+    temporary.mkdir()
+    database = next(bag.glob('*.db3'))
+    Path(f'{database}.zstd').write_bytes(zstd().compress(database.read_bytes()))
+    database.unlink()
+    (bag / 'metadata.yaml').unlink()
+    program = ('import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\n'
+               'f.SqliteFile.count = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\n'
+               f'from imu_calibration.cli.main import main\nraise SystemExit(main(["inspect", {str(bag)!r}]))')
+    process = subprocess.Popen([sys.executable, '-c', program], env={**os.environ, 'TMPDIR': str(temporary)}, stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == 'decompressed\n' and list(temporary.glob('imu_calibration_*/*'))
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode not in (0, -signal.SIGTERM) and 'Traceback' not in err
+    assert not list(temporary.iterdir())

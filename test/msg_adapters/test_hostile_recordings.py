@@ -1,0 +1,278 @@
+"""Recordings that were made to exhaust memory or time, or to deceive: one line and exit code 1, or a warning and what is usable."""
+
+import os
+import sqlite3
+import struct
+from types import SimpleNamespace
+
+import lz4.frame
+import numpy as np
+import pytest
+import yaml
+from test_adapters_mcap import chunk, message, record, text, write_file
+
+from msg_adapters.bag import list_topics
+from msg_adapters.compressed import LARGEST_CHUNK, zstd
+from msg_adapters.decode import Decoder, JointDecoder
+from msg_adapters.definitions import deserializer, is_standard
+from msg_adapters.encode import encode_imu, encode_joints
+from msg_adapters.imu import IMU_TYPE
+from msg_adapters.joint_state import MISSING_JOINT, MOST_JOINTS, joint_row
+from msg_adapters.layout import Packed
+from msg_adapters.qos import spelled_out
+
+from worlds.limited import limited, refused, survived
+from worlds.small_bags import write_small_bag
+
+SEPARATOR = '=' * 80 + '\n'
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """A recording of a second."""
+    return write_small_bag(tmp_path / 'bag')
+
+
+def rewrite_metadata(bag, change):
+    """Change the mapping in metadata.yaml."""
+    document = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    change(document['rosbag2_bagfile_information'])
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(document))
+
+
+def change_database(bag, *statements):
+    """Execute SQL in the storage file."""
+    connection = sqlite3.connect(next(bag.glob('*.db3')))
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+def zeros(n_bytes):
+    """A zstd stream of so many zeros, made piece by piece."""
+    compressor = zstd().ZstdCompressor(level=1)
+    piece = bytes(1 << 24)
+    return b''.join(compressor.compress(piece) for _ in range(n_bytes >> 24)) + compressor.flush()
+
+
+# Decompression
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4', 'lz4 that claims 2^45 bytes'])
+@pytest.mark.parametrize('declared', [1000, LARGEST_CHUNK, 5 << 30, 2**63])
+def test_a_chunk_expands_to_its_declared_size_at_most(tmp_path, compression, declared):
+    """0.6 MB of zstd filled 5 GB; an lz4 header that claims 2^45 bytes gave a traceback."""
+    if compression == 'zstd':
+        packed = zeros(1 << 30)
+    else:
+        packed = lz4.frame.compress(bytes(1 << 27), store_size=True)
+        if 'claims' in compression:
+            packed = packed[:6] + struct.pack('<Q', 2**45) + packed[14:]
+    content = struct.pack('<QQQI', 0, 1, declared, 0) + text(compression[:4]) + struct.pack('<Q', len(packed)) + packed
+    write_file(tmp_path / 'x.mcap', record(0x06, content) * 3)
+    refused('inspect', tmp_path / 'x.mcap')
+
+
+@pytest.mark.parametrize('name', ['x.db3.zstd', 'x.mcap.zstd', 'x.mcap.zst'])
+def test_a_compressed_file_is_not_written_out_without_end(tmp_path, name):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / name).write_bytes(zeros(5 << 30))
+    assert 'frames that are accepted' in refused('inspect', tmp_path / 'bag').err
+
+
+def test_frames_without_content_do_not_take_quadratic_time(tmp_path):
+    (tmp_path / 'x.mcap.zstd').write_bytes(zstd().compress(b'') * 300_000)
+    refused('inspect', tmp_path / 'x.mcap.zstd')
+    packed = zstd().compress(b'') * 300_000
+    content = struct.pack('<QQQI', 0, 1, 1000, 0) + text('zstd') + struct.pack('<Q', len(packed)) + packed
+    write_file(tmp_path / 'x.mcap', record(0x06, content))
+    refused('inspect', tmp_path / 'x.mcap')
+
+
+def test_messages_that_expand_far_are_lost_and_counted(bag):
+    rewrite_metadata(bag, lambda metadata: metadata.update(compression_mode='message', compression_format='zstd'))
+    data = zstd().compress(bytes(60 << 20))
+    connection = sqlite3.connect(next(bag.glob('*.db3')))
+    connection.execute('UPDATE messages SET data = ?', (data,))
+    connection.commit()
+    connection.close()
+    survived('inspect', bag)
+
+
+# Storage
+
+def test_a_page_that_lists_itself_is_read_once(bag):
+    """1000 pointers of a page to itself were followed to the 20th power."""
+    path = next(bag.glob('*.db3'))
+    connection = sqlite3.connect(path)
+    root, = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    size, = connection.execute('PRAGMA page_size').fetchone()
+    connection.close()
+    page = bytearray(path.read_bytes()[(root - 1) * size:root * size])
+    n_cells = (size - 100) // 2
+    cells = np.full(n_cells, size - 8, '>u2').tobytes()
+    page[:12 + len(cells)] = struct.pack('>BHHHBI', 0x05, 0, n_cells, size - 8, 0, root) + cells
+    page[size - 8:size - 4] = struct.pack('>I', root)
+    data = bytearray(path.read_bytes())
+    data[(root - 1) * size:root * size] = page
+    path.write_bytes(data)
+    survived('inspect', bag)
+
+
+ENDLESS = 'WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n)'
+
+
+@pytest.mark.parametrize('statements', [
+    ('ALTER TABLE topics RENAME TO t', f"CREATE VIEW topics AS {ENDLESS} SELECT k AS id, 'x' || k AS name, 'std_msgs/msg/String' AS type, "
+     "'cdr' AS serialization_format, '' AS offered_qos_profiles FROM n"),
+    ('ALTER TABLE messages RENAME TO m', f'CREATE VIEW messages AS {ENDLESS} SELECT k AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n'),
+    ('ALTER TABLE messages RENAME TO m', 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+     "data AS (zeroblob(900000000)))", 'INSERT INTO messages(id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM m'),
+    ('DROP TABLE message_definitions', f"CREATE VIEW message_definitions AS {ENDLESS} SELECT 'a' || k AS topic_type, 'ros2msg' AS encoding, "
+     "hex(zeroblob(1000)) AS encoded_message_definition FROM n")], ids=['topics', 'messages', 'generated column', 'definitions'])
+def test_views_and_generated_columns_in_place_of_tables_are_refused(bag, statements):
+    os.remove(bag / 'metadata.yaml')
+    change_database(bag, *statements)
+    assert 'must be a plain table' in refused('inspect', bag).err
+
+
+@pytest.mark.parametrize('change', ["UPDATE topics SET name = NULL", "UPDATE topics SET name = x'ff00'", "UPDATE topics SET type = x'00'",
+                                    "UPDATE topics SET serialization_format = NULL", "UPDATE message_definitions SET topic_type = NULL",
+                                    "UPDATE messages SET data = NULL", "UPDATE messages SET data = 7", "UPDATE messages SET timestamp = 'noon'",
+                                    "UPDATE messages SET topic_id = 'x'", "UPDATE messages SET data = 'text'", 'DROP TABLE messages'])
+@pytest.mark.parametrize('columns', [False, True])
+def test_values_of_other_kinds_are_one_line(bag, change, columns):
+    if columns:   # then rows are read by SQL
+        change_database(bag, 'ALTER TABLE messages ADD COLUMN more INTEGER')
+    else:
+        os.remove(bag / 'metadata.yaml')
+    table = next(name for name in ('topics', 'messages', 'message_definitions') if f' {name}' in change)
+    if 'UPDATE' in change:   # a copy has no constraints
+        change_database(bag, f'CREATE TABLE t AS SELECT * FROM {table}', f'DROP TABLE {table}', f'ALTER TABLE t RENAME TO {table}')
+    change_database(bag, change)
+    survived('inspect', bag)
+
+
+def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_path):
+    """60,000 chunk starts that overlap, each of a chunk that claims to end behind the file: all the rest was read for each."""
+    one = struct.pack('<BQ', 0x06, 2**40) + bytes(51)
+    starts = b''.join(record(0x08, struct.pack('<QQQ', 0, 0, 8 + 60 * k) + bytes(40)) for k in range(60_000))
+    data = b'\x89MCAP0\r\n' + one * 60_000
+    footer = record(0x02, struct.pack('<QQI', len(data), 0, 0))
+    (tmp_path / 'x.mcap').write_bytes(data + starts + footer + b'\x89MCAP0\r\n')
+    refused('inspect', tmp_path / 'x.mcap')
+    write_file(tmp_path / 'y.mcap', (message(1, 0, b'') + chunk(b'')) * 20_000)
+    refused('inspect', tmp_path / 'y.mcap')
+
+
+# Definitions
+
+def doubling(n_levels, last):
+    """A definition with 2^n fields."""
+    levels = [f'MSG: a/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [f'MSG: a/T{n_levels}\n{last}\n']
+    return 'T1 a\nT1 b\n' + ''.join(SEPARATOR + level for level in levels)
+
+
+@pytest.mark.parametrize('last', ['float64 x', 'int32 X=3'])
+def test_a_definition_with_far_too_many_fields_is_neither_standard_nor_used(last):
+    definition = doubling(61, last)
+    assert limited(is_standard, IMU_TYPE, 'ros2msg', definition).code is False
+    ended = limited(refuses_definition, definition)
+    assert ended.code is True, ended
+
+
+@pytest.mark.parametrize('definition', ['string[2000000000] x', 'float64[2000000000] x', 'Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n',
+                                        'E[] x\n' + SEPARATOR + 'MSG: a/E\nint32 X=3\n', 'E[4] x\n' + SEPARATOR + 'MSG: a/E\nint32 X=3\n',
+                                        'E x\n' + SEPARATOR + 'MSG: a/E\nE x\n', 'int32 x\n' * 200_000])
+def test_definitions_of_endless_messages_are_refused(definition):
+    assert limited(refuses_definition, definition).code is True
+
+
+def refuses_definition(definition):
+    """Return whether messages of a definition are refused; one of 400 bytes is read otherwise."""
+    try:
+        read = deserializer(IMU_TYPE, {IMU_TYPE: ('ros2msg', definition)})
+    except Exception:
+        return True
+    try:
+        read(b'\0\1\0\0' + b'\xff' * 400)
+    except Exception:
+        pass
+    return False
+
+
+# Metadata
+
+@pytest.mark.parametrize('value', ['{<<: [&a {x: 1}, *a]}', '&a [*a]', '[' * 100 + ']' * 100, '1' + ':59' * 100_000, '!!int "1' + ':59' * 100_000 + '"', '9' * 5000,
+                                   '[' + '[],' * 70_000 + ']', '2000-99-99', '.inf'])
+def test_metadata_that_cost_more_than_they_say_are_left_out(bag, value):
+    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text().replace('custom_data: null', f'custom_data: {value}')
+                                       + f'hostile: {value}\n')
+    assert survived('inspect', bag).code != 1
+    assert spelled_out(value) == []
+
+
+def test_nested_aliases_in_metadata_are_not_expanded(bag):
+    lines = ['custom_data: &a0 [x, x]'] + [f'  c{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 20)]
+    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text().replace('custom_data: null', '\n'.join(lines)))
+    assert survived('inspect', bag).code != 1
+
+
+def test_members_that_never_end_or_come_again_are_left_out(bag, tmp_path):
+    os.remove(bag / 'metadata.yaml')
+    os.symlink('/dev/zero', bag / 'metadata.yaml')
+    assert survived('inspect', bag).code != 1
+    os.remove(bag / 'metadata.yaml')
+    os.mkfifo(bag / 'metadata.yaml')
+    os.mkfifo(bag / 'more.mcap')
+    os.mkfifo(bag / 'more.db3')
+    os.symlink('/dev/zero', bag / 'more.db3.zstd')
+    ended = survived('inspect', bag)
+    assert 'not a regular file' in ended.out + ended.err
+    for name in ('fifo.mcap', 'fifo.bag', 'fifo.csv'):
+        os.mkfifo(tmp_path / name)
+        refused('inspect', tmp_path / name)
+
+
+def test_a_file_that_is_listed_again_and_again_is_read_once(bag):
+    before = sum(topic.count for topic in list_topics(bag))
+    rewrite_metadata(bag, lambda metadata: metadata.update(relative_file_paths=metadata['relative_file_paths'] * 2000,
+                                                           topics_with_message_count=[]))
+    assert sum(topic.count for topic in list_topics(bag)) == before
+    survived('inspect', bag)
+
+
+# Messages
+
+def test_long_names_take_no_quadratic_time():
+    """A frame_id of 4 MiB took 50 s to compare; four live messages blocked a node for 31 s."""
+    imu = SimpleNamespace(stamp_ns=np.arange(4), force_s=np.ones((4, 3)), rate_s=np.ones((4, 3)), frame_id='')
+    ended = limited(decode_long_names, imu)
+    assert ended.code == 0 and ended.seconds < 10 and ended.megabytes < 500, ended
+
+
+def decode_long_names(imu):
+    """Decode messages of long names; return 0."""
+    from imu_calibration.samples import ImuSamples, JointSamples
+    imu = ImuSamples(imu.stamp_ns, imu.force_s, imu.rate_s)
+    messages = [encode_imu(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k))[0].tobytes() for k in range(4)]
+    decoder = Decoder(IMU_TYPE)
+    assert decoder.decode(Packed.join(messages)) is None and sum(decoder.dropped.values()) == 4
+    names = tuple(f'joint_{k}' for k in range(100_000))
+    values = np.zeros((1, len(names)))
+    many = encode_joints(JointSamples(np.array([1]), values, values, names))[0].tobytes()
+    one = encode_joints(JointSamples(np.array([1]), values[:, :1], values[:, :1], ('x' * (1 << 22),)))[0].tobytes()
+    for data in (many, one):
+        decoder = JointDecoder()
+        assert decoder.decode(Packed.join([data] * 4)) is None and sum(decoder.dropped.values()) == 4
+    message = SimpleNamespace(name=list(names), position=values[0], velocity=[], header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0)))
+    with pytest.raises(ValueError, match=MISSING_JOINT):
+        joint_row(message, names[:MOST_JOINTS])
+    return 0
+
+
+def test_a_name_cannot_pose_as_markup_or_as_a_line(tmp_path):
+    bag = write_small_bag(tmp_path / 'bag', frame_id='imu\n[/nope]\x1b[2J', imu_topic='/[/nope]', storage='mcap')
+    ended = survived('inspect', bag)
+    assert ended.code != 1 and '\x1b[2J' not in ended.out and '/[/nope]' in ended.out
+    refused('inspect', tmp_path / 'x\x1b[2J\n')
