@@ -34,7 +34,7 @@ def find_joint_layout(data: bytes) -> MessageLayout:
         n_names = walk.count()
         names = tuple(walk.string() for _ in range(min(n_names, MOST_JOINTS)))
         if n_names > MOST_JOINTS or walk.position > LARGEST_HEAD:
-            raise MessageError(f'a JointState must have at most {MOST_JOINTS} joints with {LARGEST_HEAD} bytes of names, got {n_names} joints')
+            raise MessageError(f'a JointState must have at most {MOST_JOINTS} joints and {LARGEST_HEAD} bytes of names')
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None

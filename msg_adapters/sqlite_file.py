@@ -70,7 +70,8 @@ class SqliteFile(StorageFile):
             self.topic_ids[topic].append(topic_id)
             self.types[topic] = clean_name(message_type if encoding == 'cdr' else f'{message_type} ({encoding})')
         with suppress(sqlite3.Error):   # before schema version 4 there are no definitions
-            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions').fetchmany(MOST_TOPICS)
+            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')\
+                .fetchmany(MOST_TOPICS)
             self.definitions = {clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows}
 
     def _require_tables(self):

@@ -9,7 +9,6 @@ import numpy as np
 
 from msg_adapters.layout import Packed, is_any
 
-
 LARGEST_STRETCH = 64 << 20
 """Bytes of the messages of a stretch when they are decompressed one by one."""
 

@@ -13,11 +13,14 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from imu_calibration import files
+from imu_calibration.errors import InputError
+from imu_calibration.nodes.complaints import WARNING, say
 from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.static_frames import StaticFrames
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import root_of, table_from_urdf
 from imu_calibration.settings import setting
+from msg_adapters.stamps import clean_name
 
 TOPIC = 'topic'
 """Value of `urdf_file` that stands for the topic robot_description."""
@@ -76,7 +79,7 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     site = {} if place is None else files.read_mapping(place, 'table description')
     text = (_topic_text(node) if robot.urdf_file == TOPIC
             else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro))
-    link = robot.imu_link or frame_id or _message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id
+    link = robot.imu_link or frame_id or clean_name(_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id)
     if robot.world_frame:
         site['up'] = _up(node, robot.world_frame, root_of(text))
     return table_from_urdf(text, link, site)
@@ -90,7 +93,13 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
 
 
 def _topic_text(node):
-    return _message(node, String, 'robot_description', latched_qos()).data
+    def is_robot(message):
+        try:
+            return bool(root_of(message.data))
+        except InputError as error:   # anybody can publish on the topic
+            say(node.get_logger(), WARNING, f'a robot description was ignored: {error}')
+            return False
+    return _message(node, String, 'robot_description', latched_qos(), is_robot).data
 
 
 def _up(node, world, root):
@@ -100,10 +109,10 @@ def _up(node, world, root):
     return (mat_rw @ np.array([0.0, 0.0, 1.0])).tolist()
 
 
-def _message(node: Node, kind: type, topic: str, qos: QoSProfile) -> Any:
-    """Return the first message of a topic."""
+def _message(node: Node, kind: type, topic: str, qos: QoSProfile, usable: Callable[[Any], bool] = lambda message: True) -> Any:
+    """Return the first usable message of a topic."""
     came: list[Any] = []
-    subscription = node.create_subscription(kind, topic, came.append, qos)
+    subscription = node.create_subscription(kind, topic, lambda message: came.extend([message] * usable(message)), qos)
     try:
         return _waited_for(node, lambda: came[0] if came else None,
                            lambda: f'a message on {node.resolve_topic_name(topic)} ({kind.__module__.split(".")[0]}/{kind.__name__})')

@@ -110,6 +110,10 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path, name):
     assert '\n' not in str(refusal.value)
 
 
-def test_no_more_than_a_document_may_hold_is_read_from_an_endless_file():
-    with refused(InputError, 'document_too_long'):
+def test_no_more_than_a_document_may_hold_is_read_from_a_large_file(tmp_path):
+    with refused(InputError, 'file_unreadable'):
         files.read_calibration('/dev/zero')
+    with open(tmp_path / 'large.yaml', 'wb') as stream:
+        stream.truncate(1 << 40)   # without blocks on the disk
+    with refused(InputError, 'document_too_long'):
+        files.read_calibration(tmp_path / 'large.yaml')

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.calibration.accumulator_state import saved_model
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.cli.fleet_run import units_csv
-from imu_calibration.documents import from_text, to_text
+from imu_calibration.documents import from_text
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.files import make_folder, write_text
 from imu_calibration.reference.urdf import root_of
@@ -25,7 +24,9 @@ from msg_adapters.imu import IMU_TYPE
 
 from worlds.compensation_cases import random_calibration
 from worlds.limited import limited, refused, survived
-from worlds.small_bags import write_small_bag
+from worlds.small_bags import hostile_calibration, write_small_bag
+
+pytestmark = pytest.mark.live   # each input is read in a process with limits
 
 
 @pytest.fixture
@@ -34,28 +35,9 @@ def bag(tmp_path):
     return write_small_bag(tmp_path / 'bag')
 
 
-def with_effects(columns):
-    """A calibration that carries accelerometer effects with these columns."""
-    document = yaml.safe_load(calibration_to_text(random_calibration(0, (), verdict='good')))
-    names = [f'mine_{k}' for k in range(len(columns))]
-    document['effects'] = {name: {'sensor': 'accelerometer', 'column': column, 'unit': '1', 'tolerance': 1e-3, 'text': 'mine'}
-                           for name, column in zip(names, columns, strict=True)}
-    document['accelerometer']['effects'] += names
-    document['accelerometer'] |= {name: {'value': [0.1] * 3, 'sd': [0.1] * 3, 'unit': '1', 'status': ['determined'] * 3} for name in names}
-    old = len(document['covariance']['names'])
-    document['covariance']['names'] += [f'accelerometer.{name}.{axis}' for name in names for axis in 'xyz']
-    matrix = 0.01 * np.eye(len(document['covariance']['names']))
-    matrix[:old, :old] = document['covariance']['matrix']
-    document['covariance']['matrix'] = matrix.tolist()
-    return to_text(document)
-
-
 def test_nested_powers_in_a_calibration_are_refused_before_they_are_multiplied_out(tmp_path, bag):
     """29 kB took all memory: each level of abs(...)**9 multiplies the text of the compensation by nine."""
-    column = 'f_x'
-    for _ in range(9):
-        column = f'abs({column})**9'
-    (tmp_path / 'calibration.yaml').write_text(with_effects([column] * 20))
+    (tmp_path / 'calibration.yaml').write_text(hostile_calibration())
     ended = refused('compensate', bag, '--calibration', tmp_path / 'calibration.yaml', '--output', tmp_path / 'corrected')
     assert 'multiplied out' in ended.err and not (tmp_path / 'corrected').exists()
 
@@ -157,12 +139,12 @@ def test_deep_and_long_texts_are_one_line(tmp_path, bag):
     refused('import', tmp_path / 'digits.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml')
     (tmp_path / 'table.yaml').write_text('joints: [{name: outer, axis: [0, 0, 1]}]\ngravity: ' + '9' * 4000)
     assert 'digits' in refused('calibrate', bag, '--table', tmp_path / 'table.yaml', '--output', tmp_path / 'out').err.replace('characters', 'digits')
-    (tmp_path / 'arm.urdf').write_text('<robot name="x">' + '<link name="a">' * 5000 + '</link>' * 5000 + '</robot>')
+    (tmp_path / 'arm.urdf').write_text('<robot name="x"><joint name="j" type="fixed">' + '<origin>' * 5000 + '</origin>' * 5000 + '</joint></robot>')
     refused('plan', '--urdf', tmp_path / 'arm.urdf', '--output', tmp_path / 'out')
 
 
 @pytest.mark.parametrize('text', ['', '<robot>', '<robot/>', '<robot name="a"><link name="x&#10;&#27;[2J"/></robot>', 'x' * 3_000_000,
-                                  '<robot name="a">' + '<joint>' * 256 + '</joint>' * 256 + '</robot>'])
+                                  '<robot name="a"><joint name="j" type="fixed">' + '<origin>' * 256 + '</origin>' * 256 + '</joint></robot>'])
 def test_descriptions_are_refused_or_have_clean_names(text):
     try:
         assert root_of(text).isprintable()
@@ -221,7 +203,7 @@ def compensate_on_a_small_disk(arguments):
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
     bag = write_small_bag(tmp_path / 'bag', storage=storage)
-    write_text(tmp_path / 'calibration.yaml', calibration_to_text(random_calibration(0, (), verdict='good')))
+    write_text(tmp_path / 'calibration.yaml', calibration_to_text(random_calibration(0, ())))
     before = sorted(path.name for path in tmp_path.iterdir())
     for arguments in (['compensate', str(bag), '--calibration', str(tmp_path / 'calibration.yaml'), '--anyway'], ['simulate']):
         ended = limited(compensate_on_a_small_disk, [*arguments, '--output', str(tmp_path / 'out')])

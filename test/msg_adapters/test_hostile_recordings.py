@@ -24,6 +24,7 @@ from msg_adapters.qos import spelled_out
 from worlds.limited import limited, refused, survived
 from worlds.small_bags import write_small_bag
 
+pytestmark = pytest.mark.live   # each input is read in a process with limits
 SEPARATOR = '=' * 80 + '\n'
 
 

@@ -78,12 +78,16 @@ class Talking:
 
 
 def test_the_description_and_the_link_come_from_topics(bench, site):
-    bench.node.create_publisher(String, 'robot_description', latched_qos()).publish(String(data=SIX_AXES))
+    publisher = bench.node.create_publisher(String, 'robot_description', latched_qos())
+    hostile = '<robot name="x"><joint name="j" type="fixed">' + '<origin>' * 5000 + '</origin>' * 5000 + '</joint></robot>'
+    publisher.publish(String(data=hostile))
+    threading.Timer(1.5, lambda: publisher.publish(String(data=SIX_AXES))).start()
     with Talking(bench):
         calibrates, moves = (bench.start(node, {'urdf_file': 'topic', 'table_file': site}) for node in (CalibrationNode, PlannerNode))
     expected = table_from_urdf(SIX_AXES, LINK, files.read_mapping(site, 'site'))
     same(calibrates.worker.live.table, expected)
     same(moves._table, expected)
+    assert bench.heard('a robot description was ignored', 'warning') == 1
     assert bench.heard('on the arm that comes on robot_description with the joints pan, lift, elbow') == 1
 
 

@@ -1,0 +1,48 @@
+"""Nodes against other participants of the network: documents, files and names that were made to stop or deceive them."""
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from worlds.small_bags import hostile_calibration
+
+pytest.importorskip('rclpy')
+from std_msgs.msg import String  # noqa: E402
+
+from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
+from imu_calibration.nodes.complaints import Complaints  # noqa: E402
+from imu_calibration.nodes.qos import latched_qos  # noqa: E402
+
+from ros.one_process import OneProcess  # noqa: E402
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Nodes in this process."""
+    made = OneProcess(monkeypatch)
+    yield made
+    made.close()
+
+
+def test_a_document_of_nested_powers_is_refused_and_the_node_lives(bench):
+    """29 kB took all memory of compensator_node, which accepts documents from the topic."""
+    node = bench.start(CompensatorNode, {})
+    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=hostile_calibration()))
+    bench.until(lambda: 'multiplied out' in node.problem, 'the refusal')
+    assert node.adopted is None and not bench.call('/compensator_node/reload').success
+
+
+def test_a_pipe_as_calibration_file_does_not_block_the_node(bench, tmp_path):
+    os.mkfifo(tmp_path / 'calibration.yaml')
+    node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml')})
+    answer = bench.call('/compensator_node/reload')
+    assert not answer.success and 'regular file' in answer.message and 'regular file' in node.problem
+
+
+def test_lines_of_the_log_have_no_control_characters():
+    said = []
+    Complaints(SimpleNamespace(warning=said.append)).event('frame \x1b[2Jimu\nERROR: all is well')
+    assert said == ['frame ?[2Jimu?ERROR: all is well']
