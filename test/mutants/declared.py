@@ -261,9 +261,14 @@ TRUST = _of(
      'test_covariance_terms.py'),
 )
 FILES = _of(
-    ('files written where they stand', '_beside', '_1.parent / f".{os.getpid()}.{_ending(_1)}"', '_1', 'test_disk_faults.py test_cli_bad_input.py'),
+    ('files written where they stand', '_beside', '_1.parent / f".{os.getpid()}.{token_hex(8)}.{_ending(_1)}"', '_1', 'test_disk_faults.py test_cli_bad_input.py'),
+    ('comments that end at a line end of a name', 'commented', 'printable(_1)', '_1', 'test_exports.py'),
+    ('names of recordings as they come', 'clean_name', "printable(_1[:LONGEST_NAME].decode(errors='replace'))",
+     "_1[:LONGEST_NAME].decode(errors='replace')", 'test_adapters_cdr.py'),
+    ('paths of nodes that anybody can change', 'parameter_descriptor', '_1.path', 'False', 'test_calibration_attacked.py test_compensator_attacked.py'),
+    ('columns that grow without limit', 'LONGEST_EXPANDED', '5000', '10 ** 9', 'test_hostile_documents.py'),
     ('no limit to nesting', 'DEEPEST', '20', '10 ** 9', 'test_documents.py'),
-    ('aliases allowed', '_look_through', "_1 == 'AliasEvent'", 'False', 'test_documents.py'),
+    ('aliases allowed', '_look_through', "_1 == 'AliasEvent' and (not (_2 and _3.anchor in _4))", 'False', 'test_documents.py'),
     ('another model is resumed', '_check', 'not _1.has_columns_of(_2)', 'False', 'test_session_files.py test_live_calibration.py'),
     ('another temperature is resumed', 'SensorModel.has_columns_of', "('joint_names', 'temperature_ref_c', 'definitions')",
      "('joint_names', 'definitions')", 'test_live_calibration.py test_session_files.py'),
