@@ -14,6 +14,8 @@ from msg_adapters.mcap_records import McapDamage
 PIECE = 1 << 20
 LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
 """Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes."""
+MESSAGE_BASE = 4 << 20
+"""A message may grow to this many bytes, plus `FILE_RATIO` times its compressed size; each of many may be a bomb."""
 MOST_FRAMES = 10_000
 """Frames of one stream; each costs time and gives at least a megabyte in files that compress in parallel."""
 FILE_BASE, FILE_RATIO = 256 << 20, 100
@@ -67,10 +69,11 @@ def _errors():
 
 
 def decompress_message(data: bytes) -> bytes:
-    """Return one message of a bag that is compressed by message (raises ValueError beyond `LARGEST_MESSAGE`)."""
-    plain = decompress('zstd', data, LARGEST_MESSAGE)
-    if len(plain) == LARGEST_MESSAGE:
-        raise ValueError(f'a message of {LARGEST_MESSAGE} bytes or more')
+    """Return one message of a bag that is compressed by message (raises ValueError for one that expands too far)."""
+    limit = min(LARGEST_MESSAGE, MESSAGE_BASE + FILE_RATIO * len(data))
+    plain = decompress('zstd', data, limit)
+    if len(plain) == limit:
+        raise ValueError('a message expands beyond its limit')
     return plain
 
 
