@@ -133,7 +133,10 @@ class PathWatch:
 
     def suspect(self) -> int:
         """Return the joint that has moved least of what the path asks for: just before when it has strayed, next when the joints wait."""
-        near = int(MEMORY * self.pace / STEP) + 1
-        around = self._path[max(self._at - near, 0):self._at + 1] if self.has_strayed else self._path[self._at:self._at + near + 1]
+        near, place = int(MEMORY * self.pace / STEP) + 1, self._recent[-1][1]
+        if self.has_strayed:
+            wanted = np.ptp(self._path[max(self._at - near, 0):self._at + 1], axis=0)
+        else:   # distance to the path ahead: of joints that move alike, those that have arrived do not hold up the others
+            wanted = np.max(np.abs(self._path[self._at:self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
-        return int(np.argmax(np.ptp(around, axis=0) - moved))
+        return int(np.argmax(wanted - moved))

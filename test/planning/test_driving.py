@@ -14,7 +14,7 @@ from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.driving.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
-from imu_calibration.driving.path_watch import at_rest
+from imu_calibration.driving.path_watch import PathWatch, at_rest
 from imu_calibration.driving.separating import separator_of, with_suspect
 from imu_calibration.errors import InputError
 from imu_calibration.planning.noise import noise_of_grade
@@ -418,3 +418,12 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
     assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)
     with refused(InputError, 'cause_unknown', 'gremlins'):
         separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)
+
+
+def test_of_joints_that_move_alike_the_one_that_stands_still_is_named():
+    points = TrajectoryPoints(('outer', 'middle', 'inner'), np.array([2.0]), np.full((1, 3), 0.1), np.zeros((1, 3)), np.zeros((1, 3)))
+    watch = PathWatch(np.zeros(3), points, np.full(3, 0.06))
+    for time in np.arange(0.0, 6.0, 0.05):   # outer and inner arrive, middle does not move; half of the way is within the tolerance
+        part = 0.1 * min(time / 2.0, 1.0)
+        watch.observe(time, np.array([part, 0.0, part]), now=time)
+    assert not watch.has_strayed and watch.has_stalled_for > 1.0 and watch.suspect() == 1
