@@ -33,6 +33,10 @@ def at_rest(position: np.ndarray) -> JointMotion:
     return JointMotion(np.zeros(1), np.asarray(position, float)[None], zero, zero, zero)
 
 
+TIE = 1e-3
+"""Of joints that are equally late, the one that has moved least is named; after a motion there and back all may be where they began."""
+
+
 class PathWatch:
     """
     Follows joints along a trajectory.
@@ -66,6 +70,7 @@ class PathWatch:
         self._now = self._further = 0.0
         self._came = self._took = self._remainder = 0.0
         self._recent: deque = deque([(0.0, self._start)])
+        self._most = np.zeros(len(start))
         self.has_begun = False
         """Whether the joints have left where they were."""
         self.waited = 0.0
@@ -121,7 +126,8 @@ class PathWatch:
             self._further = now
 
     def _remember(self, time, place):
-        self.has_begun = self.has_begun or bool(np.max(np.abs(place - self._start)) > MOVED)
+        self._most = np.maximum(self._most, np.abs(place - self._start))
+        self.has_begun = self.has_begun or bool(np.max(self._most) > MOVED)
         self._recent.append((time, place))
         while len(self._recent) > 2 and time - self._recent[0][0] > MEMORY:
             self._recent.popleft()
@@ -139,4 +145,4 @@ class PathWatch:
         else:   # distance to the path ahead: of joints that move alike, those that have arrived do not hold up the others
             wanted = np.max(np.abs(self._path[self._at:self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
-        return int(np.argmax(wanted - moved))
+        return int(np.argmax(wanted - moved - TIE * self._most))

@@ -43,6 +43,7 @@ def test_a_page_is_written_with_what_its_commands_print(tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.live
 def test_the_commands_still_print_what_the_pages_say(tmp_path):
     """`make answers` writes the pages anew."""
     with answers.inside(tmp_path):

@@ -340,7 +340,7 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
         loop.node.create_subscription(JointState, 'joint_states', lambda m: places.append((m.header.stamp.sec, *m.position)), 1000)
         loop.until(lambda: places and places[-1][0] > 1.8e9 + 64, 'the end of the six faces', 60.0)
         # What the planner knows is all that came: it drives nothing before it asks, and the class does not depend on how busy the machine is.
-        assert loop.call('/calibration_node/solve').message.startswith('good')
+        assert loop.call('/calibration_node/solve').message.startswith('helps')
         loop.ask('start')
         loop.until(lambda: loop.told('separating') == 'True' and loop.value('state') == 'moving', 'the separating motion', 120.0)
         assert {loop.value('found').split()[-1], *loop.value('mates').split()} == {'accel_quadratic', 'accel_scale_asymmetry'}

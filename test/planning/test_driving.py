@@ -427,3 +427,12 @@ def test_of_joints_that_move_alike_the_one_that_stands_still_is_named():
         part = 0.1 * min(time / 2.0, 1.0)
         watch.observe(time, np.array([part, 0.0, part]), now=time)
     assert not watch.has_strayed and watch.has_stalled_for > 1.0 and watch.suspect() == 1
+
+
+def test_after_a_motion_there_and_back_the_joint_that_never_moved_is_named():
+    points = TrajectoryPoints(('outer', 'middle', 'inner'), np.array([2.0, 4.0]), np.array([[0.1] * 3, [0.0] * 3]), np.zeros((2, 3)), np.zeros((2, 3)))
+    watch = PathWatch(np.zeros(3), points, np.full(3, 0.06))
+    for time in np.arange(0.0, 9.0, 0.05):
+        part = 0.1 * max(1.0 - abs(time / 2.0 - 1.0), 0.0)
+        watch.observe(time, np.array([part, 0.0, part]), now=time)
+    assert watch.suspect() == 1
