@@ -20,7 +20,6 @@ from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 
 from ros.live_station import TABLE  # noqa: E402
-from ros.one_process import OneProcess  # noqa: E402
 
 pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)
@@ -33,13 +32,10 @@ def session():
     return make_session(3, 50.0, seconds=30.0)[:2]
 
 
-@pytest.fixture
-def bench(monkeypatch):
-    """Nodes in this process."""
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """A node reports silent streams after half a second."""
     monkeypatch.setattr(calibration_node, 'PATIENCE', 0.5)
-    made = OneProcess(monkeypatch)
-    yield made
-    made.close()
 
 
 def start(bench, folder, **parameters):

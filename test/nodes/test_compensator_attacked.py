@@ -23,16 +23,15 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import Imu, Temperature  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs, relay_loop  # noqa: E402
+from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.compensator_settings import CompensatorSettings  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 
 from ros.live_station import Station  # noqa: E402
-from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
 GOOD, OTHER = (random_calibration(seed, proof=PROOF, decision={}) for seed in (1, 2))
@@ -47,15 +46,6 @@ class Sender(Node):
 
     def __init__(self, **options):
         super().__init__('sender', **options)
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Nodes in this process."""
-    monkeypatch.setattr(relay_loop, 'available', lambda: False)   # the executor of the test moves everything
-    made = OneProcess(monkeypatch)
-    yield made
-    made.close()
 
 
 @pytest.fixture

@@ -77,8 +77,7 @@ def test_a_live_parameter_changes_and_any_other_is_rejected_with_the_reason(node
 
 
 def test_speeds_tolerances_patience_and_time_limit_of_the_planner_are_in_force_once_set(monkeypatch, tmp_path):
-    bench = PlannerBench(monkeypatch, tmp_path)
-    try:
+    with PlannerBench(monkeypatch, tmp_path) as bench:
         settings = {item.name: other_value(item) for group in (DriverSettings, CampaignSettings) for item in describe(group)}
         assert all(result.successful for result in bench.set(**settings))
         planner = bench.planner
@@ -90,5 +89,3 @@ def test_speeds_tolerances_patience_and_time_limit_of_the_planner_are_in_force_o
         assert slow <= 0.05 * 100.0 * 3.14159 / 180
         bench.set(time_limit=12.5)
         assert planner.worker.campaign.settings.time_limit == 12.5
-    finally:
-        bench.close()

@@ -16,25 +16,13 @@ pytest.importorskip('rclpy')
 from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Temperature  # noqa: E402
 
-from imu_calibration.nodes import relay_loop  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 
-from ros.one_process import OneProcess  # noqa: E402
-
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: health'
 WORLD = drive(6, 6, warm_up=(0.0, 0.0, 0.3 * DEG))
 MESSAGES = [bytes(row) for row in rows(encode_imu(WORLD.imu))]
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Nodes in this process."""
-    monkeypatch.setattr(relay_loop, 'available', lambda: False)
-    made = OneProcess(monkeypatch)
-    yield made
-    made.close()
 
 
 def start(bench, tmp_path, conditions=None, **parameters):

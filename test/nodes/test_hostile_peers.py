@@ -14,17 +14,7 @@ from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.complaints import Complaints  # noqa: E402
 from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 
-from ros.one_process import OneProcess  # noqa: E402
-
 pytestmark = pytest.mark.live
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """Nodes in this process."""
-    made = OneProcess(monkeypatch)
-    yield made
-    made.close()
 
 
 def test_a_document_of_nested_powers_is_refused_and_the_node_lives(bench):

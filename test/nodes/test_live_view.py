@@ -148,15 +148,6 @@ def test_without_the_package_one_line_names_it_and_the_node_goes_on(monkeypatch)
                                               'not installed; install imu_calibration[view]')]
 
 
-@pytest.fixture
-def bench(monkeypatch):
-    """A compensator and this test's node in one process."""
-    from ros.one_process import OneProcess
-    found = OneProcess(monkeypatch)
-    yield found
-    found.close()
-
-
 @pytest.mark.live
 def test_a_compensator_shows_what_it_does(bench, tmp_path):
     """Raw beside corrected with the band of the published covariance; turned on while it runs, its address said once."""

@@ -1,6 +1,7 @@
 """planner_node attacked over DDS: what is not known, not finite, not alone or not true stops the joints or keeps them from moving."""
 
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -22,14 +23,8 @@ pytestmark = pytest.mark.live
 @pytest.fixture
 def bench(monkeypatch, tmp_path):
     """Make benches, and close them."""
-    made = []
-
-    def make(*arguments, **parameters):
-        made.append(PlannerBench(monkeypatch, tmp_path, *arguments, **parameters))
-        return made[-1]
-    yield make
-    for each in made:
-        each.close()
+    with ExitStack() as made:
+        yield lambda *arguments, **parameters: made.enter_context(PlannerBench(monkeypatch, tmp_path, *arguments, **parameters))
 
 
 def test_joints_without_a_range_are_not_moved(bench):

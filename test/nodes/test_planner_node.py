@@ -213,8 +213,7 @@ def test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once(monkeypa
 
     from imu_calibration.nodes.planner_node import PlannerNode
     from imu_calibration.nodes.qos import output_qos
-    bench = OneProcess(monkeypatch)
-    try:
+    with OneProcess(monkeypatch) as bench:
         planner = bench.start(PlannerNode, {'table_file': str(TABLE)})
         publisher = bench.node.create_publisher(JointState, 'joint_states', output_qos())
         bench.until(lambda: publisher.get_subscription_count() == 1, 'the connection')
@@ -223,8 +222,6 @@ def test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once(monkeypa
         time.sleep(1.0)   # as while it plans
         bench.until(lambda: planner.driver.position is not None, 'joint states')
         np.testing.assert_allclose(planner.driver.position, [0.0, 0.0, 0.299])
-    finally:
-        bench.close()
 
 
 class Loop(Station):

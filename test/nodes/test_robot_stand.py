@@ -35,10 +35,8 @@ LINK = 'imu_link'
 @pytest.fixture(scope='module')
 def bench():
     """Nodes in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        bench = OneProcess(patch)
-        yield bench
-        bench.close()
+    with pytest.MonkeyPatch.context() as patch, OneProcess(patch) as made:
+        yield made
 
 
 @pytest.fixture(scope='module')

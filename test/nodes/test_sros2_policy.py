@@ -8,6 +8,8 @@ import pytest
 POLICY = Path(__file__).resolve().parents[2] / 'config' / 'sros2_policy.xml'
 LISTS = {'topics': ('topic', {'publish', 'subscribe'}), 'services': ('service', {'reply', 'request'}), 'actions': ('action', {'call', 'execute'})}
 """List of a profile -> element, attributes with ALLOW or DENY."""
+LISTS_OF = {'publisher': ('topics', 'publish'), 'subscriber': ('topics', 'subscribe'), 'service': ('services', 'reply')}
+"""Kind of a name in the graph -> list, attribute."""
 NODES = {'calibration_node', 'compensator_node', 'planner_node', 'simulator_node', 'bag_player_node'}
 
 
@@ -45,26 +47,15 @@ def test_the_structure_is_that_of_the_schema_and_only_calibration_node_publishes
 
 
 @pytest.mark.live
-def test_every_name_of_compensator_node_is_in_the_policy(monkeypatch):
-    pytest.importorskip('rclpy')
-    from imu_calibration.nodes import relay_loop
+@pytest.mark.usefixtures('executor_only')
+def test_every_name_of_compensator_node_is_in_the_policy(bench):
     from imu_calibration.nodes.compensator_node import CompensatorNode
-
-    from ros.one_process import OneProcess
-    monkeypatch.setattr(relay_loop, 'available', lambda: False)
-    bench = OneProcess(monkeypatch)
-    try:
-        node = bench.start(CompensatorNode, {})
-        own = {(LISTS_OF[kind], name if name.startswith('/compensator_node/') else name) for kind in LISTS_OF
-               for name, _ in getattr(node, f'get_{kind}_names_and_types_by_node')('compensator_node', '/')}
-    finally:
-        bench.close()
+    node = bench.start(CompensatorNode, {})
+    own = {(LISTS_OF[kind], name) for kind in LISTS_OF
+           for name, _ in getattr(node, f'get_{kind}_names_and_types_by_node')('compensator_node', '/')}
     allowed = {(key, absolute(name)) for key, names in profiles()['compensator_node'].items() for name in names}
     missing = {entry for entry in own if entry not in allowed and 'type_description' not in entry[1]}
     assert len(own) > 8 and not missing
-
-
-LISTS_OF = {'publisher': ('topics', 'publish'), 'subscriber': ('topics', 'subscribe'), 'service': ('services', 'reply')}
 
 
 def absolute(name):

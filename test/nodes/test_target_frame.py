@@ -24,7 +24,6 @@ from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from imu_calibration.nodes import relay_loop  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
@@ -32,7 +31,7 @@ from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
 from ros.message_package import make_package, why_not  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: compensation'
 XYZ, RPY = [0.3, -0.1, 0.05], [0.2, -0.4, 1.1]
@@ -76,14 +75,12 @@ class Bench(OneProcess):
 @pytest.fixture
 def bench(monkeypatch, made_messages):
     """A Bench."""
-    monkeypatch.setattr(relay_loop, 'available', lambda: False)
     if not made_messages:
         for name in ('tf2_msgs', 'tf2_msgs.msg'):
             monkeypatch.setitem(sys.modules, name, ModuleType(name))
         sys.modules['tf2_msgs.msg'].TFMessage = String
-    made = Bench(monkeypatch, made_messages)
-    yield made
-    made.close()
+    with Bench(monkeypatch, made_messages) as made:
+        yield made
 
 
 @pytest.fixture

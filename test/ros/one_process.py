@@ -88,17 +88,19 @@ class OneProcess:
         """Return how often a line with those words was said."""
         return sum(words in line for kind, line in self.said if level in (None, kind))
 
-    def call(self, name):
-        """Call a Trigger service and return its answer."""
-        client = self.node.create_client(Trigger, name)
-        self.until(client.service_is_ready, name)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done, f'the answer of {name}')
+    def call(self, name, kind=Trigger, until=None, **fields):
+        """Call a service with these fields of its request and return its answer; `until` waits in place of the method."""
+        client, until = self.node.create_client(kind, name), until or self.until
+        until(client.service_is_ready, name)
+        future = client.call_async(kind.Request(**fields))
+        until(future.done, f'the answer of {name}')
         self.node.destroy_client(client)
         return future.result()
 
-    def close(self):
-        """End everything."""
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
         for node in self.nodes:
             if hasattr(node, 'close'):
                 node.close()

@@ -1,6 +1,7 @@
 """planner_node over DDS in the test's process, with the joints, the controller and calibration_node of the test."""
 
 import json
+from functools import partial
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
@@ -71,12 +72,7 @@ class PlannerBench(OneProcess):
 
     def ask(self, what, elapsed=PERIOD):
         """Call a service of the planner while joint states go on."""
-        client = self.node.create_client(Trigger, f'/planner_node/{what}')
-        self.looks(client.service_is_ready, what, elapsed)
-        future = client.call_async(Trigger.Request())
-        self.looks(future.done, f'the answer of {what}', elapsed)
-        self.node.destroy_client(client)
-        return future.result()
+        return self.call(f'/planner_node/{what}', until=partial(self.looks, elapsed=elapsed))
 
     def moving(self, **parameters):
         """Start and return once a motion is driven."""
@@ -88,10 +84,5 @@ class PlannerBench(OneProcess):
 
     def set(self, node='planner_node', **values):
         """Set parameters of a node from outside; return the results."""
-        client = self.node.create_client(SetParameters, f'/{node}/set_parameters')
-        self.until(client.service_is_ready, 'the parameters')
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
-        future = client.call_async(request)
-        self.until(future.done, 'the answer')
-        self.node.destroy_client(client)
-        return future.result().results
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        return self.call(f'/{node}/set_parameters', SetParameters, parameters=parameters).results
