@@ -12,7 +12,6 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.errors import DocumentError, InputError
 
 FORMAT = 'imu_calibration/noise/1'
-UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 UNITS = {
     'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', 'gauss_markov': 'm/s^2', TIME: 's',
                       RANDOM_WALK.name: 'm/s^3/sqrt(Hz)', 'temperature': 'm/s^2/K', 'turn_on': 'm/s^2', 'ramp': 'm/s^3'},

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.allan.dead_reckoning import position_budget
-from imu_calibration.allan.document import TERMS, UNIT, UNITS
+from imu_calibration.allan.document import TERMS, UNITS
 from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
-from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.units import SHOWN_OF_NOISE, significant
 
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',

@@ -12,9 +12,10 @@ from imu_calibration.by_hand.workflow import read_by_hand
 from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.proof import UNITS, compared
+from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.arrays import compensate_readings
 from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.effects.base import UNIT
 from imu_calibration.errors import NotObservableError
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.joint_checks import check_force
@@ -67,9 +68,9 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
-    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNITS['accelerometer'],
+    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNIT['accelerometer'],
                    seconds=rested)
-    rest = _entry(raw_rate, rate, unit=UNITS['gyroscope'], seconds=rested)
+    rest = _entry(raw_rate, rate, unit=UNIT['gyroscope'], seconds=rested)
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)

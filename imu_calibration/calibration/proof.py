@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.held_out import HeldOut
 from imu_calibration.effects.applied import Centre, applied_values
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
@@ -28,7 +28,6 @@ LEAST_BLOCKS = 3
 LARGEST_DELAY = 0.1
 """A delay is looked for up to this size, s."""
 Side = tuple[HeldOut, Sequence[Sequence[np.ndarray]]]
-UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +104,7 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
         moving = {str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
                   if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
         late = {'delay_s': now.delay, 'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300)}
-        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
+        proof[sensor] = entry | {'unit': UNIT[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
     return proof
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.effects.applied import Centre, in_time, not_applied
-from imu_calibration.effects.base import Effect
+from imu_calibration.effects.base import UNIT, Effect
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
@@ -90,7 +90,7 @@ def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.n
 
 def _size(effect, rms):
     return {'effect': effect.name, 'sensor': effect.sensor, 'applied': END if in_time(effect) else MEAN, 'rms': rms.tolist(),
-            'unit': {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[effect.sensor]}
+            'unit': UNIT[effect.sensor]}
 
 
 def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:

@@ -4,10 +4,9 @@ import numpy as np
 
 from imu_calibration.calibration.decision import worse_regimes
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.proof import UNITS
 from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet
 from imu_calibration.calibration.uncorrected import uncorrected_lines
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, UNIT, Role
 from imu_calibration.units import for_people, significant
 
 LOST_SHARE = 0.05
@@ -74,7 +73,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         if scatter > tolerances[part][0]:
-            factor, unit = for_people(UNITS[sensor])
+            factor, unit = for_people(UNIT[sensor])
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
                                         f'{significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well known, the bias of the moment is not',

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.diagnosis.result import Diagnosis
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, UNIT
 
 FORMAT = 'imu_calibration/diagnosis/1'
 
@@ -53,7 +53,7 @@ def _gain(gain):
 
 
 def _rest(sensor, rest):
-    unit = rest.unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor]
+    unit = rest.unit or UNIT[sensor]
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
             'share': rest.share, 'where': rest.where, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
             'tones': [tone.to_mapping() for tone in rest.tones],

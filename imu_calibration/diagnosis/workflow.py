@@ -20,7 +20,7 @@ from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
 from imu_calibration.diagnosis.result import Diagnosis
 from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.lags import total_lags
 from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
@@ -226,5 +226,5 @@ def nothing_named(diagnosis: Diagnosis) -> str:
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:
     """Return a specific force or rate, or a value in another unit, in people's units."""
-    factor, unit = for_people(unit or {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}[sensor])
+    factor, unit = for_people(unit or UNIT[sensor])
     return f'{significant(value * factor)} {unit}'

@@ -8,6 +8,8 @@ import numpy as np
 
 AXES = ('x', 'y', 'z')
 SENSORS = ('accelerometer', 'gyroscope')
+UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
+"""Sensor -> unit of its readings."""
 SHORT = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
 """Beginning of the names of a sensor's own effects and columns."""
 SECTIONS = SENSORS + ('reference',)

@@ -4,12 +4,11 @@ import numpy as np
 
 from imu_calibration.constants import DEG, MILLI_G, STANDARD_GRAVITY
 from imu_calibration.effects import regressors
-from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, VECTOR, Effect, Role
+from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, UNIT, VECTOR, Effect, Role
 from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, OfOthers, Products
 
 SHAKEN = 0.05
 """Variance of a vibration that is plainly felt, (m/s^2)^2."""
-UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 
 
 def _one_axis(table):

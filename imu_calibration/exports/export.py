@@ -10,11 +10,11 @@ from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
 from imu_calibration.calibration.trust import Usable, caveats, usable
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, UNIT, Role
 from imu_calibration.errors import InputError
 from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
 from imu_calibration.exports.holdings import ARMS, MATRICES
-from imu_calibration.exports.loss import NOTHING, UNIT, Loss, loss_of
+from imu_calibration.exports.loss import NOTHING, Loss, loss_of
 from imu_calibration.exports.motion import TrialMotion, standard_motion
 from imu_calibration.exports.pose import UNNAMED, pose_line
 from imu_calibration.exports.target import Noise, Numbers, Page, Readings, Target

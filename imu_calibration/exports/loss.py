@@ -13,7 +13,6 @@ from imu_calibration.exports.holdings import Holding, holding_of
 from imu_calibration.exports.motion import TrialMotion
 from imu_calibration.exports.target import Numbers, Readings, Target
 
-UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 NOTHING = 1e-9
 """m/s^2, rad/s; smaller differences are rounding."""
 

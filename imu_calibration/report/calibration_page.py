@@ -6,6 +6,7 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
 from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -16,7 +17,7 @@ from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
-from imu_calibration.report.residuals import UNIT, residual_section
+from imu_calibration.report.residuals import residual_section
 from imu_calibration.report.worked_sample import worked_sample
 
 
@@ -46,7 +47,7 @@ def tiles(result: CalibrationResult, errors: WindowErrors, navigation: dict[str,
     """Return the figures that matter most: what was determined, and the errors before and after."""
     asked = list(result.calibration.requested.values())
     found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]
-    for sensor in ('accelerometer', 'gyroscope'):
+    for sensor in SENSORS:
         after, before = (in_unit(errors.rms(sensor, which), UNIT[sensor]) for which in ('after', 'before'))
         found.append(_tile(f'{sensor} error', after, before, f'rms of {len(errors.time)} window means'))
     if navigation['rest']:

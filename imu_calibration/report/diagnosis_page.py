@@ -8,12 +8,11 @@ from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Diagnosis, Finding
 from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines, proposed_effects
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
 from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
-from imu_calibration.report.residuals import UNIT
 from imu_calibration.report.spectrum_figure import draw_tones
 from imu_calibration.units import for_people
 

@@ -3,11 +3,10 @@
 import numpy as np
 from scipy.special import chdtri
 
-from imu_calibration.allan.document import UNIT
 from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import predicted
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
 from imu_calibration.units import SHOWN_OF_NOISE
 

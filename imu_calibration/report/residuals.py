@@ -7,12 +7,11 @@ import numpy as np
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
 from imu_calibration.report.numbers import in_unit, text
 from imu_calibration.units import for_people
 
-UNIT = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 LAG_SECONDS = 2.0
 """Longest lag that is drawn."""
 MOST_WINDOWS = 60
