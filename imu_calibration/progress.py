@@ -29,6 +29,19 @@ def report(phase: str, done: float = 0.0, total: float = 0.0) -> None:
         listener(phase, done, total)
 
 
+def counter(phase: str, total: float) -> Callable[[float], None]:
+    """Return a function that takes the amount done since its last call; nothing is reported where the total is 0."""
+    done = 0.0
+
+    def advance(amount):
+        nonlocal done
+        done += amount
+        if total:
+            report(phase, done, total)
+    advance(0)
+    return advance
+
+
 def reported(phase: str, items: Iterable[Item], total: int) -> Iterator[Item]:
     """Yield items and report how many of them are done."""
     report(phase, 0, total)

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG, add_stand_arguments, add_topic_arguments, stand_of
+from imu_calibration.cli.arguments import BAG, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
 
 EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.yaml',
@@ -25,9 +25,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.cli.show import console, warn
     from imu_calibration.preflight.checks import warnings
     from imu_calibration.use_cases.check import check
-    from imu_calibration.use_cases.choices import Choices
-    chosen = {name: value for name, value in vars(options).items() if name in Choices.__annotations__}
-    found = check(options.bag, options.calibration, stand_of(options), **chosen)
+    found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])
     out, table = console(), Table(box=None, pad_edge=False)
     for heading in ('sensor', 'motion', 'seconds', 'before', 'after', 'unit', 'after / before', '95 %'):

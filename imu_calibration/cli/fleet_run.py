@@ -18,12 +18,12 @@ from imu_calibration.cli.parser import VerbResult
 from imu_calibration.cli.show import console, warn
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, with_hint
+from imu_calibration.progress import counter
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
 from imu_calibration.use_cases.choices import topics_of
 from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
-from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.stand import table_of
 
 HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
@@ -36,19 +36,20 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     table = _table(options, [path for _, paths in found for path in paths])
     units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names) for name, paths in found]
     folder = files.make_folder(options.output)
-    with progress_bar('units', len(units)) as advance:
-        mapper = _mapper(options, len(units), lambda result: advance(1))
-        results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
+    advance = counter('units', len(units))
+    mapper = _mapper(options, len(units), lambda result: advance(1))
+    results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
     spreads = summarise(results)
     for result in results:
         for name, text in (result.files or {}).items():
             files.write_text(files.make_folder(folder / result.name) / name, text)
-    files.write_text(folder / 'summary.csv', parameters_csv(spreads))
-    files.write_text(folder / 'units.csv', units_csv(results))
+    tables = {'summary.csv': parameters_csv(spreads), 'units.csv': units_csv(results)}
+    for name, text in tables.items():
+        files.write_text(folder / name, text)
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
     show_fleet(results, spreads, folder, hints=hints_of(options))
-    return VerbResult(fleet_exit_code(results), {'units': list(csv.DictReader(io.StringIO(units_csv(results)))),
-                                              'parameters': list(csv.DictReader(io.StringIO(parameters_csv(spreads))))})
+    rows = {name: list(csv.DictReader(io.StringIO(text))) for name, text in tables.items()}
+    return VerbResult(fleet_exit_code(results), {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
 
 
 def _table(options, bags):

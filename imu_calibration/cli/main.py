@@ -18,8 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.suppress(ValueError):   # in the main thread alone: partial results are then removed as after Ctrl+C
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        from imu_calibration.cli.parser import check_verb, make_parser
-        check_verb(arguments)
+        from imu_calibration.cli.parser import make_parser
         options = make_parser(*arguments[:1]).parse_args(arguments)
     except KeyboardInterrupt:
         return _interrupted('imu_calibration')
@@ -40,17 +39,16 @@ def run(options: Namespace) -> int:
                 from imu_calibration.cli.progress_bars import ProgressBars
                 stack.enter_context(listening(stack.enter_context(ProgressBars(verbose=options.verbose))))
             code, document = options.run(options)
-    except ImuCalibrationError as error:
-        text, code = error.told(hints_of(options)), 1
-        print(f'{prog}: {text}', file=sys.stderr)
-        document = {'error': text, 'key': error.key}
     except BrokenPipeError:
         sys.stdout = None   # a later flush would fail again
         return 1
-    except (OSError, MemoryError, RecursionError) as error:
-        text, code = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), 1
+    except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
+        if isinstance(error, ImuCalibrationError):
+            text, key = error.told(hints_of(options)), error.key
+        else:
+            text, key = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None
         print(f'{prog}: {text}', file=sys.stderr)
-        document = {'error': text, 'key': None}
+        code, document = 1, {'error': text, 'key': key}
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.json:

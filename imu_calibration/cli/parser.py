@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
@@ -76,7 +76,11 @@ def make_parser(verb: str | None = None) -> OneLineParser:
 
 
 def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, required: bool = True) -> None:
-    """Add the verbs to a parser; only the module of `verb` is imported and declares its arguments."""
+    """Add the verbs to a parser; only the module of `verb` is imported and declares its arguments; an unknown verb is refused."""
+    if verb is not None and not verb.startswith('-') and verb not in VERBS:
+        print(f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
+              f"see '{parser.prog} --help'", file=sys.stderr)
+        raise SystemExit(1)
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=required, parser_class=OneLineParser)
     for name, text in VERBS.items():
         added = verbs.add_parser(name, help=text, description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -97,11 +101,3 @@ def _usage(action):
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
     return f'{action.option_strings[0]} {name}' if action.option_strings else f'{name} [{name} ...]' if action.nargs == '+' else name
-
-
-def check_verb(arguments: Sequence[str], prog: str = 'imu_calibration') -> None:
-    """Refuse a verb that does not exist with the closest one."""
-    if arguments and not arguments[0].startswith('-') and arguments[0] not in VERBS:
-        print(f"{prog}: the verb must be one of {', '.join(VERBS)}, got '{arguments[0]}'{did_you_mean(arguments[0], VERBS)}; "
-              f"see '{prog} --help'", file=sys.stderr)
-        raise SystemExit(1)

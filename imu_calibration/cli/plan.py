@@ -48,16 +48,11 @@ def run(options: Namespace) -> VerbResult:
     stand = _stand(options)
     from imu_calibration import files
     from imu_calibration.planning.document import plan_to_mapping
+    from imu_calibration.progress import report
     from imu_calibration.use_cases.plan import plan
-    from imu_calibration.use_cases.progress import progress_bar
-    with files.output_folder(options.output) as folder, progress_bar('planning', 100) as advance:
-        told = 0.0
-
-        def progress(share):
-            nonlocal told
-            advance(max(100 * share - told, 0.0))
-            told = max(told, 100 * share)
-        made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate, progress=progress,
+    with files.output_folder(options.output) as folder:
+        made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
+                    progress=lambda share: report('planning', share, 1.0),
                     with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
                     diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach,
                     **{name: getattr(options, name) for name in CHOICES})

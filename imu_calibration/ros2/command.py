@@ -8,7 +8,7 @@ from types import MethodType
 from ros2cli.command import CommandExtension
 
 from imu_calibration.cli.main import run
-from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, add_verbs, check_verb
+from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, add_verbs
 
 
 class ImuCommand(CommandExtension):
@@ -20,7 +20,6 @@ class ImuCommand(CommandExtension):
         setattr(parser, 'error', MethodType(OneLineParser.error, parser))   # one line, and the exit code of the plain command
         words = list(sys.argv[1:] if argv is None else argv)
         after = words[words.index(cli_name.split()[-1]) + 1:][:1] if cli_name.split()[-1] in words else []
-        check_verb(after, 'ros2 imu')
         add_verbs(parser, *after, required=False)
 
     def main(self, *, args: Namespace, **_: ArgumentParser) -> int:

@@ -16,12 +16,11 @@ from imu_calibration.calibration.document import Calibration, calibration_to_tex
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
 from imu_calibration.calibration.verdict import Verdict, judged
 from imu_calibration.errors import InputError
-from imu_calibration.progress import report
+from imu_calibration.progress import counter, report
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.pool import jobs_for, process_mapper
-from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
@@ -117,7 +116,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=joints is not None).close()
     jobs = jobs_for(jobs, len(recordings))
-    sources = [source_of(item, topics, joints, quiet=jobs > 1) for item in recordings]
+    sources = [source_of(item, topics, joints) for item in recordings]
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
         provenance = hashing.submit(provenance_of, recordings, kept(choices))
         if table is None:
@@ -138,10 +137,10 @@ def _beside(result, proof):
 
 
 def _side_by_side(sources, table, options, recordings, jobs):
-    """Calibrate with the table, recordings side by side; with several processes one bar counts the recordings."""
+    """Calibrate with the table, recordings in several processes if `jobs` is above 1."""
     names = [name_of(recording) for recording in recordings]
     names = [name if names.count(name) == 1 else f'recording {number}' if isinstance(recording, SampleBlock) else str(Path(recording))
              for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)]
-    with progress_bar('recordings', len(recordings) if jobs > 1 else 0) as advance:
-        mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-        return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
+    advance = counter('recordings', len(recordings) if jobs > 1 else 0)
+    mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
+    return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result

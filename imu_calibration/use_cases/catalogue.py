@@ -3,7 +3,6 @@
 from os import PathLike
 from typing import Any
 
-from imu_calibration.effects.base import Effect
 from imu_calibration.estimation.standard_motions import MOTIONS
 from imu_calibration.use_cases.choices import catalogue_of
 
@@ -28,10 +27,10 @@ def _row(effect):
     units = (effect.unit,) if isinstance(effect.unit, str) else tuple(dict.fromkeys(effect.unit))
     needs = [*effect.needs, *(motion.text for motion in MOTIONS if motion.name in effect.motion)]
     return {'effect': effect.name, 'sensor': effect.sensor, 'unit': ', '.join(units), 'tolerance': effect.tolerance,
-            'compensation': effect.compensation, 'text': effect.explanation, 'equation': equation(effect), 'needs': '; '.join(needs)}
+            'compensation': effect.compensation, 'text': effect.explanation, 'equation': _equation(effect), 'needs': '; '.join(needs)}
 
 
-def equation(effect: Effect) -> str:
+def _equation(effect):
     """Return the output of the effect as a sum of coefficients times columns; empty where it changes the reference motion."""
     columns = [text for group in effect.groups for text in group.text]
     if not columns or effect.warp is not None:

@@ -12,9 +12,9 @@ from imu_calibration.calibration.measured_noise import with_measured_noise
 from imu_calibration.calibration.trust import caveats, usable
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
+from imu_calibration.progress import counter
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.use_cases.choices import noise_of
-from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
 
 CORRECTED_TOPIC = '/imu/data_corrected'
@@ -95,7 +95,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it', code='exists_already')
     topics = Topics(imu_topic, None, temperature_topic)
     bag = open_bag(recording, topics, want_joints=False)
-    with bag, progress_bar('compensating', bag.message_counts.get(bag.imu_topic, 0)) as advance:
+    advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
+    with bag:
         refuse_corrected(bag.imu_topic)
         stream = CompensationStream(calibration, temperature=temperatures(recording, topics), transfer=transfer)
 

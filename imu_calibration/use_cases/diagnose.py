@@ -10,11 +10,10 @@ from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
-from imu_calibration.progress import report
+from imu_calibration.progress import counter, report
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
 from imu_calibration.use_cases.drawing import Drawing
-from imu_calibration.use_cases.progress import progress_bar
 from imu_calibration.use_cases.recordings import provenance_of, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
@@ -109,7 +108,7 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, None if table is None else table.joint_names)
     provenance = provenance_of([recording], kept(choices))
-    with progress_bar('diagnosing', 100) as advance:
-        if table is None:
-            return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))
-        return Diagnosed(diagnose_recording(source, table, options, provenance=provenance, progress=advance))
+    advance = counter('diagnosing', 100)
+    if table is None:
+        return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))
+    return Diagnosed(diagnose_recording(source, table, options, provenance=provenance, progress=advance))

@@ -150,7 +150,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     noise = expected_noise(options.noise, grade, imu_rate)
     limits, start = limits_of(table), None
     if around or reach is not None:
-        limits, start = _neighbourhood(table, around or {}, reach)
+        limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
     known = _known(calibration, table, options)
     causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
     if causes:
@@ -171,13 +171,11 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     return Planned(planner.plan(start, progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
 
 
-def _neighbourhood(table, around, reach):
-    """Return the limits that keep to `reach` about a pose, and the pose."""
-    names = table.joint_names
+def _neighbourhood(limits, names, around, reach):
+    """Return the limits restricted to `reach` about a pose, and the pose."""
     if reach is None or reach <= 0 or set(around) != set(names):
         raise InputError(f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
                          f'and {", ".join(around) or "no joint"}; give both')
-    limits = limits_of(table)
     position = np.where(limits.turns, DEG, 1.0) * [around[name] for name in names]
     return limits.around(position, np.where(limits.turns, reach * DEG, 0.0)), position
 

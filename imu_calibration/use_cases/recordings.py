@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from imu_calibration import files
 from imu_calibration.errors import InputError
+from imu_calibration.progress import counter
 from imu_calibration.samples import SampleBlock, TemperatureSamples
-from imu_calibration.use_cases.progress import progress_bar
 from msg_adapters.bag import Recording, open_recording
 from msg_adapters.read_ahead import read_ahead
 
@@ -48,10 +48,10 @@ def open_bag(path: str | PathLike, topics: Topics, *, want_joints: bool | str = 
 
 def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *, want_joints: bool | str, want_temperature: bool | str,
                 quiet: bool) -> Iterator[SampleBlock]:
-    """Yield the blocks of a recording with a progress bar, unless `quiet`; a plain function, so that another process can run it."""
+    """Yield the blocks of a recording and report the progress unless `quiet`; a plain function, so that another process can run it."""
     recording = open_recording(path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
-    total = 0 if quiet else recording.message_counts.get(recording.imu_topic, 0)
-    with recording, progress_bar(f'reading {Path(path).name}', total) as advance:
+    advance = counter(f'reading {Path(path).name}', 0 if quiet else recording.message_counts.get(recording.imu_topic, 0))
+    with recording:
         with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
             for block in blocks:
                 if block.imu is not None:
