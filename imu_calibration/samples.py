@@ -13,6 +13,16 @@ EPOCH = 1e8
 """s; larger times count from 1970."""
 
 
+def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
+    """
+    Return stamps of times in multiples of `unit` seconds, ns, int64, shape (n,).
+
+    Times that do not count from 1970 are shifted, so that the first stamp is `FIRST_NS`.
+    """
+    start = round(time[0] * unit * 1e9) if time[0] * unit > EPOCH else FIRST_NS
+    return start + np.round((time - time[0]) * (unit * 1e9)).astype(np.int64)
+
+
 class _Columns:
     """Slicing and joining for dataclasses whose array fields share their first axis."""
 
@@ -66,6 +76,12 @@ class JointSamples(_Columns):
     """Joint rates, rad/s, shape (n, n_joints); NaN where the message had none."""
     names: tuple = ()
     """Joint names in column order."""
+
+    @classmethod
+    def of_angles(cls, stamp_ns: np.ndarray, angles: dict[str, np.ndarray]) -> 'JointSamples':
+        """Return the samples of joint angles by name, rad, each of shape (n,); without velocities."""
+        position = np.column_stack(list(angles.values()))
+        return cls(stamp_ns, position, np.full(position.shape, np.nan), tuple(angles))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +148,8 @@ class SampleBlock:
                                  'correct the array')
         if not np.isfinite(time).all():
             raise InputError(f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows')
-        start = round(time[0] * 1e9) if time[0] > EPOCH else FIRST_NS
-        stamp_ns = start + np.round((time - time[0]) * 1e9).astype(np.int64)
-        position = np.column_stack(list(angles.values())) if angles else None
-        return cls(ImuSamples(stamp_ns, force, rate, 'imu_link'),
-                   None if position is None else JointSamples(stamp_ns, position, np.full(position.shape, np.nan), tuple(angles)),
+        stamp_ns = stamps_of(time)
+        return cls(ImuSamples(stamp_ns, force, rate, 'imu_link'), JointSamples.of_angles(stamp_ns, angles) if angles else None,
                    None if heat is None else TemperatureSamples(stamp_ns, heat))
 
 

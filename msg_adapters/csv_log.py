@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from imu_calibration.errors import InputError, shortened
 from imu_calibration.preflight.chunks import ChunkSeries
 from imu_calibration.preflight.turning import relate_turns
 from imu_calibration.regular_files import open_regular
-from imu_calibration.samples import EPOCH, FIRST_NS, ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 HEAD_BYTES = 1 << 16
@@ -118,14 +117,8 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
 
     """
     path = Path(path)
-    status = path.stat() if path.is_file() else None
-    if status is None:
+    if not path.is_file():
         raise InputError(f'a text log must be a regular file, got {path}; check the path')
-    return _read(path, tuple(columns), status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=1)
-def _read(path, columns, *_):
     table = _Table(path)
     found = [_parse(text) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
@@ -151,14 +144,9 @@ def _read(path, columns, *_):
     imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * UNITS['rate'][rate.unit], 'imu_link')
     used += joints
     taken = {name.removeprefix('-') for each in used for name in each.names}
-    return CsvLog(tuple(used), imu, _joints(table, stamp_ns, joints), temperature, tuple(name for name in table.names if name not in taken))
-
-
-def _joints(table, stamp_ns, joints):
-    if not joints:
-        return None
-    position = np.column_stack([table.values(each.names)[:, 0] * UNITS['joint'][each.unit] for each in joints])
-    return JointSamples(stamp_ns, position, np.full(position.shape, np.nan), tuple(each.joint for each in joints))
+    angles = {each.joint: table.values(each.names)[:, 0] * UNITS['joint'][each.unit] for each in joints}
+    return CsvLog(tuple(used), imu, JointSamples.of_angles(stamp_ns, angles) if angles else None, temperature,
+                  tuple(name for name in table.names if name not in taken))
 
 
 def _with_unit(columns, guess, path):
@@ -273,10 +261,7 @@ class _Table:
         if not np.isfinite(values).all():
             raise InputError(f'the time of every row of {self.path} must be a number, got {np.count_nonzero(~np.isfinite(values))} without '
                              'one; remove these rows')
-        size = UNITS['time'][time.unit]
-        start = values[0]
-        offset = round(start * size * 1e9) if start * size > EPOCH else FIRST_NS
-        return offset + np.round((values - start) * (size * 1e9)).astype(np.int64)
+        return stamps_of(values, UNITS['time'][time.unit])
 
 
 def _delimiter(lines):
