@@ -1,4 +1,4 @@
-"""Progress of long work: the core reports phases, the command line shows them; without a listener a report costs nothing."""
+"""Progress of long work: the core reports phases, the command line shows them; without a listener a report has no effect."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from typing import TypeVar
 
 Item = TypeVar('Item')
 Listener = Callable[[str, float, float], None]
-"""Takes the name of a phase, the amount done and the total; a total of 0 means unknown."""
+"""Receives the name of a phase, the amount done and the total; a total of 0 means unknown."""
 
 _listener: ContextVar[Listener | None] = ContextVar('listener', default=None)
 
@@ -30,7 +30,7 @@ def report(phase: str, done: float = 0.0, total: float = 0.0) -> None:
 
 
 def counter(phase: str, total: float) -> Callable[[float], None]:
-    """Return a function that takes the amount done since its last call; nothing is reported where the total is 0."""
+    """Return a function of the amount done since its last call; a total of 0 suppresses the reports."""
     done = 0.0
 
     def advance(amount):

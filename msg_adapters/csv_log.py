@@ -234,7 +234,7 @@ class _Table:
             lines = [line.replace(',', '.') for line in lines]
         try:
             data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
-        except ValueError:   # empty cells, words such as "nan" in other languages, rows that are cut off
+        except ValueError:   # empty cells, text such as "nan" in other languages, truncated rows
             data = np.genfromtxt(lines, usecols=numbers, invalid_raise=False, **options).reshape(-1, len(numbers))
         self._values = dict(zip(numbers, data.T, strict=True))
         for k in set(wanted) & self.dates:

@@ -19,7 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Namespace) -> VerbResult:
-    """Print errors before and after with their interval and the answer; return 0 when it helps, 3 when it does not or cannot be told."""
+    """Print the errors before and after with their interval and the decision; exit code 0 where each sensor helps, else 3."""
     from rich.table import Table
 
     from imu_calibration.cli.show import console, warn

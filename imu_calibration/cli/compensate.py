@@ -1,4 +1,4 @@
-"""``imu_calibration compensate``: a bag with the corrected topic beside the others."""
+"""``imu_calibration compensate``: a bag with the corrected topic in addition to the original ones."""
 
 from argparse import Namespace
 
@@ -22,14 +22,14 @@ def add_arguments(parser: OneLineParser) -> None:
            help='place of the sensor in the target frame, m')
     expert('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
            help='roll, pitch, yaw of the sensor in the target frame, rad')
-    common('--anyway', action='store_true', help='also correct a sensor whose decision is harms')
+    common('--anyway', action='store_true', help='also correct a sensor with the decision harms')
     expert('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
     expert('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     add_topic_arguments(parser, joints=False)
 
 
 def run(options: Namespace) -> VerbResult:
-    """Compensate into a new bag, print what was noticed, return the exit code."""
+    """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
     names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'noise', 'correct_stamps', 'imu_topic',
              'temperature_topic')

@@ -1,4 +1,4 @@
-"""``imu_calibration diagnose``: what the model gets wrong, why, the extended model, and the measured gain."""
+"""``imu_calibration diagnose``: the errors of the model, their causes, the extended model, and the measured gain."""
 
 from argparse import Namespace
 

@@ -13,19 +13,19 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('document', metavar='CALIBRATION', nargs='?', help='calibration.yaml')
-    common('--to', metavar='NAME', help='the program: one of those that --list shows')
-    common('--list', action='store_true', help='show the programs and what each can hold')
+    common('--to', metavar='NAME', help='name of the program, listed by --list')
+    common('--list', action='store_true', help='list the programs and the parameters that each accepts')
     common('--noise', metavar='FILE', help='noise.yaml of the verb noise')
     expert('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
     common('--output', metavar='FILE', help='the file to write')
     expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
-    expert('--anyway', action='store_true', help='also the numbers of a sensor whose decision is harms; without it nominal')
+    expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
     add_stand_arguments(parser, 'motion of --bag; without it: from its readings')
     add_topic_arguments(parser)
 
 
 def run(options: Namespace) -> VerbResult:
-    """Show the list, or write the file and print what is lost."""
+    """Show the list, or write the file and print the information that is lost."""
     if options.list:
         return VerbResult(0, {'targets': _show_targets()})
     for name, given in (('CALIBRATION', options.document), ('--to NAME', options.to), ('--output FILE', options.output)):

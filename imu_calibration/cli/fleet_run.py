@@ -53,7 +53,7 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
 
 
 def _table(options, bags):
-    """Return the chain of joints; what a recording has to say of it comes from the first that can be read."""
+    """Return the chain of joints; a description in recordings is read from the first readable one."""
     stand = stand_of(options)
     if stand is None:
         raise InputError('a fleet is calibrated on a table or an arm, got none; describe it', key='table')
@@ -78,7 +78,7 @@ def parameters_csv(spreads: Sequence[Spread]) -> str:
 
 
 def units_csv(results: Sequence[UnitResult]) -> str:
-    """Return one row per unit: decision, those of the sensors, exit code, why refused, samples lost, each parameter with its sd, SI."""
+    """Return one row per unit: decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
     headings = [heading for name in names for heading in (name, f'{name}.sd')]
     rows: list[list] = [['name', 'decision', *SENSORS, 'exit_code', 'error', 'dropped', *headings]]
@@ -100,7 +100,7 @@ def _csv(rows):
 
 
 def shown(spread: Spread) -> tuple[str, ...]:
-    """Return the cells of a parameter for people: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
+    """Return the printed cells of a parameter: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
     factor, unit = for_people(spread.unit)
     if not spread.count:
         return spread.name, 'held', '', '', unit, '', ''

@@ -48,14 +48,14 @@ def bags_of(path: Path) -> list[Path]:
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path looks like a recording."""
+    """Return whether a path has the form of a recording."""
     if not path.is_dir():
         return path.suffix in (*suffixes(), '.bag')
     return (path / 'metadata.yaml').exists() or any(inner.suffix in suffixes() for inner in path.iterdir())
 
 
 def unit_of(name: str, paths: Sequence[Path], choices: Choices, *, joint_names: JointNames) -> Unit:
-    """Return the Unit whose sources read the bags, without progress bars of their own."""
+    """Return the Unit with sources that read the bags without reporting progress."""
     paths = [path.resolve() for path in paths]
     sources = tuple(source_of(path, topics_of(choices), joint_names, quiet=True) for path in paths)
     return Unit(name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, kept(choices)))

@@ -1,4 +1,4 @@
-"""What the command line calls the things that errors of the core ask for."""
+"""Options of the command line for the keys of errors."""
 
 from argparse import Namespace
 

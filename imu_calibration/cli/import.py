@@ -10,14 +10,14 @@ EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --fr
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common = parser.common.add_argument
-    parser.add_argument('file', metavar='FILE', help='what the other program wrote')
+    parser.add_argument('file', metavar='FILE', help='file of the other program')
     common('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
     common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
     common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
 
 
 def run(options: Namespace) -> VerbResult:
-    """Read, write, and say what is not known."""
+    """Read, write, and list the parameters that the file lacks."""
     from imu_calibration.calibration.status import HELD
     from imu_calibration.use_cases.exporting import import_calibration
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)

@@ -1,4 +1,4 @@
-"""``imu_calibration inspect``: what a recording holds, what looks wrong with it, and what it can determine."""
+"""``imu_calibration inspect``: topics of a recording, suspicious properties, and the parameters that it determines."""
 
 from argparse import Namespace
 from dataclasses import asdict
@@ -21,7 +21,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Namespace) -> VerbResult:
-    """Read each Imu topic through and print what it is like; with the table also the motions and what they determine."""
+    """Read each Imu topic and print its properties; with a table also the motions and the parameters that they determine."""
     from imu_calibration.cli.show import console, show_findings
     from imu_calibration.preflight.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
@@ -46,7 +46,7 @@ def run(options: Namespace) -> VerbResult:
         codes.append(max(look.exit_code, _judge(out, look, hints_of(options))))
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints_of(options))
-    if set(codes) == {1}:   # nothing is usable: told on standard error too, as every refusal
+    if set(codes) == {1}:   # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
     return VerbResult(3 if any(codes) else 0, {'topics': [asdict(topic) for topic in looks[0].recording.topics],
                                             'imu': [_document(look) for look in looks]})
@@ -67,7 +67,7 @@ def _document(look):
 
 
 def _show_topics(out, looks):
-    """Print the topics; those that are read come with what their stamps say."""
+    """Print the topics; for the topics that are read also rate, gaps and step of the stamps."""
     from rich.table import Table
     used = {getattr(look.recording, attribute): look.streams.get(name) for look in looks for attribute, name in TOPICS
             if getattr(look.recording, attribute)}

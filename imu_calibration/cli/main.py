@@ -15,7 +15,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code (see `parser.EXIT_CODES`)."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    with contextlib.suppress(ValueError):   # in the main thread alone: partial results are then removed as after Ctrl+C
+    with contextlib.suppress(ValueError):   # only in the main thread: partial results are then removed as after Ctrl+C
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from imu_calibration.cli.parser import make_parser
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: Namespace) -> int:
-    """Run the verb that was parsed and print its document where --json asks for it; return the exit code."""
+    """Run the verb that was parsed and print its document if --json is given; return the exit code."""
     from imu_calibration.cli.hints import hints_of
     from imu_calibration.errors import ImuCalibrationError, printable
     from imu_calibration.progress import listening

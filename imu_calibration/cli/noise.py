@@ -42,7 +42,7 @@ def run(options: Namespace) -> VerbResult:
 
 
 def _show(found, rates, folder, names):
-    """Print the figures, what to know about them, and what filters ask for, in 80 columns."""
+    """Print the figures, their remarks, and the figures for filters, in 80 columns."""
     from imu_calibration.allan import summary
     for head, rows in groupby(summary.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
         print(head)

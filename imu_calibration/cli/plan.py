@@ -22,7 +22,7 @@ def add_arguments(parser: OneLineParser) -> None:
     add_stand_arguments(parser, 'with limits')
     common('--by-hand', action='store_true', help='without a table: poses and turns in text and pictures')
     common('--calibration', '--known', metavar='FILE', help='known already: calibration.yaml or .accumulator.npz')
-    common('--around', metavar='NAME=DEG,...', default='', help='pose near which the motion stays, every joint (sliding: m)')
+    common('--around', metavar='NAME=DEG,...', default='', help='pose that the motion keeps near, every joint (sliding: m)')
     common('--reach', metavar='DEG', type=float, help='largest angle from that pose; sliding joints do not move')
     expert('--motion', choices=('any', 'yaw-only'), default='any', help='yaw-only: turns by known angles about the vertical')
     expert('--separate', metavar='A,B', default='', help='separate these effects; the first is in --calibration')
@@ -37,12 +37,12 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--reference-model', metavar='MODEL', help='default table_tilt')
     add_effects_argument(parser.expert)
     expert('--storage', choices=identifiers(), default='sqlite3', help='of the trajectory, default sqlite3')
-    expert('--no-bound', action='store_true', help='no lower bound on the time (it takes longest)')
+    expert('--no-bound', action='store_true', help='no lower bound on the time (saves most of the run time)')
     expert('--no-report', action='store_true', help='no report.html')
 
 
 def run(options: Namespace) -> VerbResult:
-    """Plan into a folder that can be written, print what it promises, return the exit code."""
+    """Plan into a folder that can be written, print the prediction, return the exit code."""
     if options.by_hand and options.motion == 'any':
         return _run_by_hand(options)
     stand = _stand(options)

@@ -1,4 +1,4 @@
-"""What the verbs print: short tables on standard output."""
+"""Short tables that the verbs print on standard output."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from imu_calibration.use_cases.calibrate import Calibrated
 
 
 def console() -> Any:
-    """Return a console on standard output that keeps lines whole when it is not a terminal."""
+    """Return a console on standard output that does not break lines where it is no terminal."""
     import sys
 
     from rich.console import Console
@@ -20,7 +20,7 @@ def console() -> Any:
 
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
-    """Print what looks wrong with a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
+    """Print the warnings about a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
     import sys
     for item in found:
         print(f'warning: {printable(item["text"])}', file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``imu_calibration simulate``: a bag from a simulated session, and the truth beside it."""
+"""``imu_calibration simulate``: a bag of a simulated session, with the true parameters."""
 
 from argparse import Namespace
 

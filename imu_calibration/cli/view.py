@@ -23,7 +23,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Namespace) -> VerbResult:
-    """Write the file, say how it is opened and what it lacks; return the exit code."""
+    """Write the file, print the layout to open it with and the missing parts; return the exit code."""
     from imu_calibration.resources import config_file
     from imu_calibration.use_cases.foxglove_file import foxglove
     from imu_calibration.use_cases.view import view

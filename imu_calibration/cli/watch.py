@@ -9,7 +9,7 @@ from imu_calibration.errors import InputError, printable
 
 EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
-"""Seconds without a word after which the node is gone."""
+"""Seconds without a message after which the node counts as ended."""
 PERIOD = 0.25
 
 
@@ -18,11 +18,11 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     common('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
     common('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
-    common('--once', action='store_true', help='show what there is, and end')
+    common('--once', action='store_true', help='show the present status and end')
 
 
 def run(options: Namespace) -> VerbResult:
-    """Show what the node says until it ends."""
+    """Show the status of the node until it ends."""
     try:
         import rclpy
     except ImportError as error:
@@ -111,6 +111,6 @@ class NodeWatcher:
             self._executor.spin_once(timeout_sec=left)
 
     def screen(self) -> Any:
-        """Return what is shown now."""
+        """Return the present screen."""
         from imu_calibration.cli.watch_screen import screen
         return screen(self.name, self.statuses, self.picture)
