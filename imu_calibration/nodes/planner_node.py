@@ -82,7 +82,9 @@ class PlannerNode(Node):
         self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
                                            settings.reference_model or None, tolerances,
                                            noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
-        self._lock, self._stamp, self._documents, self._told = threading.RLock(), 0.0, [], {}
+        self._lock, self._stamp, self._told = threading.RLock(), 0.0, {}
+        self._newest: str | None = None
+        self._n_documents = 0
         self._is_halted = False
         self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
         self._names = tuple(self._table.joint_names)
@@ -174,7 +176,7 @@ class PlannerNode(Node):
 
     def _document(self, message: String) -> None:
         with self._heard:
-            self._documents.append(message.data)
+            self._newest, self._n_documents = message.data, self._n_documents + 1
             self._heard.notify_all()
 
     def _diagnostic(self, message: DiagnosticArray) -> None:
@@ -229,7 +231,7 @@ class PlannerNode(Node):
 
     def _latest(self) -> Calibration | None:
         with self._heard:
-            text = self._documents[-1] if self._documents else None
+            text = self._newest
         return None if text is None else calibration_from_text(text)
 
     def _ask(self, what: str) -> Trigger.Response | None:
@@ -239,7 +241,7 @@ class PlannerNode(Node):
         return future.result() if done.wait(ANSWER_PATIENCE) else None
 
     def _measure(self) -> Calibration | None:
-        known = len(self._documents)
+        known = self._n_documents
         answer = self._ask('solve')
         if answer is None:
             raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
@@ -248,7 +250,7 @@ class PlannerNode(Node):
             self._say(INFO, f'no calibration yet: {answer.message}')
             return None
         with self._heard:
-            self._heard.wait_for(lambda: len(self._documents) > known, timeout=2.0)
+            self._heard.wait_for(lambda: self._n_documents > known, timeout=2.0)
         return self._latest()
 
     def _diagnose(self) -> list[Suspect] | None:
