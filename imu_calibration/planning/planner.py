@@ -191,10 +191,11 @@ class Planner:
         if with_bound and isinstance(goal, WithinTolerances):
             windows, _, seconds = situation.timed(sequence, place)
             factor = situation.variance_factor(windows, self.known)
-            bound = situation.lower_bound(self.known, factor=factor)
+            relaxed = situation.relaxation(self.known, factor=factor)
+            bound = situation.lower_bound(self.known, factor=factor, relaxed=relaxed)
             if seconds > WORTH * bound:   # what limits the relaxed plan counts more: a second attempt
-                weights = situation.relaxation(self.known, factor=factor).weights
-                situation.goal = WithinTolerances(situation.coordinates, np.maximum(weights / weights.max(), LEAST_WEIGHT))
+                weights = np.maximum(relaxed.weights / relaxed.weights.max(), LEAST_WEIGHT)
+                situation.goal = WithinTolerances(situation.coordinates, weights)
                 other = self._sequence(place, first, progress=None, longest=longest)
                 situation.goal = goal
                 windows, _, less = situation.timed(other, place)

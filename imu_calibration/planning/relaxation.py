@@ -68,14 +68,14 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
         Rows e_i: parameters in tolerances.
 
     """
+    weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
-        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0, np.full(len(asked), 1.0 / len(asked)))
+        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0, weights)
     if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
-        return Relaxation(np.nan, np.full(len(seconds), np.nan), np.full_like(known, np.nan), np.nan, np.full(len(asked), 1.0 / len(asked)))
+        return Relaxation(np.nan, np.full(len(seconds), np.nan), np.full_like(known, np.nan), np.nan, weights)
     kept = np.arange(len(seconds))
     flat = information.reshape(len(seconds), -1)
     share = np.full(len(seconds), 1.0 / len(seconds)) / seconds
-    weights = np.full(len(asked), 1.0 / len(asked))
     best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf, weights)
     for number in range(rounds):
         total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)

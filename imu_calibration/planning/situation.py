@@ -133,10 +133,10 @@ class Situation:
         ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest, weighted by its samples. Where something is
         known, the noise was estimated from the rests of a whole session already. Causes to be told apart have a chance in their goal.
         """
-        counts = np.array([window.samples for window in windows if window.kind == 'static'])
-        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if known is None else LEAST_RESTS)
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
+        counts = np.array([window.samples for window in windows if window.kind == 'static'])
+        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if known is None else LEAST_RESTS)
         return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
 
     def least_session(self) -> float:
@@ -145,17 +145,18 @@ class Situation:
         away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
         return float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf)) if len(rests) > 1 else 0.0
 
-    def lower_bound(self, known: np.ndarray | None = None, *, factor: float = 1.0) -> float:
+    def lower_bound(self, known: np.ndarray | None = None, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
-        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s; else NaN.
+        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s.
 
-        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is out of reach.
+        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is out of reach. `relaxed` is the relaxation
+        for the same arguments where it is available already.
 
         With nothing known of the biases, a share of their wander is common to a whole session no longer than T, which keeps their
         parameters from being known better however much is measured: every plan takes at least ``min(T, value(T))``, the value that of the
         relaxation for sessions of T. The best T is looked for; without any T the share is zero.
         """
-        best = self.relaxation(known, factor=factor).seconds
+        best = (relaxed or self.relaxation(known, factor=factor)).seconds
         if known is not None or not np.isfinite(best):
             return best
         floor = self._bias_floor(factor)
@@ -174,13 +175,13 @@ class Situation:
     def _bias_floor(self, factor: float) -> float:
         """Return how long the biases alone must be observed, whatever else is known, s; infinite where they are out of reach."""
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
+        lengths = np.geomspace(0.01, LONGEST, 2000)
         for sensor in SENSORS:
-            for parameter in range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names))):
+            for k, parameter in enumerate(range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names)))):
                 prior = coordinates.prior_sd[parameter]**2
                 wanted = coordinates.tolerances[parameter]**2
                 room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
-                lengths, axis = np.geomspace(0.01, LONGEST, 2000), (parameter - model.part(sensor, Role.OFFSET).start) % 3
-                white = factor * self.noise[sensor].low_variance[axis] / self.rate
+                white = factor * self.noise[sensor].low_variance[k % 3] / self.rate
                 enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
                 floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf)
         return floor
