@@ -27,6 +27,7 @@ from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.compensator_view import CompensatorFoxglove, CompensatorView
 from imu_calibration.nodes.complaints import ERROR, Complaints
+from imu_calibration.nodes.guarded import guarded
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
@@ -145,16 +146,13 @@ class CompensatorNode(Node):
             self._publisher.publish(converted)
 
     def _guarded(self, callback: Callable) -> Callable:
-        """Return a callback that tells what goes wrong instead of ending the node."""
-        def call(*arguments: Any) -> None:
-            try:
-                callback(*arguments)
-            except Exception as error:
-                if not self.context.ok():   # the node is ending, and nothing can be published any more
-                    return
-                self.complaints.event('what came could not be used, the node goes on as before: '
-                                      + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
-        return call
+        """Return a callback whose exceptions are printed instead of ending the node."""
+        return guarded(callback, self._failed)
+
+    def _failed(self, error: Exception) -> None:
+        if self.context.ok():   # otherwise the node is ending, and nothing can be published any more
+            self.complaints.event('what came could not be used, the node goes on as before: '
+                                  + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
 
     def _on_document(self, message: String) -> None:
         self.documents.look()

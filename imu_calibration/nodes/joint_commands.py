@@ -13,6 +13,7 @@ from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.errors import InputError
+from imu_calibration.nodes.guarded import guarded
 from imu_calibration.nodes.qos import output_qos
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from msg_adapters.joint_trajectory import encode_trajectory
@@ -110,12 +111,7 @@ class ActionCommand:
 
     def _guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
         """Return a callback of a future whose exceptions count as a refusal: in an executor they would end the node."""
-        def call(future: Any) -> None:
-            try:
-                callback(future)
-            except Exception as error:
-                self._refused(f'{type(error).__name__}: {error}')
-        return call
+        return guarded(callback, lambda error: self._refused(f'{type(error).__name__}: {error}'))
 
     def _ended(self, number: int, result: Any) -> None:
         if number != self._number:

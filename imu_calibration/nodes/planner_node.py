@@ -33,6 +33,7 @@ from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.guarded import guarded
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, watch_inputs
 from imu_calibration.nodes.joint_commands import make_command
@@ -195,12 +196,7 @@ class PlannerNode(Node):
 
     def _guarded(self, callback: Callable) -> Callable:
         """Return a callback whose exceptions stop the joints instead of ending the node."""
-        def call(*arguments: Any) -> None:
-            try:
-                callback(*arguments)
-            except Exception as error:
-                self._failed(error)
-        return call
+        return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> str:
         if not self.context.ok():   # the node is ending
