@@ -28,6 +28,11 @@ SHOWN = 3
 """Other topics that are named at most."""
 
 
+def node_of(endpoint: Any) -> str:
+    """Return the full name of the node of a TopicEndpointInfo."""
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
+
 class MatchedInput:
     """
     A subscription as reliable as the publishers of its topic.
@@ -79,25 +84,27 @@ class MatchedInput:
 
     def look(self) -> None:
         """Note who publishes, and subscribe anew when that asks for another reliability."""
-        known = self.node.get_publishers_info_by_topic(self.topic_name)
+        several, known = self.mixed, self.node.get_publishers_info_by_topic(self.topic_name)
         self.publishers = [found for found in known if found.topic_type == self.type_name]
         self.others = [found for found in known if found.topic_type != self.type_name]
-        several, self.mixed = self.mixed, len(self.publishers) > 1
         reliable = self._latched or all(found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for found in self.publishers)
         if reliable != self.reliable or (self._latched and several and not self.mixed):   # the last message of the one that remains
             before, self.reliable = self.subscription, reliable
             self.subscription = self._subscribe()
             self.node.destroy_subscription(before)
-        self._several_since = None if len(self.publishers) < 2 else self._several_since or time.monotonic()
+        self._several_since = (self._several_since or time.monotonic()) if self.mixed else None
 
-    mixed = False
-    """Whether several publishers send on the topic at present."""
     others: list = []
     """Publishers of another type on the topic."""
 
+    @property
+    def mixed(self) -> bool:
+        """Whether several publishers sent on the topic at the last `look`."""
+        return len(self.publishers) > 1
+
     def names(self) -> list[str]:
         """Return the full names of the nodes that publish."""
-        return [f'{found.node_namespace.rstrip("/")}/{found.node_name}' for found in self.publishers]
+        return [node_of(found) for found in self.publishers]
 
     def faults(self) -> list[str]:
         """Return what is wrong with the topic, a line each."""

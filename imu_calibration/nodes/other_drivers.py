@@ -6,6 +6,7 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 
+from imu_calibration.nodes.inputs import node_of
 from imu_calibration.nodes.joint_commands import ActionCommand, TopicCommand
 
 _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
@@ -13,7 +14,7 @@ _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.S
 
 class OtherDrivers:
     """
-    Watches who else commands the joints.
+    Finds other publishers and action clients that command the joints.
 
     Parameters
     ----------
@@ -34,14 +35,14 @@ class OtherDrivers:
 
     def found(self) -> str:
         """Return a line that names the other driver, '' for none."""
-        topic, own = self._command.topic_name, (self._node.get_name(), self._node.get_namespace())
-        names = [(each.node_name, each.node_namespace) for each in self._node.get_publishers_info_by_topic(topic)]
+        topic, own = self._command.topic_name, self._node.get_fully_qualified_name()
+        names = sorted(map(node_of, self._node.get_publishers_info_by_topic(topic)))
         if own in names:
             names.remove(own)
         if names:
-            listed = ', '.join(sorted(f'{space.rstrip("/")}/{name}' for name, space in names))
-            return f'{topic} must have no other publisher, there is {listed}; stop it (after a crash its name remains for half a minute)'
-        # The last status of a controller that has ended says nothing.
+            return (f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after a crash its name remains for half '
+                    'a minute)')
+        # The last status of a controller that has ended is not valid any more.
         if self._active - self._command.goals and self._node.count_publishers(self._status.topic_name):
             return (f'{self._command.action_name} must have no active goal, another client has one; wait until it has ended, or cancel it')
         return ''
