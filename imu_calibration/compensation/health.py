@@ -36,8 +36,6 @@ class HealthWord(StrEnum):
     """The bias of the gyroscope has moved, and an update takes it off."""
     HARMS = 'harms'
     """At rest, readings are farther from the truth with the calibration than without."""
-
-
     UNIT = 'unit'
     """The specific force at rest is that of another unit."""
 

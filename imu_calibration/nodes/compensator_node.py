@@ -85,13 +85,13 @@ class CompensatorNode(Node):
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
-        if (path := self.settings.calibration_file) and not files.user_path(path).exists():
+        if self.settings.calibration_file and not (path := files.user_path(self.settings.calibration_file)).exists():
             if not self.settings.wait_for_file:
-                raise InputError(f"parameter 'calibration_file' must name an existing file, {files.user_path(path)} is missing; correct "
+                raise InputError(f"parameter 'calibration_file' must name an existing file, {path} is missing; correct "
                                  'it, or wait for it with wait_for_file:=true')
             self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
-            self.get_logger().info(f'waits for the file {files.user_path(path)}')
-        elif path:
+            self.get_logger().info(f'waits for the file {path}')
+        elif self.settings.calibration_file:
             self._try("parameter 'calibration_file'", self._load_file, self.settings)
         else:
             self.get_logger().info(f'waiting for a calibration on {self.documents.topic_name}' if self.settings.takes_topic else
@@ -162,16 +162,13 @@ class CompensatorNode(Node):
             return
         self._heard = message.data
         if self.settings.takes_topic:
-            source = f'topic {self.documents.topic_name}'
-            self._try(source, self._adopt, message.data, source, self.settings)
+            self._try(self._topic, self._take_topic, self.settings)
         else:
             self.complaints.event(f"a calibration came on {self.documents.topic_name} and is not taken: parameter 'adopt' is "
                                   f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'")
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
-        if source.startswith('topic') and version_of(text) == self._harmful:
-            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again')
         adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
         self._put_in_force(adopted)
         if adopted.says_more_than(self._told):
@@ -205,6 +202,15 @@ class CompensatorNode(Node):
         self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
         self.diagnostics.publish_now()
 
+    @property
+    def _topic(self) -> str:
+        return f'topic {self.documents.topic_name}'
+
+    def _take_topic(self, settings: CompensatorSettings) -> None:
+        if version_of(self._heard) == self._harmful:
+            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again')
+        self._adopt(self._heard, self._topic, settings)
+
     def _load_file(self, settings: CompensatorSettings) -> None:
         path = files.user_path(settings.calibration_file)
         self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
@@ -235,8 +241,7 @@ class CompensatorNode(Node):
 
     def _retry(self) -> None:
         if self.settings.takes_topic and self._heard:
-            source = f'topic {self.documents.topic_name}'
-            self._try(source, self._adopt, self._heard, source, self.settings)
+            self._try(self._topic, self._take_topic, self.settings)
         elif self.settings.calibration_file:
             self._try("parameter 'calibration_file'", self._load_file, self.settings)
 
@@ -254,7 +259,7 @@ class CompensatorNode(Node):
         if settings.calibration_file and insists and not settings.takes_topic:
             self._load_file(settings)
         elif settings.takes_topic and self._heard and (insists or not old.takes_topic):
-            self._adopt(self._heard, f'topic {self.documents.topic_name}', settings)
+            self._take_topic(settings)
         elif self.adopted is not None:
             self._put_in_force(again(self.adopted, settings, self._frames))
         if settings.covariance_rate != old.covariance_rate:
