@@ -252,9 +252,6 @@ class TimedDerivative:
             self.alpha = tuple((-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist())
         return self.alpha
 
-    def rebase(self, stamp_ns: int) -> None:
-        """Keep the window as it is: its times are the stamps."""
-
     def seed(self, other: 'TimedDerivative') -> None:
         """Take over the past of another derivative of the same stream."""
         self._stamps, self._values, self.alpha = other._stamps.copy(), other._values.copy(), other.alpha

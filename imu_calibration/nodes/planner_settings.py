@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.constants import DEG
 from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.settings import setting
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -40,6 +39,6 @@ class PlannerNodeSettings:
 
 
 def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: PlannerNodeSettings) -> MotionLimits:
-    """Return the limits of the joints with what `max_turns` and `reach_deg` leave of them about a position."""
+    """Return the limits of the joints restricted by `max_turns` and `reach_deg` about a position."""
     limits = limits.wound(position, settings.max_turns)
-    return limits.around(position, np.where(limits.turns, settings.reach_deg * DEG, 0.0)) if settings.reach_deg else limits
+    return limits.reached(position, settings.reach_deg) if settings.reach_deg else limits

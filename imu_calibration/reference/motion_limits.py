@@ -15,8 +15,8 @@ USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
 """Speed and acceleration of joints that turn, and of those that slide, whose description says nothing: rad/s, rad/s^2; m/s, m/s^2."""
 NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
 """Stated wherever a plan is printed, saved or driven."""
-DEFAULT = 'default'
-"""Origin of a limit that no description gives."""
+DEFAULT, ROBOT, TABLE = 'default', 'robot description', 'table file'
+"""Origins of limits; default: no description gives it."""
 RADIANS = 2 * np.pi
 """A range in degrees whose ends are smaller than this looks like radians."""
 WIDEST = 20 * np.pi
@@ -73,6 +73,10 @@ class MotionLimits:
                              'outside; choose another pose')
         return replace(self, lower=lower, upper=upper)
 
+    def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
+        """Return the limits with joints that turn restricted to so many degrees to either side of a position; joints that slide stay."""
+        return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
+
     def hold(self, position: np.ndarray, margin: float = 1e-9) -> bool:
         """Whether every position, shape (..., n_joints), lies within the range."""
         return bool(np.all(position >= self.lower - margin) and np.all(position <= self.upper + margin))
@@ -119,7 +123,7 @@ def limits_of(table: Table) -> MotionLimits:
 
 
 def _origin(joint: Joint, name: str) -> str:
-    where = 'robot description' if name in joint.limits.described else 'table file'
+    where = ROBOT if name in joint.limits.described else TABLE
     return where if joint.mimic is None else f'{where}, joint {joint.name}'
 
 
@@ -128,7 +132,7 @@ def missing_ranges(table: Table) -> tuple[str, ...]:
     limits = limits_of(table)
     wide = limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > WIDEST)
     return tuple(name for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
-                 if origin[0] == DEFAULT or (is_wide and 'robot' in origin[0]))
+                 if origin[0] == DEFAULT or (is_wide and origin[0].startswith(ROBOT)))
 
 
 def range_warnings(table: Table) -> list[str]:

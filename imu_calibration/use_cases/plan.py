@@ -177,7 +177,7 @@ def _neighbourhood(limits, names, around, reach):
         raise InputError(f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
                          f'and {", ".join(around) or "no joint"}; give both')
     position = np.where(limits.turns, DEG, 1.0) * [around[name] for name in names]
-    return limits.around(position, np.where(limits.turns, reach * DEG, 0.0)), position
+    return limits.reached(position, reach), position
 
 
 def _known(calibration, table, options):

@@ -40,6 +40,9 @@ def test_a_joint_has_a_range_or_is_endless_or_is_listed():
     assert missing_ranges(table_from_urdf(degrees, 'imu_link')) == ('pan',)
     unlimited = SIX_AXES.replace('lower="-2.9" upper="2.9"', '', 1)
     assert missing_ranges(table_from_urdf(unlimited, 'imu_link')) == ('pan',)
+    wide = {'name': 'robot', 'axis': [1, 0, 0], 'mimic': {'joint': 'outer'}, 'range_deg': [-3600, 3600]}
+    follower = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, wide], 'gravity': 9.81})
+    assert missing_ranges(follower) == ()   # the table file gives this range, whatever the joint is called
 
 
 def test_a_site_overrides_what_a_robot_description_says_of_the_range():
