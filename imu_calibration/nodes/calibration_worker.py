@@ -1,7 +1,7 @@
 """
-The thread behind calibration_node: takes what arrived, solves when it is due, saves; the node's own thread only listens.
+The worker thread of calibration_node: it processes received messages, solves at intervals and saves; the main thread only receives.
 
-Somewhat above 300 lines, because what one thread does to one session is read in one place.
+The file has all steps of this thread, in their order.
 """
 
 import os
@@ -28,16 +28,16 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 from msg_adapters.live import LiveGatherer
 
 PERIOD = 0.1
-"""Seconds between two looks at what arrived."""
+"""Interval at which received messages are processed, s."""
 IDLE = 3.0
-"""Seconds without messages after which the windows that are still open count as well."""
+"""Seconds without messages after which open windows are included in a solution."""
 
 
 class CalibrationWorker(threading.Thread):
     """
     Runs a session.
 
-    Whatever fails is told and left out, and the session goes on: nothing that a message, a solution or a disk does ends it.
+    A step that fails is reported and skipped, and the session continues: no error of a message, a solution or a disk ends it.
 
     Parameters
     ----------
@@ -45,10 +45,10 @@ class CalibrationWorker(threading.Thread):
         Where messages are added by another thread.
     live : LiveSession
     make_live : callable
-        Returns a new one, for a reset.
+        Returns a new LiveSession, for a reset.
     place : SessionFiles
     autosave_period : float
-        Seconds between two savings of the accumulator; 0: only when asked.
+        Interval at which the accumulator is saved, s; 0: on request only.
     listeners : Listeners
     hints : dict, optional
         As for `errors.with_hint`.
@@ -77,7 +77,7 @@ class CalibrationWorker(threading.Thread):
 
     @property
     def gathered(self) -> str:
-        """What is gathered, for people."""
+        """Name of the observations (plural)."""
         return self.live.observations
 
     @property
@@ -85,7 +85,7 @@ class CalibrationWorker(threading.Thread):
         return self.live.settings.diagnosis_period if self.live.on_table is not None else 0.0
 
     def ask(self, what: str | Callable[[], tuple[bool, str]]) -> 'Request':
-        """Ask for 'solve', 'save', 'reset' or a function to be called; return a Request whose `done` is set when the answer is there."""
+        """Queue 'solve', 'save', 'reset' or a function; return a Request whose `done` is set when the result is available."""
         request = Request(getattr(self, f'_{what}') if isinstance(what, str) else what)
         with self._lock:
             self._asked.append(request)
@@ -93,7 +93,7 @@ class CalibrationWorker(threading.Thread):
         return request
 
     def end(self, timeout: float = 20.0) -> str:
-        """Let the thread finish what it does, keep what is not saved, and return what became of it; '' when nothing was left."""
+        """Wait for the end of the present step, save unsaved windows, and return a line about them; '' for no unsaved windows."""
         self._ending = True
         self._wake.set()
         self._diagnosis.end()
@@ -103,7 +103,7 @@ class CalibrationWorker(threading.Thread):
             self.place.keep(self.live, self.gathered)
 
     def run(self) -> None:
-        """Work until `end`."""
+        """Run the steps until `end`."""
         try:
             while not self._ending:
                 self._wake.wait(PERIOD)
@@ -118,7 +118,7 @@ class CalibrationWorker(threading.Thread):
                 request.answer(False, 'the node is ending')
 
     def _survive(self, step: Callable[[], None]) -> None:
-        """Do one step; what goes wrong in it is told until it goes well again."""
+        """Run one step; its error is reported until it succeeds again."""
         name = step.__name__.strip('_')
         try:
             step()
@@ -133,7 +133,7 @@ class CalibrationWorker(threading.Thread):
         self._faults[name] = line
 
     def _take(self) -> None:
-        # Silence is judged by when the thread last looked: what came while it made a solution waits for the next look.
+        # Silence is measured from the last call: messages that arrived during a solution are processed in the next one.
         self._looked = time.monotonic()
         block = self.gatherer.flush()
         self._watch.note(block, self._looked)
@@ -154,9 +154,9 @@ class CalibrationWorker(threading.Thread):
                 success, message = request.action()
             except ImuCalibrationError as error:
                 success, message = False, error.told(self.hints)
-            except Exception as error:   # who asked gets an answer whatever happens
+            except Exception as error:   # every request gets a result
                 success, message = False, shortened(f'{type(error).__name__}: {error}', 300)
-            self._survive(self._tell)   # who asked looks at the diagnostics next
+            self._survive(self._tell)   # the requester reads the diagnostics next
             request.answer(success, message)
 
     def _solve_when_due(self) -> None:
@@ -185,12 +185,12 @@ class CalibrationWorker(threading.Thread):
             self._publish_solution(pending=self._closed)
 
     def _adopt(self) -> bool:
-        """Take the last answer of the diagnosis into the model; return whether anything changes."""
+        """Apply the last result of the diagnosis to the model; return whether the model changes."""
         demand, session = self._diagnosis.take_demand(), self.live.on_table
         return demand is not None and session is not None and session.adopt(demand)
 
     def _settled_solution(self) -> tuple[CalibrationResult, str]:
-        """Publish the solution of everything so far, with what it demands of the model: what `calibrate` makes of the same messages."""
+        """Publish the solution of all messages with the model that the diagnosis requires: the result of `calibrate` for these messages."""
         published = self._publish_solution(pending=True)
         if not self._diagnosis_period:
             return published
@@ -220,8 +220,8 @@ class CalibrationWorker(threading.Thread):
             return False, "nothing is diagnosed by hand while it runs, nor where parameter 'diagnosis_period' is 0"
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return True, (f'asked what the model gets wrong on {self.live.n_windows} windows; '
-                      'the answer comes on /diagnostics, and joins the calibration')
+        return True, (f'diagnosis of {self.live.n_windows} windows started; '
+                      'its result is published on /diagnostics and in the calibration')
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
@@ -247,19 +247,19 @@ class CalibrationWorker(threading.Thread):
             'the last calibration stays published until there is another one'
 
     def change_settings(self, settings: LiveSettings) -> tuple[bool, str]:
-        """Solve, keep and tell as often as other LiveSettings say."""
+        """Use the intervals of other LiveSettings."""
         self.live.settings = settings
         self._pacer = SolvePacer(settings.solve_share)
         self._diagnosis.change(self._diagnosis_period)
         return True, ''
 
     def change_windows(self, windows: WindowSettings) -> tuple[bool, str]:
-        """Find windows by other WindowSettings from now on."""
+        """Use other WindowSettings for windows from now on."""
         self.live.change_windows(windows)
         return True, ''
 
     def change_by_hand(self, by_hand: LiveByHandSettings) -> tuple[bool, str]:
-        """Take other LiveByHandSettings; another gravity changes the solution at once."""
+        """Use other LiveByHandSettings; another gravity changes the solution at once."""
         self.live.change_by_hand(by_hand)
         self._new_windows = self.live.n_windows > 0
         return True, ''
@@ -278,7 +278,7 @@ class CalibrationWorker(threading.Thread):
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
                   f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
-            lines = [*lines, 'an effect has moved too far from where it was linearised and the stored windows are gone: '
+            lines = [*lines, 'an effect is too far from its point of linearisation and the stored windows are not available any more: '
                      'calibrate the recording offline']
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
         groups = self.live.groups() if stale else self.state.groups
@@ -289,7 +289,7 @@ class CalibrationWorker(threading.Thread):
                                  str(self.place.calibration), judged, complete)
 
     def _cover(self) -> None:
-        """Make the picture anew when there is something new in it."""
+        """Update the picture of the coverage after a change."""
         seen = (id(self.live), self.live.n_windows if self.live.on_table is None else 0, self._n_solutions)
         if seen != self._covered:
             self._covered = seen

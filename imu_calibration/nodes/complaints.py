@@ -1,7 +1,7 @@
 """
-What is wrong, on the terminal: said when it begins, now and then while it lasts, and when it is over.
+Faults on the terminal: logged at their start, at intervals while they last, and at their end.
 
-Each thing by a clock of its own.
+Each kind of fault has a separate interval.
 """
 
 import re
@@ -13,15 +13,15 @@ from imu_calibration.errors import printable
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
 REMINDER = 60.0
-"""Seconds after which what still holds is said again."""
+"""Interval at which a lasting fault is logged again, s."""
 PATIENCE = 10.0
-"""What comes and goes is not said more often than after so many seconds."""
+"""Least interval between two lines about an intermittent fault, s."""
 MOST_KINDS = 1000
-"""Things that are remembered as said; whatever comes, memory stays bounded."""
+"""Largest number of kinds whose last time is stored: it bounds the memory."""
 
 
 def say(logger: Any, level: str, line: str) -> None:
-    """Log a line without control characters; rclpy ties a place in the code to one severity, so each has a separate place."""
+    """Log a line without control characters; one call per severity, because rclpy allows one severity per line of code."""
     line = printable(line)
     if level == ERROR:
         logger.error(line)
@@ -35,8 +35,8 @@ class Complaints:
     """
     Logs lines for a node.
 
-    Two lines are about the same thing when they differ in their numbers only, or stand behind the same ``subject: ``, where the subject
-    ends with a topic in brackets (see `kind_of`).
+    Two lines are of the same kind when they differ in their numbers only, or have the same ``subject: ``, where the subject ends with a
+    topic in brackets (see `kind_of`).
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Complaints:
         self._open: dict[str, str] = {}
 
     def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = PATIENCE) -> None:
-        """Take all present faults of `source`; a fault that it no longer has is over, and is repeated at most every `patience` seconds."""
+        """Log the present faults of `source` and the end of earlier ones; an ended one is repeated after `patience` seconds at least."""
         present = {kind_of(source, line): (level, line) for level, lines in ((WARNING, warnings), (ERROR, errors)) for line in lines}
         for kind in [kind for kind in self._open if kind.startswith(source + ':') and kind not in present]:
             say(self._logger, INFO, f'over: {self._open.pop(kind)}')
@@ -62,7 +62,7 @@ class Complaints:
                 self._open[kind] = line
 
     def event(self, line: str, level: str = WARNING) -> None:
-        """Take something that happened, which has no end."""
+        """Log an event, which has no end."""
         if self._due(kind_of('', line), PATIENCE):
             say(self._logger, level, line)
 
@@ -78,6 +78,6 @@ class Complaints:
 
 
 def kind_of(source: str, line: str) -> str:
-    """Return what a line is about: what stands before ``): ``, else the line, without numbers."""
+    """Return the kind of a line: its text before ``): ``, or all of it, without numbers."""
     subject, bracket, _ = line.partition('): ')
     return source + ':' + re.sub(r'[\d.]+', '#', subject if bracket else line)

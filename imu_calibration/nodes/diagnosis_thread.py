@@ -1,4 +1,4 @@
-"""The thread that asks what the model gets wrong: it takes long, so neither the topics nor the solutions wait for it."""
+"""The thread of the diagnosis of model errors: a diagnosis takes long, so neither the topics nor the solutions wait for it."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ from imu_calibration.diagnosis.live import FAILED, OFF, Answer, DiagnosisQuestio
 from imu_calibration.nodes.heap import return_freed_memory
 
 SHARE = 0.2
-"""Share of the time that diagnosing takes at most."""
+"""Largest share of the time for diagnoses."""
 
 
 OFF_WHY = "parameter 'diagnosis_period' is 0"
@@ -18,12 +18,12 @@ OFF_WHY = "parameter 'diagnosis_period' is 0"
 
 class DiagnosisThread:
     """
-    Answers one `DiagnosisQuestion` at a time.
+    Runs one `DiagnosisQuestion` at a time.
 
     Parameters
     ----------
     period : float
-        Seconds from one answer to the next when nobody asks; 0: never ask.
+        Interval between diagnoses without a request, s; 0: no diagnosis.
 
     """
 
@@ -37,28 +37,28 @@ class DiagnosisThread:
         self._demand: Demand | None = None
 
     def change(self, period: float) -> None:
-        """Ask as often as another period says; 0: no more."""
+        """Use another period; 0: no more diagnoses."""
         if bool(period) != bool(self.period):
             self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.period, self._next = period, time.monotonic() + period
 
     @property
     def is_running(self) -> bool:
-        """Whether a question is being answered."""
+        """Whether a diagnosis is running."""
         return self._thread is not None and self._thread.is_alive()
 
     def want(self, urgent: bool = False) -> None:
-        """Ask as soon as the share of the time allows, whatever the period; at once when it is urgent."""
+        """Request a diagnosis before the period is over, as soon as `SHARE` allows; at once when it is urgent."""
         self._wanted, self._urgent = bool(self.period), urgent and bool(self.period)
 
     def forget(self) -> None:
-        """Take back what was said: the session starts anew."""
+        """Discard all results: the session is restarted."""
         self.state, self._wanted, self._urgent = DiagnosisState() if self.period else self.state, False, False
         self._answered = self._demand = None
         self._session += 1
 
     def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
-        """Start answering `make_question()` (or None) when that is wanted, or when the period is over and there is news."""
+        """Start the diagnosis `make_question()` (None: no diagnosis) when it is requested, or when the period is over and there is news."""
         now = time.monotonic()
         due = self._urgent or ((self._wanted or (bool(self.period) and is_news and now >= self._next)) and self._pacer.due(now))
         if not due or self.is_running or self._ending:
@@ -86,12 +86,12 @@ class DiagnosisThread:
         self._pacer.note(start, end)
 
     def take_demand(self) -> Demand | None:
-        """Return what the last answer demands of the model, once."""
+        """Return the change of the model that the last diagnosis requires, once."""
         demand, self._demand = self._demand, None
         return demand
 
     def settle(self, question: DiagnosisQuestion | None) -> None:
-        """Wait until a question is answered; what was answered already, of the same windows, is not asked again."""
+        """Run a diagnosis and wait for it; one of the same windows that was completed already is not repeated."""
         self._join()
         if question is not None and self.period and not (self._answered and question.is_the_same_as(self._answered)):
             self._urgent = True
@@ -107,10 +107,10 @@ class DiagnosisThread:
             raise _Ended
 
     def end(self, timeout: float = 10.0) -> None:
-        """Let the answer be, and wait for the thread."""
+        """Cancel the diagnosis, and wait for the thread."""
         self._ending = True
         self._join(timeout)
 
 
 class _Ended(Exception):
-    """The node is being shut down, or the session has been started anew."""
+    """The node is being shut down, or the session has been restarted."""

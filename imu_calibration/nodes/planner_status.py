@@ -1,4 +1,4 @@
-"""Diagnostics of planner_node: what is driven, what remains, what is wrong."""
+"""Diagnostics of planner_node: state of the drive, parameters outside their tolerance, faults."""
 
 from imu_calibration.driving.driver import Driver, DriveState
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
@@ -8,7 +8,7 @@ _LEVELS = {DriveState.STOPPED: ERROR}
 
 
 def drive_statuses(driver: Driver, worker: PlannerWorker, commands: str, *, faults: list[str]) -> list:
-    """Return the DiagnosticStatus of the drive; `commands` names where trajectories go, `faults` are lines about the inputs."""
+    """Return the DiagnosticStatus of the drive; `commands`: topic or action of the trajectories, `faults`: lines about the inputs."""
     name, excess = worker.worst
     values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
               'it takes [s]': f'{worker.seconds:.1f}', 'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside,
