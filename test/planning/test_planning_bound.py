@@ -17,7 +17,7 @@ from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.simulation.sensor_noise import GRADES
 
 from worlds.random_tables import random_table
-from worlds.stands import stand
+from worlds.stands import quarter_tolerances, stand
 
 
 def situation(seed=3, grade='tactical', share=0.2):
@@ -85,15 +85,8 @@ def test_the_least_variance_of_a_bias_beside_white_noise_is_that_of_the_dense_co
 
 def test_the_bound_counts_the_white_noise_beside_a_wandering_bias():
     """At a quarter of the default tolerances it was 53 s where the plan took 91 s."""
-    planner = make_planner(stand('three axes'), noise=noise_of_grade(GRADES['industrial'].noise, 100.0), tolerances=quarter(stand('three axes')))
+    table = stand('three axes')
+    planner = make_planner(table, noise=noise_of_grade(GRADES['industrial'].noise, 100.0), tolerances=quarter_tolerances(table))
     plan = planner.plan()
     assert plan.missing == () and plan.lower_bound_seconds <= plan.seconds <= 1.25 * plan.lower_bound_seconds
     assert planner.situation.lower_bound() > 75.0
-
-
-def quarter(table):
-    """A quarter of the default tolerances."""
-    found = {}
-    for effect in choose_model(CalibrationOptions(), table).effects:
-        found.setdefault(effect.sensor, {})[effect.name] = 0.25 * effect.tolerance
-    return found

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import table_from_urdf
 
@@ -22,3 +23,11 @@ def stand(name):
     axes = {'outer': [0, 0, 1], 'middle': [0, 1, 0], 'inner': [1, 0, 0]} if name == 'three axes' else {'tilt': [0, 1, 0], 'plate': [0, 0, 1]}
     return Table.from_mapping({'joints': [{'name': joint, 'axis': axis, **LIMITS} for joint, axis in axes.items()], 'gravity': 9.81,
                                'mount': {'rpy_deg': [0, 0, 0]}})
+
+
+def quarter_tolerances(table):
+    """Return {section: {effect: a quarter of its default tolerance}}."""
+    found = {}
+    for effect in choose_model(CalibrationOptions(), table).effects:
+        found.setdefault(effect.sensor, {})[effect.name] = 0.25 * effect.tolerance
+    return found
