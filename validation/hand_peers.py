@@ -25,15 +25,15 @@ def imu_tk(imu, ranges, gravity):
         if len(rests) < LEAST_RESTS:
             continue
         pieces = [slice((rest.start + rest.stop - PER_REST) // 2, (rest.start + rest.stop + PER_REST) // 2) for rest in rests]
-        sensor = fit_norm(np.array([imu.force_s[piece].mean(axis=0) for piece in pieces]), gravity)
-        cost = np.sum(sensor.norm_errors([imu.force_s[piece].mean(axis=0) for piece in pieces], gravity)**2)
-        best = (cost, sensor, pieces) if best is None or cost < best[0] else best
+        force = _means(imu, pieces)
+        sensor = fit_norm(force, gravity)
+        cost = np.sum(sensor.norm_errors(force, gravity)**2)
+        best = (cost, sensor, pieces, force) if best is None or cost < best[0] else best
     if best is None:
         return None
-    _, sensor, pieces = best
-    up = _directions(sensor, imu, pieces)
+    _, sensor, pieces, force = best
     turns = [(np.diff(time[a.stop:b.start]), imu.rate_s[a.stop:b.start]) for a, b in zip(pieces, pieces[1:])]
-    return sensor, _gyroscope(turns, up, imu.rate_s[first].mean(axis=0), loss='linear')
+    return sensor, _gyroscope(turns, sensor.directions(force), imu.rate_s[first].mean(axis=0), loss='linear')
 
 
 def imu_calib(imu, ranges, gravity):
@@ -43,17 +43,17 @@ def imu_calib(imu, ranges, gravity):
     samples = imu.force_s[np.concatenate([np.arange(rest.start, rest.stop) for rest in rests])]
     sensor = fit_norm(samples, gravity, loss='soft_l1')
     turns = [(np.full(b.start - a.stop + 9, step), imu.rate_s[a.stop - 5:b.start + 5]) for a, b in zip(rests, rests[1:])]
-    return sensor, _gyroscope(turns, _directions(sensor, imu, rests), imu.rate_s[first].mean(axis=0), loss='soft_l1')
+    return sensor, _gyroscope(turns, sensor.directions(_means(imu, rests)), imu.rate_s[first].mean(axis=0), loss='soft_l1')
 
 
 def norm_fit(imu, ranges, gravity):
     """Return (accelerometer, None): scipy's fit of the length of gravity to the means of the rests that imu-calib finds."""
-    return fit_norm(np.array([imu.force_s[rest].mean(axis=0) for rest in _resting(imu, ranges[0])]), gravity), None
+    return fit_norm(_means(imu, _resting(imu, ranges[0])), gravity), None
 
 
 def six_faces(imu, ranges, gravity):
     """Return (accelerometer, None): bias and matrix by least squares from the rests nearest to the six faces, taken as exact."""
-    force = np.array([imu.force_s[held].mean(axis=0) for held in ranges])
+    force = _means(imu, ranges)
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     near = force[np.argmax(faces @ force.T, axis=1)]
     solution = np.linalg.lstsq(np.column_stack([np.ones(6), gravity * faces]), near, rcond=None)[0]
@@ -80,9 +80,9 @@ def _runs(mask):
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 
 
-def _directions(sensor, imu, rests):
-    up = np.linalg.solve(sensor.matrix, (np.array([imu.force_s[rest].mean(axis=0) for rest in rests]) - sensor.bias).T).T
-    return up / np.linalg.norm(up, axis=1, keepdims=True)
+def _means(imu, rests):
+    """Return the mean specific force of each rest, shape (n, 3)."""
+    return np.array([imu.force_s[rest].mean(axis=0) for rest in rests])
 
 
 def _gyroscope(turns, up, bias, loss):

@@ -54,8 +54,7 @@ def plain(imu, ranges, average):
     """
     force = np.array([average(imu.force_s[held], axis=0) for held in ranges])
     accelerometer = fit_norm(force, GRAVITY)
-    up = np.linalg.solve(accelerometer.matrix, (force - accelerometer.bias).T).T
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    up = accelerometer.directions(force)
     bias = np.mean([average(imu.rate_s[held], axis=0) for held in ranges], axis=0)
     step = 1e-9 * (imu.stamp_ns[-1] - imu.stamp_ns[0]) / (len(imu) - 1)
     turns = [imu.rate_s[first.stop:second.start] - bias for first, second in zip(ranges, ranges[1:])]
@@ -88,7 +87,7 @@ def errors(found, truth):
     force = rng.normal(size=(500, 3))
     for sensor, true, motion in zip(found, truth, (GRAVITY * force / np.linalg.norm(force, axis=1, keepdims=True), rng.normal(size=(500, 3)))):
         reading = motion @ true.matrix.T + true.bias
-        rms.append(np.sqrt(np.mean((np.linalg.solve(sensor.matrix, (reading - sensor.bias).T).T - motion)**2)))
+        rms.append(np.sqrt(np.mean((sensor.compensated(reading) - motion)**2)))
     return rms
 
 

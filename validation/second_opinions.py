@@ -17,16 +17,25 @@ def installed(name):
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """``measured = bias + matrix @ true`` of an accelerometer."""
+    """``measured = bias + matrix @ true`` of a sensor."""
 
     bias: np.ndarray
-    """m/s^2, shape (3,)."""
+    """m/s^2 or rad/s, shape (3,)."""
     matrix: np.ndarray
     """Shape (3, 3)."""
 
+    def compensated(self, readings):
+        """Return ``matrix^-1 @ (readings - bias)``, shape (n, 3)."""
+        return np.linalg.solve(self.matrix, (readings - self.bias).T).T
+
     def norm_errors(self, force, gravity):
         """Return ``|compensated force| - gravity`` of readings at rest, shape (n,)."""
-        return np.linalg.norm(np.linalg.solve(self.matrix, (np.asarray(force) - self.bias).T), axis=0) - gravity
+        return np.linalg.norm(self.compensated(np.asarray(force)), axis=1) - gravity
+
+    def directions(self, force):
+        """Return unit vectors along the compensated force, shape (n, 3)."""
+        up = self.compensated(force)
+        return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def fit_norm(force, gravity, cross_axis=True, loss='linear'):
