@@ -20,7 +20,7 @@ from imu_calibration.allan.document import noise_from_text
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration, calibration_from_text, checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, shortened
 from imu_calibration.reference.table import Table
 from imu_calibration.regular_files import open_regular
 
@@ -117,8 +117,8 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     try:
         return xacro.process_file(str(path)).toxml()
     except Exception as error:   # macros raise whatever their expressions do
-        said = ' '.join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {said}; correct it, or expand it '
+        reason = shortened(str(error), 200) or type(error).__name__
+        raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
                          'yourself to a .urdf', code='xacro_fails') from error
 
 

@@ -33,9 +33,11 @@ class Ros1File:
         self.counts = {}
         self.types = {}
         self.definitions = {}
+        self.topics = {}
+        """Id of a connection -> topic."""
         for connection in self.reader.connections:
-            topic, message_type = clean_name(connection.topic), clean_name(connection.msgtype)
-            self.types[topic] = message_type
+            topic = self.topics[connection.id] = clean_name(connection.topic)
+            self.types[topic] = message_type = clean_name(connection.msgtype)
             self.counts[topic] = self.counts.get(topic, 0) + connection.msgcount
             self.definitions[message_type] = ('ros2msg', connection.msgdef.data)
 
@@ -46,7 +48,7 @@ class Ros1File:
 
     def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
         """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
-        connections = [c for c in self.reader.connections if clean_name(c.topic) in topics]
+        connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
         pending, n_pending, n_read = defaultdict(list), 0, 0
         expected = sum(c.msgcount for c in connections)
         messages = self.reader.messages(connections) if connections else iter(())
@@ -58,7 +60,7 @@ class Ros1File:
             except Exception as error:   # whatever a damaged file makes rosbags raise
                 self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
                 break
-            pending[clean_name(connection.topic)].append((bytes(data), received_ns))
+            pending[self.topics[connection.id]].append((bytes(data), received_ns))
             n_pending, n_read = n_pending + 1, n_read + 1
             if n_pending == STRETCH:
                 yield _arrived(pending)

@@ -87,15 +87,19 @@ class StorageFile:
         mine, packed = stretch.pack(mine)
         if self.unpack is None:
             return mine, packed
-        messages, n_bytes = [], 0
+        kept, messages, n_bytes = [], [], 0
         for k in range(len(packed)):
-            messages.append(self._unpacked(packed.message(k)) if n_bytes < LARGEST_STRETCH else
-                            self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1))
-            n_bytes += len(messages[-1] or b'')
-        kept = np.array([message is not None for message in messages], dtype=bool)
-        return mine[kept], Packed.join([message for message in messages if message is not None])
+            message = self._unpacked(packed.message(k), n_bytes)
+            if message is not None:
+                kept.append(k)
+                messages.append(message)
+                n_bytes += len(message)
+        return mine[kept], Packed.join(messages)
 
-    def _unpacked(self, data):
+    def _unpacked(self, data, n_before):
+        """Return a decompressed message of a stretch that has `n_before` bytes already; None when it is lost."""
+        if n_before >= LARGEST_STRETCH:
+            return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
         try:
             return self.unpack(data)
         except Exception as error:   # whatever the decompressor raises on damaged data

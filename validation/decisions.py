@@ -29,6 +29,8 @@ SEEDS = range(36901, 36901 + 5)
 CLEARLY = 0.8
 """A ratio after / before below this is an improvement by more than 20 %."""
 DECISIONS = ('helps', 'unproven', 'harms', 'refused')
+SESSIONS = {'real': 'recordings of hardware', 'simulated': 'simulated sessions'}
+"""Key of the command line -> title."""
 GRAVITY = 9.81
 """Of the simulated sessions by hand, m/s^2."""
 
@@ -182,8 +184,8 @@ def run(folder, plots):
     section = Section('Decision and truth')
     section.say('Each sensor is calibrated on one session and judged on a second session, or the other half, of the same unit. Both halves of a recording and both '
                 'sensors of an IMU are counted, which are not independent.')
-    add_claims(section, 'recordings of hardware', list(real(folder)))
-    add_claims(section, 'simulated sessions', list(simulated()))
+    add_claims(section, SESSIONS['real'], list(real(folder)))
+    add_claims(section, SESSIONS['simulated'], list(simulated()))
     return section
 
 
@@ -191,7 +193,7 @@ def main():
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, nargs='*', default=list(SEEDS))
-    parser.add_argument('--only', choices=('real', 'simulated'))
+    parser.add_argument('--only', choices=SESSIONS)
     options, section = parser.parse_args(), Section('Decision and truth')
     for name, outcomes in (('real', lambda: real(data_folder())), ('simulated', lambda: simulated(options.seeds))):
         if options.only in (None, name):
@@ -199,7 +201,7 @@ def main():
             for each in outcomes():
                 print(f'{each.case}: {each.sensor} {each.decision} {each.ratio:.3f}', flush=True)
                 found.append(each)
-            add_claims(section, {'real': 'recordings of hardware', 'simulated': 'simulated sessions'}[name], found)
+            add_claims(section, SESSIONS[name], found)
     print(section.markdown())
 
 
