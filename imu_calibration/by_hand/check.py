@@ -5,9 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandData, gather_by_hand
-from imu_calibration.by_hand.equations import between_middles
-from imu_calibration.by_hand.preintegration import integrate_turn
-from imu_calibration.by_hand.proof import PER_TURN, TURNS_LEAST
+from imu_calibration.by_hand.proof import PER_TURN, TURNS_LEAST, turn_error
 from imu_calibration.by_hand.workflow import read_by_hand
 from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.document import Calibration
@@ -74,10 +72,11 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
-        missed = (np.array([[_missed(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)]
+        # the first corrected readings are NaN where they need an angular acceleration
+        errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)]
                             for turn in turns])
                   for imu in (before, after))
-        angles = _entry(*missed, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
+        angles = _entry(*errors, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
     return proof
 
@@ -90,11 +89,3 @@ def _entry(before, after, *, unit, seconds):
     """Return an entry of a proof, of errors of shape (n, components)."""
     found = compared(*((errors**2).sum(axis=1) for errors in (before, after)), np.ones(len(before)), components=before.shape[1])
     return found | {'unit': unit, 'windows': len(before), 'seconds': seconds}
-
-
-def _missed(poses, turn, rates, up):
-    """Return the angle between gravity after a turn and where these rates carry it from before, rad."""
-    known = np.isfinite(rates).all(axis=1)   # the first readings may lack an angular acceleration
-    mat_ji = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji
-    carried = between_middles(poses, turn, mat_ji) @ up[turn.first]
-    return np.arctan2(np.linalg.norm(np.cross(carried, up[turn.last])), carried @ up[turn.last])

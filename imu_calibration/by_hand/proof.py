@@ -122,12 +122,6 @@ class _Rows:
         return values
 
 
-def _turned(model, values, turn):
-    """Return the matrix of a turn, shape (3, 3), integrated from corrected rates."""
-    rates = _corrected(model, values, turn.force, turn.rate, turn.temperature_c).rate
-    return integrate_turn(turn.time, rates, bias=np.zeros(3), matrix=np.eye(3)).mat_ji
-
-
 def _entry(parts, unit):
     before, after = (np.concatenate(side) for side in zip(*parts))
     return compared(before, after, np.ones(len(before)), components=1) | {'unit': unit, 'windows': len(before)}
@@ -153,6 +147,25 @@ def _missed(model, values, poses, turns, gyroscope):
         mixed[part] = gyroscope[part]
     true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
-    carried = np.array([between_middles(poses, turn, _turned(model, mixed, turn)) @ up[turn.first] for turn in turns]).reshape(-1, 3)
-    last = up[[turn.last for turn in turns]].reshape(-1, 3)
-    return np.arctan2(np.linalg.norm(np.cross(carried, last), axis=1), (carried * last).sum(axis=1))
+    rates = [_corrected(model, mixed, turn.force, turn.rate, turn.temperature_c).rate for turn in turns]
+    return np.array([turn_error(poses, turn, rate, up) for turn, rate in zip(turns, rates, strict=True)])
+
+
+def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, up: np.ndarray) -> float:
+    """
+    Return the angle between the direction of gravity after a turn and that before it rotated by corrected rates, rad.
+
+    Parameters
+    ----------
+    poses : Poses
+    turn : TurnData
+    rates : array, shape (n, 3)
+        Corrected rates during the turn, rad/s; samples that are not finite are omitted.
+    up : array, shape (n_poses, 3)
+        Unit vector of gravity in each pose.
+
+    """
+    known = np.isfinite(rates).all(axis=1)
+    mat_ji = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji
+    rotated, last = between_middles(poses, turn, mat_ji) @ up[turn.first], up[turn.last]
+    return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))
