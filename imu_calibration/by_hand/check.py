@@ -73,7 +73,7 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
         # the first corrected readings are NaN where they need an angular acceleration
-        errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up)]
+        errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
                             for turn in turns])
                   for imu in (before, after))
         angles = _entry(*errors, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))

@@ -148,10 +148,10 @@ def _missed(model, values, poses, turns, gyroscope):
     true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
     rates = [_corrected(model, mixed, turn.force, turn.rate, turn.temperature_c).rate for turn in turns]
-    return np.array([turn_error(poses, turn, rate, up) for turn, rate in zip(turns, rates, strict=True)])
+    return np.array([turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)])
 
 
-def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, up: np.ndarray) -> float:
+def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarray) -> float:
     """
     Return the angle between the direction of gravity after a turn and that before it rotated by corrected rates, rad.
 
