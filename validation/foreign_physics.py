@@ -1,0 +1,133 @@
+"""
+Causes outside the package: twenty recordings with a place, twenty without one, forty without a cause (validation/foreign_worlds.py).
+
+Usage: `python -m validation.foreign_physics --seed N [--kinds NAME ...] [--empty N]` prints one line for each recording and the table.
+Reserved seeds: draw them once, after the search is frozen.
+"""
+
+import argparse
+import json
+import time
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.reference.table import Table
+from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.diagnose import diagnose
+
+from validation import foreign_worlds
+from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world
+from validation.section import markdown_table
+
+SAME_PLACE = 0.7
+"""F1 score of the reported and the true samples from which a place counts as correct."""
+WORSE = 1.05
+"""Largest allowed ratio of the rms errors on a second session, chosen model over bias and matrix alone."""
+SENSORS = ('accelerometer', 'gyroscope')
+KINDS = ['clock_stepped' if kind == 'accel_offset_in_outer_arc' else kind for kind in PLACED] + list(UNPLACED)
+
+
+def block_of(world):
+    """Return a world as samples."""
+    joints = JointSamples(world.joint_ns, world.angle, np.full_like(world.angle, np.nan), foreign_worlds.JOINTS)
+    return SampleBlock(ImuSamples(world.stamp_ns, world.force, world.rate, 'imu_link'), joints,
+                       TemperatureSamples(world.temperature_ns, world.temperature_c))
+
+
+def outcome(kind, unit, motion):
+    """Return the row of one recording."""
+    world, table = make_world(kind, unit, motion), Table.from_mapping(TABLE)
+    start = time.process_time()
+    found = diagnose(block_of(world), table).result.diagnosis
+    row = {'kind': kind, 'unit': unit, 'seconds': time.process_time() - start, 'findings': [finding.effect for finding in found.findings]}
+    concerned = SENSORS if world.sensor in ('both', '') else (world.sensor,)
+    rests = [found.unexplained[sensor] for sensor in concerned]
+    named = bool(world.names & set(row['findings']))
+    row['flagged'] = bool(row['findings'] if kind == 'nothing' else named) or any(rest.significant for rest in rests)
+    row['false_names'] = sorted(set(row['findings']) - world.names)
+    row['formulas'] = [str(column) for rest in found.unexplained.values() if rest.proposal for column in rest.proposal.columns]
+    reported = {axis for rest in rests for axis in rest.axes}
+    row['axes'] = sorted(reported)
+    row['axis'] = None if kind == 'nothing' or not world.axes else named or bool(reported) and reported <= world.axes
+    regimes = [regime for rest in found.unexplained.values() for regime in rest.regimes[:3]]
+    row['places'] = [regime.text for regime in regimes]
+    row['place'] = 'named' if named and world.place else _place(world, regimes)
+    if kind != 'nothing':
+        row['ratio'] = _second_session(block_of(world), table, kind, unit, motion)
+    return row
+
+
+def _place(world, regimes):
+    """Return 'correct', 'false', 'missed' or 'none' for the reported places."""
+    if not regimes:
+        return 'missed' if world.place else 'none'
+    if not world.place:
+        return 'false'
+    scores = [_f1(regime, world) for regime in regimes if regime.variable.startswith(world.place)]
+    return 'correct' if max(scores, default=0.0) >= SAME_PLACE else 'false'
+
+
+def _f1(regime, world):
+    true = np.interp(regime.time, world.time, world.inside.astype(float)) > 0.5
+    options = [regime.inside, ~regime.inside][:1 + bool(regime.offset)]
+    return max(float(2 * (true & told).sum() / max(true.sum() + told.sum(), 1)) for told in options)
+
+
+def _second_session(block, table, kind, unit, motion):
+    """Return sensor -> rms error of a second session corrected by the chosen model over that by bias and matrix alone."""
+    plain = {'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix', 'reference_model': 'none', 'model_as_asked': True}
+    second = make_world(kind, unit, motion + 500_000)
+    errors = []
+    for choices in ({}, plain):
+        try:
+            corrected = compensate(block_of(second), calibrate(block, table, **choices).calibration, anyway=True).imu
+        except ImuCalibrationError as error:
+            return {'refused': str(error)[:200]}
+        errors.append([np.sqrt(np.nanmean((values - true)**2)) for values, true in
+                       ((corrected.force_s, second.true_force), (corrected.rate_s, second.true_rate))])
+    return dict(zip(SENSORS, np.divide(*errors).tolist()))
+
+
+def table_of(rows):
+    """Return the table of the protocol, Markdown."""
+    hidden, empty = [row for row in rows if row['kind'] != 'nothing'], [row for row in rows if row['kind'] == 'nothing']
+    placed = [row for row in hidden if row['kind'] not in UNPLACED]
+    unplaced = [row for row in hidden if row['kind'] in UNPLACED]
+    axes = [row['axis'] for row in hidden if row['axis'] is not None]
+    told = [row for row in hidden if row['place'] in ('correct', 'false')]
+    worst = [max(v for v in row['ratio'].values()) for row in hidden if 'refused' not in row['ratio']]
+
+    def count(some, test):
+        return f'{sum(map(bool, map(test, some)))} of {len(some)}'
+    return markdown_table(('measure', 'target', 'measured'), [
+        ('flagged', '95 %', count(hidden, lambda row: row['flagged'])), ('right axis', '95 %', count(axes, bool)),
+        ('place correct or cause named', '12 of 20', count(placed, lambda row: row['place'] in ('correct', 'named'))),
+        ('reported places that are correct', '85 %', count(told, lambda row: row['place'] == 'correct')),
+        ('false place where there is none', 'at most 2 of 20', count(unplaced, lambda row: row['place'] == 'false')),
+        ('false name', 'at most 1 of 40', count(hidden, lambda row: row['false_names'])),
+        ('finding where nothing is hidden', '0 of 40', count(empty, lambda row: row['findings'])),
+        ('flagged where nothing is hidden', '', count(empty, lambda row: row['flagged'])),
+        ('second session worse than bias and matrix by more than 5 %', '0', count(worst, lambda ratio: ratio > WORSE)),
+        ('refused to calibrate', '', str(len(hidden) - len(worst))),
+        ('processor time, median, 95 %, largest, s', '5 (95 %), 10', ', '.join(f'{q:.1f}' for q in np.quantile([row['seconds'] for row in rows], (0.5, 0.95, 1.0))))])
+
+
+def main():
+    """Print the rows and the table."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seed', type=int, required=True)
+    parser.add_argument('--kinds', nargs='*', choices=KINDS, default=KINDS)
+    parser.add_argument('--empty', type=int, default=40)
+    options, rows = parser.parse_args(), []
+    tasks = [(kind, options.seed + number) for number, kind in enumerate(KINDS) if kind in options.kinds]
+    for kind, unit in [*tasks, *(('nothing', options.seed + 1000 + number) for number in range(options.empty))]:
+        rows.append(outcome(kind, unit, 7 * unit))
+        print(json.dumps(rows[-1]), flush=True)
+    print(table_of(rows))
+
+
+if __name__ == '__main__':
+    main()
