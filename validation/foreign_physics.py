@@ -17,7 +17,6 @@ from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, Tempe
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.compensate import compensate
 from imu_calibration.use_cases.diagnose import diagnose
-
 from validation import foreign_worlds
 from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world
 from validation.section import markdown_table
