@@ -2,6 +2,7 @@
 
 import re
 from enum import StrEnum
+from functools import cache
 from typing import Any
 
 from imu_calibration.errors import InputError, shortened
@@ -16,6 +17,8 @@ NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
 """What the parser raises for dates and numbers that are none."""
 NUMBER, LONGEST_NUMBER = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
 """What may be a number, and its characters at most; larger whole numbers do not fit into a float."""
+FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
+"""Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
 DEEPEST = 20
 """Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
 
@@ -32,9 +35,7 @@ def to_text(document: dict[str, Any]) -> str:
     """
     import yaml
 
-    base: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
-
-    class Dumper(base):
+    class Dumper(_with_floats('SafeDumper')):
         """Writes lists of scalars on one line and floats with all their digits."""
 
         def ignore_aliases(self, _data):
@@ -48,6 +49,15 @@ def to_text(document: dict[str, Any]) -> str:
     Dumper.add_representer(tuple, sequence)
     Dumper.add_multi_representer(StrEnum, lambda dumper, word: dumper.represent_str(word.value))
     return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=100_000, allow_unicode=True)
+
+
+@cache
+def _with_floats(name: str) -> Any:
+    """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that looks like a number is then quoted."""
+    import yaml
+    kind = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
+    kind.add_implicit_resolver('tag:yaml.org,2002:float', FLOAT, list('-+.0123456789'))
+    return kind
 
 
 def from_text(text: str, what: str = 'document') -> dict[str, Any]:
@@ -78,7 +88,7 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
 
     """
     import yaml
-    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+    loader = _with_floats('SafeLoader')
     _within_limits(len(text), LARGEST, what, 'characters')
     try:
         _look_through(yaml.parse(text, Loader=loader), what, aliases)

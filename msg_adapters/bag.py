@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from imu_calibration.errors import InputError, shortened
+from imu_calibration.errors import InputError, did_you_mean, shortened
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.csv_bag import CsvBag
 from msg_adapters.csv_log import SUFFIXES, is_csv
@@ -232,7 +232,8 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
     if asked is not None:
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
         if not names:
-            raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}; {_listing(topics, fitting)}',
+            raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}'
+                             f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}',
                              key=key, code='topic_unknown')
         return names[0]
     if DEFAULT_TOPICS[message_type] in fitting:

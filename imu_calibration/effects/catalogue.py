@@ -1,6 +1,6 @@
 """The catalogue of effects: declared once for simulation, calibration, compensation, diagnosis and planning."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -9,7 +9,7 @@ from imu_calibration.effects.base import SECTIONS, Effect
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
 from imu_calibration.effects.term import from_definition
-from imu_calibration.errors import InputError, shortened
+from imu_calibration.errors import InputError, did_you_mean, shortened
 from imu_calibration.reference.joint import JointNames
 
 JOINTS = ('outer', 'middle', 'inner')
@@ -46,20 +46,22 @@ class Catalogue:
         """Return every effect by (sensor, name) for a table with these joints."""
         return _own_effects(JointNames.of(joint_names)) | {effect.key: effect for effect in self.added}
 
-    def find(self, sensor: str, name: str, joint_names: Sequence[str] = JOINTS) -> Effect:
-        """Return the effect `name` of `sensor`, or raise `InputError` with the names there are."""
+    def find(self, sensor: str, name: str, joint_names: Sequence[str] = JOINTS, *, models: Iterable[str] = ()) -> Effect:
+        """Return the effect `name` of `sensor`, or raise `InputError` with the closest name; `models` are suggested too."""
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
             known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
-            raise InputError(f"the {sensor} has no effect '{name}'; choose from {', '.join(known)}", code='effect_unknown')
+            raise InputError(f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])}; choose from {', '.join(known)}",
+                             code='effect_unknown')
         return effects[sensor, name]
 
     def owner_of(self, name: str, joint_names: Sequence[str] = JOINTS) -> str:
         """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:
-            raise InputError(f"effect '{name}' is unknown or ambiguous; "
-                             f"choose from {', '.join(sorted(n for n in names if names.count(n) == 1))}")
+            known = sorted(n for n in names if names.count(n) == 1)
+            raise InputError(f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from {', '.join(known)}",
+                             code='effect_unknown')
         return next(sensor for sensor, known in self.effects(joint_names) if known == name)
 
     def with_effects(self, *effects: Effect) -> 'Catalogue':

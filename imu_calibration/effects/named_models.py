@@ -41,7 +41,7 @@ def parse_effects(sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *
     """
     names = NAMED_MODELS.get(text) or tuple(part.strip() for part in text.split('+'))
     for name in names:
-        catalogue.find(sensor, name, joint_names)
+        catalogue.find(sensor, name, joint_names, models=NAMED_MODELS if name == text else ())
     if not set(BASE) <= set(names):
         raise InputError(f"the {sensor} model must contain bias and matrix, got '{text}'; write bias+matrix+...")
     return names

@@ -4,7 +4,7 @@ from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, did_you_mean
 from imu_calibration.exports import targets
 from imu_calibration.exports.target import Target
 
@@ -46,5 +46,6 @@ def _find(name: str, fitting: list[Target], what: str) -> Target:
     for target in fitting:
         if target.name == name:
             return target
-    raise InputError(f"the name of a program whose files can be {what} must be given, got '{name}'; choose from "
+    raise InputError(f"the name of a program whose files can be {what} must be given, got '{name}'"
+                     f"{did_you_mean(name, (target.name for target in fitting))}; choose from "
                      f"{', '.join(target.name for target in fitting)}")

@@ -6,7 +6,7 @@ from typing import Any, Callable
 
 import numpy as np
 
-from imu_calibration.errors import InputError
+from imu_calibration.errors import InputError, did_you_mean
 from imu_calibration.reference.motion_limits import free_limits, limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.simulation import paper_profiles
@@ -76,7 +76,8 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
 
     """
     if name not in _REGISTRY:
-        raise InputError(f"profile '{name}' is unknown; the profiles are {', '.join(profile_names())}", code='profile_unknown')
+        raise InputError(f"profile '{name}' is unknown{did_you_mean(name, profile_names())}; "
+                         f"the profiles are {', '.join(profile_names())}", code='profile_unknown')
     entry = _REGISTRY[name]
     joint_names = _joint_names(entry, table)
     fits = entry.n_joints in (None, len(joint_names))

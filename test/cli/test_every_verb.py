@@ -52,6 +52,20 @@ def test_the_closest_name_is_suggested(arguments, closest, capsys):
     assert ended.value.code == 1 and error.count('\n') == 1 and f'did you mean {closest}?' in error
 
 
+@pytest.mark.parametrize(('arguments', 'closest'), [
+    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--accelerometer-model', 'bias+matrx'], 'matrix'),
+    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--accelerometer-model', 'size_efect'], 'size_effect'),
+    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--imu-topic', '/imu/dat_raw'], '/imu/data_raw'),
+    (['simulate', '--output', 'never', '--effect', 'accel_bandwith'], 'accel_bandwidth'),
+    (['simulate', '--output', 'never', '--profile', 'calibratin'], 'calibration'),
+    (['export', TRUTH, '--to', 'kalib', '--output', 'never'], 'kalibr'),
+])
+def test_the_closest_model_effect_topic_profile_or_program_is_suggested(arguments, closest, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 1
+    assert f'; did you mean {closest}?;' in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(('arguments', 'code', 'keys'), [
     (['inspect', SESSION], 0, {'topics', 'imu'}),
     (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),

@@ -138,3 +138,15 @@ def test_what_would_take_long_to_read_is_refused_by_its_name(text, words):
     """One guard at a time: whatever else the text is, it is small and plain."""
     with pytest.raises(InputError, match=words):
         documents.from_text(text)
+
+
+@pytest.mark.parametrize(('text', 'value'), [('1e-6', 1e-6), ('-2E3', -2e3), ('1.e5', 1e5), ('.5e+3', 500.0), ('0x1e5', 485), ('"1e-6"', '1e-6'), ('1e5x', '1e5x')])
+def test_a_number_with_an_exponent_is_a_number(text, value):
+    """PyYAML follows YAML 1.1, in which 1e-6 is a text."""
+    found = documents.from_text(f'value: {text}')['value']
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize('value', ['1e-6', '12345678e901', 1e-6, 1e300])
+def test_texts_and_numbers_with_an_exponent_come_back_as_written(value):
+    assert documents.from_text(documents.to_text({'value': value})) == {'value': value}

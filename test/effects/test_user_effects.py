@@ -5,6 +5,7 @@ import string
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +17,18 @@ from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.effects.expressions import PLACES, read
+from imu_calibration.effects.named_models import BASE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.effects.term import term
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.simulation.session import hidden_effect
+from imu_calibration.samples import SampleBlock
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values, simulate
+from imu_calibration.use_cases.calibrate import calibrate
+
+from worlds.stands import stand
 
 MINE = """
 effects:
@@ -182,3 +190,22 @@ def test_the_node_reads_the_file(mine):
                'node.close(); node.destroy_node(); rclpy.shutdown()')
     done = subprocess.run([sys.executable, '-c', program, str(mine)], capture_output=True, text=True, timeout=120)
     assert "dict_keys(['gyro_warm_force'])" in done.stdout, done.stderr
+
+
+def test_the_example_file_is_a_catalogue_whose_effects_are_found():
+    """Each effect of the example, hidden in a session on a table, is added by a calibration that knows the file, with its true values."""
+    example, table = Path(__file__).resolve().parents[2] / 'config/effects_example.yaml', stand('three axes')
+    catalogue = files.read_effects(example)
+    names = {effect.name: effect.sensor for effect in catalogue.added}
+    assert len(names) == 2 and all(effect.tolerance < 1e-3 for effect in catalogue.added)   # 2e-6 is a number
+    model = SensorModel((*BASE, 'accel_rate_coupling'), (*BASE, 'gyro_scale_by_force'), joint_names=table.joint_names,
+                        catalogue=catalogue)
+    truth = random_values(model, 'industrial', 3)
+    for name in names:
+        truth[model.slices[hidden_effect(model, name, 3)[0], name]] = hidden_effect(model, name, 3)[1]
+    samples = simulate(model, truth, table, profile=make_profile('quick', 3, table), options=SimulationOptions(noise=GRADES['industrial'].noise), seed=3)
+    found = calibrate(SampleBlock(*samples), table, catalogue=example).calibration
+    for name, sensor in names.items():
+        where = found.model.slices[sensor, name]
+        np.testing.assert_allclose(found.values[where], truth[model.slices[sensor, name]], atol=4 * found.sd[where].max())
+        assert found.sd[where].max() < 0.1 * np.abs(found.values[where]).max()
