@@ -35,7 +35,9 @@ def to_text(document: dict[str, Any]) -> str:
     """
     import yaml
 
-    class Dumper(_with_floats('SafeDumper')):
+    base: Any = _with_floats('SafeDumper')
+
+    class Dumper(base):
         """Writes lists of scalars on one line and floats with all their digits."""
 
         def ignore_aliases(self, _data):
@@ -55,7 +57,7 @@ def to_text(document: dict[str, Any]) -> str:
 def _with_floats(name: str) -> Any:
     """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that looks like a number is then quoted."""
     import yaml
-    kind = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
+    kind: Any = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
     kind.add_implicit_resolver('tag:yaml.org,2002:float', FLOAT, list('-+.0123456789'))
     return kind
 
