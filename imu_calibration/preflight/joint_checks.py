@@ -10,8 +10,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
+from imu_calibration.preflight.exchanges import find_exchange
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
-from imu_calibration.preflight.on_table import same_motion, signs_or_delay
+from imu_calibration.preflight.on_table import exchanged, same_motion, signs_or_delay
 from imu_calibration.preflight.standing_still import standing_still
 from imu_calibration.reference.table import Table
 
@@ -93,8 +94,14 @@ def _rates(moments, windows, table):
     found = list(_rate_units(moments))
     if found:
         return found
-    stranger = (standing_still(windows, table) if table is not None else None) or same_motion(moments, windows, table)
-    return [] if stranger is None else [stranger]
+    finding = None
+    if table is not None:
+        exchange = find_exchange(windows, table)
+        if exchange and not exchange.joints and exchange.span is None:
+            return []   # `_axes` reports turned or exchanged IMU axes, with the mount that fits
+        finding = (exchanged(exchange, windows, table) if exchange else None) or standing_still(windows, table)
+    finding = finding or same_motion(moments, windows, table)
+    return [] if finding is None else [finding]
 
 
 def _rate_units(moments):
@@ -127,7 +134,7 @@ def _axes(sensor, moments, table, windows):
         return
     delay = signs_or_delay(windows, table) if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored else None
     if delay and delay.sure:
-        yield CheckFinding('on_table', REFUSE, f'both streams must tell the same time: {delay.words}')
+        yield CheckFinding('on_table', REFUSE, f'both streams must share one clock: {delay.words}')
         return
     what, whose = WORDS[sensor]
     yield CheckFinding('handedness', REFUSE,

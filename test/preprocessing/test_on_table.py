@@ -1,5 +1,6 @@
 """Is this IMU on this table? What does not tell the motion of the joints is refused, with the cause."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,10 @@ from refusal import refused
 
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.errors import InputError
+from imu_calibration.preflight.exchanges import _candidates
+from imu_calibration.preflight.joint_checks import _rates
 from imu_calibration.preflight.on_table import _a_period_late, same_motion, signs_or_delay
+from imu_calibration.preflight.standing_still import standing_still
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
@@ -47,18 +51,18 @@ def joints(block, names=None, sign=1.0):
 
 
 @pytest.mark.parametrize(('change', 'words'), [
-    (still, ('this IMU does not turn when the table does', 'right topic')),
+    (still, ('this IMU does not turn when the table does', 'give the topic')),
     (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer turns as middle should', 'middle turns as outer should')),
     (lambda block: joints(block, sign=-1.0), ('outer turns the other way round', 'inner turns the other way round')),
     (lambda block: later(block, 2.0), ('about 2.0 s behind those of the joints', 'set both clocks by one source')),
-    (lambda block: later(block, 9.0), ('turns otherwise than the table', 'do both clocks agree')),
+    (lambda block: later(block, 9.0), ('its motion is not that of the table', 'both clocks')),
 ], ids=('another IMU', 'exchanged joints', 'wrong signs', 'apart in time', 'farther apart than is looked for'))
 def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
     block, table = gimbals
     with pytest.raises(InputError) as caught:
         calibrate(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
-    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == ('right topic' in str(caught.value))
+    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == ('give the topic' in str(caught.value))
 
 
 @pytest.mark.parametrize(('seconds', 'delay', 'side'), [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')])
@@ -68,8 +72,52 @@ def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds
 
 
 def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
-    with refused(InputError, 'handedness', 'x'):
+    with refused(InputError, 'on_table', 'shaft turns the other way round', 'measured x is minus'):
         calibrate(joints(shaft[0], sign=-1.0), shaft[1])
+
+
+def sweeps(table, measured_rate, joint_rate):
+    """Return a window of 60 s on a shaft from the rates of both streams, functions of the time."""
+    time = np.arange(6000) * 0.01
+    zero = np.zeros((len(time), 1))
+    motion = JointMotion(time, np.cumsum(joint_rate(time))[:, None] * 0.01, joint_rate(time)[:, None], zero, zero)
+    measured = reference_motion(table, replace(motion, rate=measured_rate(time)[:, None])).rate_s
+    return Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(measured), measured, motion)
+
+
+PERIOD = 1.105
+
+
+def ripple(time):
+    """Sweeps with the ripple of a stepper motor, one period after the other."""
+    phase = 2.0 * np.pi * time / PERIOD
+    return np.sin(phase) + 0.45 * np.sin(28.0 * phase)
+
+
+def alternating(sign):
+    """Sweeps of which every other one differs, by `sign`, in addition to a ripple that one stream has."""
+    def rate(time):
+        phase = 2.0 * np.pi * time / PERIOD
+        return np.sin(phase) + 0.2 * sign * np.sin(1.5 * phase) + (0.3 * np.sin(19.3 * phase) if sign > 0 else 0.0)
+    return rate
+
+
+@pytest.mark.parametrize(('measured', 'joint'), [(lambda time: ripple(time - 0.005), ripple), (alternating(1.0), alternating(-1.0))],
+                         ids=('a lag of half a sampling period', 'both neighbours equally good'))
+def test_a_period_of_fast_sweeps_is_not_reported_as_a_delay(shaft, measured, joint):
+    """Periods of 1.105 s at 100 Hz: without the delays between samples, or with those of one sign only, the stamps seem 1.1 s ahead."""
+    table = shaft[1]
+    assert _a_period_late([sweeps(table, measured, joint)], table) is None
+
+
+@pytest.mark.parametrize('delay', [-1.1, -0.14, 0.14, 1.1])
+def test_a_real_delay_of_fast_sweeps_is_reported(shaft, delay):
+    """Their size varies slowly, so that one period of delay is no repetition."""
+    table = shaft[1]
+    def rate(time):
+        return (1.0 + 0.5 * np.sin(0.77 * time)) * ripple(time)
+    found = _a_period_late([sweeps(table, lambda time: rate(time - delay), rate)], table)
+    assert found is not None and f'about {abs(delay):.1f} s {"behind" if delay > 0 else "ahead"}' in found.text
 
 
 @pytest.mark.parametrize('swing', [0.0, 0.6])
@@ -89,6 +137,50 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
         assert found is None
     else:
         assert found.sure == (swing > 0) and 'about 1.0 s' in found.words
+
+
+@pytest.mark.parametrize(('signs', 'corrected'), [((-1, 1, 1), ['outer']), ((1, -1, 1), ['middle']), ((1, 1, -1), ['inner']),
+                                                  ((-1, 1, -1), ['outer', 'inner'])])
+def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is(gimbals, signs, corrected):
+    """Signs of outer and inner together are a sensor turned about y for the gyroscope; gravity separates them."""
+    with refused(InputError, 'on_table') as caught:
+        calibrate(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
+    assert [name for name in gimbals[1].joint_names if f'{name} turns the other way round' in str(caught.value)] == corrected
+
+
+def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
+    """With middle at 80 degrees, inner is nearly parallel to outer, and it rests: its standstill would explain the rates too."""
+    table, time = gimbals[1], np.arange(6000) * 0.01
+    motion = JointMotion(time, np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)))
+    motion.position[:, 0], motion.rate[:, 0] = np.sin(time), np.cos(time)
+    motion.position[:, 1] = np.radians(-80.0)
+    reference = reference_motion(table, motion)
+    reversed_outer = replace(motion, position=motion.position * [-1, 1, 1], rate=motion.rate * [-1, 1, 1])
+    window = Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, reference.force_s, reference.rate_s, reversed_outer)
+    assert standing_still([window], table).check == 'frozen', 'a standstill of inner explains it'
+    told = reference_motion(table, reversed_outer).rate_s
+    finding, = _rates((reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s), [window], table)
+    assert finding.check == 'on_table' and 'outer turns the other way round' in finding.text
+
+
+@pytest.mark.parametrize(('order', 'signs', 'words'), [([1, 0, 2], [1, 1, -1], "measured x is the reference's y"),
+                                                       ([0, 1, 2], [-1, -1, 1], "measured y is minus the reference's y")])
+def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_time(gimbals, order, signs, words):
+    block, table = gimbals
+    force, rate = block.imu.force_s.copy(), block.imu.rate_s.copy()
+    part = slice(2 * len(rate) // 5, 4 * len(rate) // 5)
+    force[part], rate[part] = force[part][:, order] * signs, rate[part][:, order] * signs
+    with refused(InputError, 'on_table', words, ' s to ', 'the driver of the IMU') as caught:
+        calibrate(replace(block, imu=replace(block.imu, force_s=force, rate_s=rate)), table)
+    duration = (block.imu.stamp_ns[-1] - block.imu.stamp_ns[0]) * 1e-9
+    start, stop = (float(each) for each in re.search(r'from (\d+) s to (\d+) s', str(caught.value)).groups())
+    assert abs(start - 0.4 * duration) < 15.0 and abs(stop - 0.8 * duration) < 15.0
+
+
+def test_each_sign_and_each_exchange_of_two_joints_is_tested_on_an_arm():
+    candidates = _candidates(6)
+    assert len(candidates) == 1 + 6 + 15 and ([0, 4, 2, 3, 1, 5], [1.0] * 6) in candidates
+    assert len(_candidates(3)) == 48
 
 
 def frozen(block, *, joint, start, stop):
