@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -62,40 +63,58 @@ class Detrending:
         return np.column_stack(columns)
 
 
-def read_curve(blocks: Iterable[SampleBlock], parts: list[list[StillPart]], period: float, *, detrending: Detrending,
-               time_of: Callable[[int, np.ndarray], np.ndarray], nominal: NominalScaling | None = None) -> AllanCurve:
-    """
-    Read the parts at rest and return their Allan variances.
+class Sink(Protocol):
+    """Takes the samples of the parts at rest, on the grid of their period."""
 
-    Parameters
-    ----------
-    blocks : iterable of SampleBlock
-    parts : list of list of StillPart
-        For each epoch of the clock, in order.
-    period : float
-        Time between samples, s.
-    detrending : Detrending
-    time_of : callable
-        ``time_of(epoch, stamp_ns)``: s since the beginning of the recording.
-    nominal : NominalScaling, optional
-        For recordings in volts or counts.
+    def push(self, values: np.ndarray, present: np.ndarray) -> None:
+        """Take the next samples of a part, shape (n, 6), and which of them are present."""
 
-    """
-    longest = max(round(part.seconds / period) for of_epoch in parts for part in of_epoch)
-    reader = _PartReader(averaging_factors(longest), period, detrending)
-    for cleaned in BlockCleaner(nominal=nominal).all_of(blocks):
-        for epoch, imu in cleaned.imu:
-            reader.push(epoch, imu, parts[epoch], time_of)
-    return reader.curve()
+    def end_stretch(self) -> None:
+        """Close the part."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestReader:
+    """Reads the parts at rest of a recording."""
+
+    source: Callable[[], Iterable[SampleBlock]]
+    """Returns the blocks of the recording, from the beginning at each call."""
+    parts: list[list[StillPart]]
+    """For each epoch of the clock, in order."""
+    period: float
+    """Time between samples, s."""
+    detrending: Detrending
+    """Subtracted from the samples."""
+    time_of: Callable[[int, np.ndarray], np.ndarray]
+    """``time_of(epoch, stamp_ns)``: s since the beginning of the recording."""
+    nominal: NominalScaling | None = None
+    """For recordings in volts or counts."""
+
+    def read(self, *bare: Sink, raw: Sink | None = None) -> None:
+        """Push the samples of each part without trends into the sinks `bare`, and unchanged into `raw`."""
+        reader = _PartReader(bare, raw, self.period, self.detrending)
+        for cleaned in BlockCleaner(nominal=self.nominal).all_of(self.source()):
+            for epoch, imu in cleaned.imu:
+                reader.push(epoch, imu, self.parts[epoch], self.time_of)
+        reader.close()
+
+    def curve(self) -> AllanCurve:
+        """Return the Allan variances of the parts."""
+        factors = averaging_factors(max(round(part.seconds / self.period) for of_epoch in self.parts for part in of_epoch))
+        bare, raw = AllanSums(factors, 6), AllanSums(factors, 6) if any(self.detrending.trends) else None
+        self.read(bare, raw=raw)
+        usable = bare.terms > 0
+        variance, terms = (values[:, usable] for values in bare.by_stretch())
+        parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
+        return AllanCurve(self.period, bare.factors[usable], bare.variance()[usable], (raw or bare).variance()[usable],
+                          tuple(bare.lengths), parts)
 
 
 class _PartReader:
-    """Hands the samples of each part to the sums, as they are and without trends."""
+    """Splits accepted samples into parts and pushes them into the sinks."""
 
-    def __init__(self, factors, period, detrending):
-        self._period, self._detrending = period, detrending
-        self._bare = AllanSums(factors, 6)
-        self._raw = AllanSums(factors, 6) if any(detrending.trends) else self._bare
+    def __init__(self, bare, raw, period, detrending):
+        self._bare, self._raw, self._detrending = bare, raw, detrending
         self._grid, self._open = SampleGrid(period), None
 
     def push(self, epoch, imu, parts, time_of):
@@ -107,7 +126,7 @@ class _PartReader:
             if part.end_ns <= begin or part.first_ns > end:
                 continue
             if self._open != (epoch, k):
-                self._close()
+                self.close()
                 self._open = (epoch, k)
             first, last = np.searchsorted(imu.stamp_ns, (part.first_ns, part.end_ns))
             if last > first:
@@ -118,21 +137,13 @@ class _PartReader:
         steps = self._grid.steps(imu.stamp_ns)
         trend = self._detrending.at(time_of(imu.stamp_ns))
         grid, present = spread(values if trend is None else values - trend, steps)
-        self._bare.push(grid, present)
-        if trend is not None:
+        for sink in self._bare:
+            sink.push(grid, present)
+        if self._raw is not None:
             self._raw.push(*spread(values, steps))
 
-    def _close(self):
+    def close(self):
+        """Close the open part."""
         self._grid.begin()
-        self._bare.end_stretch()
-        if self._raw is not self._bare:
-            self._raw.end_stretch()
-
-    def curve(self):
-        """Close the last part and return the curve."""
-        self._close()
-        usable = self._bare.terms > 0
-        bare, raw = self._bare.variance()[usable], self._raw.variance()[usable]
-        variance, terms = (values[:, usable] for values in self._bare.by_stretch())
-        parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
-        return AllanCurve(self._period, self._bare.factors[usable], bare, raw, tuple(self._bare.lengths), parts)
+        for sink in filter(None, (*self._bare, self._raw)):
+            sink.end_stretch()

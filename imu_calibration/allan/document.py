@@ -63,9 +63,14 @@ def _sensor_section(sensor, axes):
 def _entry(terms, unit):
     """Return value, interval, status, reason and unit of three axes; None where an axis has no such figure."""
     return {'value': [None if term is None or term.value is None else float(term.value) for term in terms],
-            'interval95': [None if term is None else [float(end) for end in term.interval] for term in terms],
+            'interval95': [None if term is None else [_finite(end) for end in term.interval] for term in terms],
             'status': [None if term is None else term.status for term in terms],
             'reason': ['' if term is None else term.reason for term in terms], 'unit': unit}
+
+
+def _finite(value):
+    """Return a float, None where there is no bound: files hold no infinite numbers."""
+    return float(value) if math.isfinite(value) else None
 
 
 def _trends(sensor, axes):
@@ -83,8 +88,8 @@ def _trends(sensor, axes):
 def _for_filters(figures, sensor, horizon):
     """Return what most filters ask for, continuous and at the rate of the recording."""
     found = figures.densities(sensor, horizon)
-    return {'white_noise': found.white, 'random_walk': found.walk, 'random_walk_is': found.basis,
-            'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': found.step_sd(figures.rate)}
+    return {'white_noise': found.white, 'random_walk': _finite(found.walk), 'random_walk_is': found.basis,
+            'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': _finite(found.step_sd(figures.rate))}
 
 
 def noise_from_text(text: str) -> NoiseFigures:
@@ -145,7 +150,8 @@ def _pair(values):
 
 
 def _term(name, entry, k):
-    value, interval, status = entry['value'][k], tuple(float(end) for end in entry['interval95'][k]), entry['status'][k]
+    value, status = entry['value'][k], entry['status'][k]
+    interval = tuple(math.inf if end is None else float(end) for end in entry['interval95'][k])
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
                             f'{status!r} and {list(interval)}; write the noise document anew', code='status_or_interval')

@@ -50,7 +50,7 @@ class AxisFigures:
     excess: float = 1.0
     """Factor on all variances of the fit because the curve departs from the model by more than chance."""
     oscillation: tuple[float, float] | None = None
-    """Frequency (Hz) and amplitude of an oscillation that shows as a hump, where no model explains the curve."""
+    """Frequency (Hz) and amplitude of a line of the periodogram at the hump of a curve that no model explains."""
     scatter: float = 0.0
     """Standard deviation of the level of the variances from rest to rest, over the level."""
     deviation: tuple[float, ...] = ()
@@ -72,9 +72,15 @@ class AxisFigures:
 
     @property
     def white(self) -> float:
-        """The density of the white noise; where the curve does without it, its bound."""
+        """
+        The density of the white noise; where its interval contains zero, its upper end.
+
+        Without an upper end, the density of white noise with the variance of the samples: a finite bound for filters and weights.
+        """
         term = self.terms[WHITE.name]
-        return term.value if term.value is not None and term.interval[0] > 0 else term.interval[1]
+        if term.value is not None and term.interval[0] > 0:
+            return term.value
+        return term.interval[1] if np.isfinite(term.interval[1]) else self.sample_sd * float(np.sqrt(self.shortest))
 
     def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
         """

@@ -71,7 +71,7 @@ class Choice:
     def having(self, name: str) -> tuple[list[MomentFit], list[float]]:
         """Return the fits with a process, the best first, and how likely each is against it; without those that do not count."""
         found = [fit for fit in self.fits if name in fit.fit.names]
-        weights = [float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found]
+        weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
         return [fit.fit for fit, weight in zip(found, weights) if weight > LEAST_WEIGHT], [w for w in weights if w > LEAST_WEIGHT]
 
     def widened(self, name: str) -> 'Choice':
@@ -136,15 +136,22 @@ def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
 
 
 def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
-    """Return minus twice the log likelihood of the logarithms of the variances but for a constant, with `excess` times their covariance."""
+    """
+    Return minus twice the log likelihood of the logarithms of the variances except for a constant, with `excess` times their covariance.
+
+    Infinite for a fit that expects no variance at some averaging time.
+    """
     some = moments.scales.tau[moments.used] * INDEPENDENT <= moments.scales.longest
     expected = (moments.design(fit.processes) @ fit.coefficients)[some]
     covariance = fit.covariance[np.ix_(some, some)]
+    if not (np.all(expected > 0) and np.all(np.isfinite(covariance))):
+        return np.inf
     freedom = 2 * expected**2 / np.diag(covariance)
     spread = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
     whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(spread, spread))
     rest = whiten(np.log(moments.target[some] / expected) - digamma(freedom / 2) + np.log(freedom / 2))
-    return float(rest @ rest) / excess + whiten.log_determinant
+    cost = float(rest @ rest) / excess + whiten.log_determinant
+    return cost if np.isfinite(cost) else np.inf
 
 
 def without_finest(moments: Moments, count: int) -> Moments:

@@ -1,12 +1,12 @@
 """From a recording at rest to the figures of its noise: what a user calls."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration import __version__
-from imu_calibration.allan.curve import AllanCurve, Detrending, read_curve
+from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.forms import PROCESSES
 from imu_calibration.allan.moment_fit import Moments
@@ -16,6 +16,7 @@ from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, still_parts
 from imu_calibration.allan.survey import Survey, survey
 from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, AxisNoise, identify_axis
+from imu_calibration.allan.tones import ToneSearch
 from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.errors import InputError
@@ -45,6 +46,8 @@ class RestingRecord:
     """Standard deviation of single samples within a quarter of a second, shape (6,)."""
     survey: Survey
     """The first reading."""
+    reader: RestReader
+    """Reads the parts at rest again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,7 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
     Parameters
     ----------
     source : callable
-        Gives the blocks of the recording, each time anew; it is read twice.
+        Returns the blocks of the recording, from the beginning at each call; it is read twice, and again where a curve has a hump.
     nominal : NominalScaling, optional
         For recordings in volts or counts.
 
@@ -75,7 +78,14 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
 
     """
     record = read_rest(source, nominal)
-    return NoiseIdentification(record, tuple(identify_axis(moments) for moments in record.moments))
+    axes = [identify_axis(moments) for moments in record.moments]
+    longest = max(part.seconds for part in record.parts)
+    searches = {k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
+                for k, axis in enumerate(axes) if axis.oscillation}
+    if searches:
+        record.reader.read(*searches.values())
+    return NoiseIdentification(record, tuple(replace(axis, oscillation=searches[k].line() if k in searches else None)
+                                             for k, axis in enumerate(axes)))
 
 
 def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> RestingRecord:
@@ -91,13 +101,14 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     search = TrendSearch(_blocks(found, parts, clock))
     trends = tuple(search.find(axis) for axis in range(6))
     detrending = Detrending(trends, search.reference, clock.temperature(found))
-    curve = read_curve(source(), parts, found.period, detrending=detrending, time_of=clock.time, nominal=nominal)
+    reader = RestReader(source, parts, found.period, detrending, clock.time, nominal)
+    curve = reader.curve()
     _require_scatter(curve)
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
     moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]), curve.parts[axis])
                     for axis, variance in enumerate(curve.variance.T))
     flat = tuple(part for of_epoch in parts for part in of_epoch)
-    return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found)
+    return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found, reader)
 
 
 def _require_scatter(curve):
@@ -117,7 +128,8 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     recording = {'seconds_at_rest': float(record.curve.seconds), 'parts': len(record.parts),
                  'longest_part': float(max(part.seconds for part in record.parts)),
                  'left_out': {'motion': left.motion, 'short_rests': left.short, 'other_sampling_rate': left.other_rate},
-                 'dropped': dict(record.survey.dropped)}
+                 'dropped': dict(record.survey.dropped),
+                 'intervals_hold_for': 'this recording; the slow noise of another one can be outside'}
     return NoiseFigures(tuple(axes[:3]), tuple(axes[3:]), 1.0 / record.curve.period, record.survey.frame_id, recording,
                         tuple(float(tau) for tau in record.curve.tau), {'software': f'imu_calibration {__version__}'} | (provenance or {}))
 

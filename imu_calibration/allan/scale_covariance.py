@@ -138,5 +138,5 @@ def _sorted_lengths(lengths):
     lengths = np.sort(np.asarray(lengths, float))
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))
-    classes = np.array_split(lengths, MOST_LENGTHS)
+    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]   # the longest alone: only it has terms at the longest scales
     return np.array([part.mean() for part in classes]), np.array([float(len(part)) for part in classes])

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.allan.dead_reckoning import position_budget
 from imu_calibration.allan.document import TERMS, UNITS
-from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures
+from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
@@ -16,6 +16,7 @@ TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bia
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
 BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise found', 'bound': 'none seen: the largest possible'}
+NO_BOUND = 'no bound'
 WORTH_SAYING = 0.04
 """Scatter of the variances between rests that is said: two per cent of the noise."""
 
@@ -58,16 +59,23 @@ def rows(figures: NoiseFigures) -> list[FigureRow]:
 def _row(sensor, letter, axis, term):
     factor, unit = SHOWN_OF_NOISE[UNITS[sensor][term.name]]
     lower, upper = (end * factor for end in term.interval)
-    value = f'< {significant(upper)}' if term.value is None else _digits(term.value * factor, upper - lower)
-    interval = ' … '.join(_digits(end, upper - lower) for end in (lower, upper) if term.value is not None)
+    if term.value is None:
+        value, interval = f'< {significant(upper)}' if np.isfinite(upper) else NO_BOUND, ''
+    else:
+        value = _digits(term.value * factor, upper - lower)
+        interval = f'{_digits(lower, upper - lower)} … {_digits(upper, upper - lower)}'
     return FigureRow(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
 
 
 def _digits(value, width):
     """Return a value with the digits that an interval of this width supports."""
     if not np.isfinite(width) or width <= 0 or not 0 < value < np.inf:
-        return '0' if value == 0 else significant(value)
+        return '0' if value == 0 else _bounded(value)
     return significant(value, int(np.clip(np.ceil(np.log10(value / width)) + 2, 2, 6)))
+
+
+def _bounded(value):
+    return significant(value) if np.isfinite(value) else NO_BOUND
 
 
 def _note(axis, term):
@@ -112,6 +120,9 @@ def lines(figures: NoiseFigures) -> list[str]:
     for sensor in SENSORS:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
+    if any(name in SLOW for sensor in SENSORS for axis in figures.sensor(sensor) for name in axis.form):
+        found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals hold for this recording; those of another '
+                     'one can lie outside of them')
     longest = _longest(figures)
     return [*found, *([longest] if longest else []), _metres(figures)]
 
@@ -149,11 +160,11 @@ def _axis_lines(name, sensor, axis):
 
 
 def _hump(sensor, axis):
-    """Return what the hump of a curve looks like, or ''."""
+    """Return the line of the periodogram at the hump of a curve, or ''."""
     if axis.oscillation is None:
         return ''
     (frequency, amplitude), (factor, unit) = axis.oscillation, SHOWN_OF_NOISE[UNIT[sensor]]
-    return f', as if something oscillated at about {significant(frequency, 2)} Hz by {significant(amplitude * factor, 2)} {unit}'
+    return f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at {significant(frequency, 3)} Hz'
 
 
 def said(form: tuple[str, ...]) -> str:
@@ -178,7 +189,7 @@ def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HOR
         densities = figures.densities(sensor, horizon)
         units = UNITS[sensor]
         found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},')
-        found.append(f'    random walk {significant(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
+        found.append(f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
         found += [f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNIT[sensor]}, '
-                  f'bias step sd {significant(densities.step_sd(rate))} {UNIT[sensor]}' for rate in rates]
+                  f'bias step sd {_bounded(densities.step_sd(rate))} {UNIT[sensor]}' for rate in rates]
     return found

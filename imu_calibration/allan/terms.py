@@ -65,7 +65,7 @@ class AxisNoise:
     excess: float
     """Factor on all covariances because the curve departs from the model by more than chance, at least 1."""
     oscillation: tuple[float, float] | None = None
-    """Frequency (Hz) and amplitude of what makes the largest hump of a curve that no model explains."""
+    """Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a recording, of its line."""
     scatter: float = 0.0
     """Standard deviation of the level of the variances from rest to rest, over the level."""
 
@@ -168,6 +168,8 @@ def _figures(choice, name, excess):
 
 def _term(name, value, interval):
     lower, upper = (float(end) for end in interval)
+    if not value > 0:
+        return Term(name, None, (0.0, upper), HELD, 'not seen')
     if lower > 0 and upper / lower <= DETERMINED_RATIO:
         return Term(name, float(value), (lower, upper), DETERMINED)
     return Term(name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none')

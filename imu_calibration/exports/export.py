@@ -133,6 +133,10 @@ def _walk_lines(noise: Noise) -> list[str]:
 def _noise_of(calibration, figures, rate) -> Noise | None:
     if figures is not None:
         accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
+        unbounded = [sensor for sensor, found in zip(SENSORS, (accelerometer, gyroscope)) if not np.isfinite(found.walk)]
+        if unbounded:
+            raise InputError(f'the noise document must bound the random walk of both sensors, that of the {" and ".join(unbounded)} has no '
+                             'bound; record a longer rest', key='noise', code='walk_unbounded')
         return Noise(accelerometer, gyroscope, rate or figures.rate)
     white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
     if rate is None or not all(white.values()):

@@ -123,6 +123,6 @@ def _places(coordinates, key):
 
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
-    if effect.role is Role.LIMIT or effect.smooth or 'temperature' in effect.needs:
-        raise InputError(f"effects that motion can separate must depend on motion, '{key[1]}' depends on time, temperature or range; "
+    if effect.role is Role.LIMIT or effect.time_constant or 'temperature' in effect.needs:
+        raise InputError(f"effects that are told apart by motion must depend on it, '{key[1]}' shows with time, temperature or range; "
                          'leave it out')

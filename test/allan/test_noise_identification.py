@@ -1,5 +1,6 @@
 """Noise identified from Allan curves: the covariance between scales, the fit, its intervals, what is left out and taken out."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.stats import chi2
 
 from imu_calibration.allan.dead_reckoning import position_sd
 from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance
-from imu_calibration.allan.forms import PROCESSES, choose_form, fit_form, fit_names, log_cost, without_finest
+from imu_calibration.allan.forms import PROCESSES, Choice, choose_form, fit_form, fit_names, log_cost, without_finest
 from imu_calibration.allan.moment_fit import RIDGE, Moments
 from imu_calibration.allan.processes import (
     FLATNESS,
@@ -274,3 +275,30 @@ def test_dead_reckoning_scatters_as_predicted():
     assert white == pytest.approx(np.sqrt(seconds**3 / 3 + seconds**4 / 4 / 200.0), rel=1e-3)
     tilt = position_sd([WHITE], [1.0], 'gyroscope', seconds=seconds, alignment=200.0, gravity=10.0)[0]
     assert tilt == pytest.approx(10.0 * np.sqrt(seconds**5 / 20 + seconds**6 / 36 / 200.0), rel=1e-3)
+
+
+def test_a_fit_without_variance_costs_infinitely_and_is_never_preferred():
+    """Steps as large as the noise left a form without any coefficient: its cost was NaN, and no form remained (IndexError)."""
+    moments = moments_of({'white_noise': 1.0}, 400.0)
+    form = fit_form(moments, ())
+    empty = replace(form, fit=replace(form.fit, coefficients=np.zeros(1)), cost=log_cost(moments, replace(form.fit, coefficients=np.zeros(1))))
+    assert empty.cost == np.inf and np.isfinite(form.cost)
+    fits, weights = Choice((empty,), moments).having('white_noise')
+    assert len(fits) == 1 and weights == [1.0]
+    assert Choice((form, empty), moments).having('white_noise')[0] == [form.fit]
+
+
+def test_white_noise_that_is_not_seen_is_held_with_its_bound():
+    """A random walk as coarse steps: the curve has no white noise."""
+    rng, period = np.random.default_rng(44), 0.1
+    step = 8 / np.sqrt(period)
+    walk = random_walk(36_000, period, 0.3, rng)
+    term = identify_axis(moments_from(np.round((walk + 0.3 * step) / step) * step, period)).terms['white_noise']
+    assert (term.status, term.value, term.interval[0]) == (HELD, None, 0.0) and 0 < term.interval[1] < 2
+
+
+def test_the_longest_of_many_rests_keeps_its_own_scales():
+    """Classes of rests by their mean length had no term at the longest averaging time: 0 / 0."""
+    lengths = [*range(200, 800, 5), 3000]
+    scales = ScaleCovariance(averaging_factors(max(lengths)), lengths, PERIOD)
+    assert np.isfinite(scales.product(WHITE, WHITE)).all()

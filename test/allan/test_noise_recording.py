@@ -1,24 +1,30 @@
 """From a recording to noise.yaml: what is at rest is found, trends are taken out and said, and the verb writes what it promises."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 from refusal import refused
+from scipy.signal import lfilter
 
 from imu_calibration import files
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
 from imu_calibration.allan.summary import exit_code, filter_lines, lines
+from imu_calibration.allan.terms import HELD, Term, identify_axis
 from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main
 from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.exports.export import export
+from imu_calibration.exports.registry import find_target
 from imu_calibration.report.noise_page import noise_report
 from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
 from msg_adapters.write import write_session
 
+from worlds.compensation_cases import random_calibration
 from worlds.noise_worlds import random_walk, white
 
 PERIOD = 0.02
@@ -266,3 +272,51 @@ def test_an_axis_whose_steps_hide_its_noise_is_refused_by_its_name():
     frozen = ImuSamples(imu.stamp_ns, np.where([False, True, False], 0.5, imu.force_s), imu.rate_s, imu.frame_id)
     with refused(InputError, 'coarse_steps', 'accelerometer y'):
         read_rest(source(changed(frozen, slice(0, 6), 3000, knock)))
+
+
+def hummed(extra, seed, period=0.05, n=24_000):
+    """Twenty minutes at rest with something added to the x axis of the accelerometer, in sizes of its sample noise."""
+    rng = np.random.default_rng(seed)
+    values = SIZES / np.sqrt(period) * rng.standard_normal((n, 6))
+    values[:, 0] += extra * SIZES[0] / np.sqrt(period)
+    values[:, 2] += 9.81
+    return ImuSamples(np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18, values[:, :3], values[:, 3:], 'imu_link')
+
+
+def test_an_oscillation_needs_a_line_in_the_periodogram():
+    """A resonance that noise excites makes the hump of a sine, and no line."""
+    time = np.arange(24_000) * 0.05
+    sine = hummed(1.5 * np.sin(2 * np.pi * 0.41 * time), 11)
+    radius, angle = 0.99, 2 * np.pi * 0.1 * 0.05
+    noise = lfilter([1.0], [1.0, -2 * radius * np.cos(angle), radius**2], np.random.default_rng(12).standard_normal(24_000))
+    broad = hummed(1.2 * noise / noise.std(), 13)
+    found, other = (identify_noise(source(imu)) for imu in (sine, broad))
+    frequency, amplitude = found.axes[0].oscillation
+    assert frequency == pytest.approx(0.41, rel=0.01)
+    assert amplitude == pytest.approx(1.5 * SIZES[0] / np.sqrt(0.05), rel=0.1)
+    candidate = identify_axis(other.record.moments[0])
+    assert candidate.excess > 1 and candidate.oscillation is not None and other.axes[0].oscillation is None
+
+
+def numbers(part):
+    """All numbers of a document."""
+    if isinstance(part, (dict, list)):
+        return [number for item in (part.values() if isinstance(part, dict) else part) for number in numbers(item)]
+    return [part] if isinstance(part, float) else []
+
+
+def test_an_interval_without_an_upper_end_is_null_in_the_file_and_finite_where_filters_take_it(quiet):
+    figures = figures_of(quiet[1])
+    open_ends = {name: Term(name, None, (0.0, np.inf), HELD) for name in ('white_noise', 'random_walk')}
+    axis = replace(figures.gyroscope[2], terms=figures.gyroscope[2].terms | open_ends, form=())
+    without = replace(figures, gyroscope=(axis,) * 3)
+    text = noise_to_text(without)
+    document = yaml.safe_load(text)
+    assert np.isfinite(numbers(document)).all() and document['gyroscope']['random_walk']['interval95'] == [[0.0, None]] * 3
+    assert document['recording']['intervals_hold_for']
+    again = noise_from_text(text)
+    assert again.gyroscope[0].terms['random_walk'].interval == (0.0, np.inf) and noise_to_text(again) == text
+    assert again.gyroscope[0].white == pytest.approx(axis.sample_sd * np.sqrt(axis.shortest))
+    assert not {'inf', 'nan'} & {word for line in (*filter_lines(without, [100.0]), *lines(without)) for word in line.split()}
+    with refused(InputError, 'walk_unbounded', 'gyroscope'):
+        export(random_calibration(1), find_target('kalibr'), noise=without)

@@ -34,7 +34,6 @@ HIDDEN = {
     'gyro_g_sensitivity': lambda f, w, t, k: (NOTHING, f @ np.array([[0, 3, 0], [-4, 0, 2], [0, 0, 5]]).T * 1e-4),
     'gyro_quadratic': lambda f, w, t, k: (NOTHING, np.array([8e-3, -6e-3, 7e-3]) * w**2),
     'gyro_scale_asymmetry': lambda f, w, t, k: (NOTHING, np.array([1.2e-2, -1e-2, 1e-2]) * np.abs(w)),
-    'gyro_bias_trend': lambda f, w, t, k: (NOTHING, np.outer(t, [2e-3 * DEG, -1.5e-3 * DEG, 1e-3 * DEG])),
     'gyro_bias_drift': lambda f, w, t, k: (NOTHING, np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG])),
 }
 """What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and number of the pose."""

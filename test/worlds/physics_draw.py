@@ -22,7 +22,6 @@ EFFECTS = {
     'accel_vibration_rectification': (0.3, (3,)), 'gyro_vibration_rectification': (4e-3, (3, 3)),
     'accel_cross_axis_lag': (2e-4, (3, 2)), 'gyro_cross_axis_lag': (2e-4, (3, 2)),
     'axis_sag': (5 * ARCMIN, None), 'axis_wobble': (3 * ARCMIN, None), 'axis_offset': (5e-3, None),
-    'accel_bias_trend': (0.02 * MG, (3,)), 'gyro_bias_trend': (1e-3 * DEG, (3,)),
     'load_compliance': (1 * ARCMIN / G, (3, 3)),
     'gyro_g_sensitivity': (0.02 * DEG / G, (3, 3)), 'gyro_rate_product': (1e-3, (3, 3)), 'gyro_quadratic': (1e-3, (3,)),
     'gyro_scale_asymmetry': (1e-3, (3,)), 'gyro_thermal_bias': (0.01 * DEG, (3,)), 'gyro_thermal_scale': (5e-4, (3,)),
@@ -89,7 +88,6 @@ def draw_imu(grade, values, arms, rng):
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
         triad.low_pass, triad.late = float(values.get(short + '_bandwidth', 0.0)), float(values.get(short + '_delay', 0.0))
         triad.second_order, triad.crosstalk = float(values.get(short + '_filter', 0.0)), values.get(short + '_cross_axis_lag')
-        triad.trend = values.get(short + '_bias_trend', 0.0)
         if short + '_bias_drift' in values:
             triad.drift, triad.drift_constant = values[short + '_bias_drift'][:3], values[short + '_bias_drift'][3]
     accel.cubic = values.get('accel_cubic', 0.0)
