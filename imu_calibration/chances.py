@@ -1,8 +1,8 @@
 """
-Probabilities that chance alone is as large: upper tails of the distributions that tests of significance ask.
+Probabilities of an equal or larger value by chance: upper tails of the distributions of significance tests.
 
-The same numbers as from ``scipy.stats``, of which the special functions are all that is needed here; its import takes longer than that of
-everything else together, and every command and every node would wait for it.
+The same numbers as ``scipy.stats``, by special functions alone; the import of scipy.stats is slower than that of
+all remaining modules together, and every command and node would wait for it.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ def chi2_sf(x: ArrayLike, dof: ArrayLike) -> np.ndarray:
 
 
 def chi2_isf(chance: ArrayLike, dof: ArrayLike) -> np.ndarray:
-    """Return what chi-square of `dof` degrees of freedom exceeds by a `chance` between zero and one."""
+    """Return the value that chi-square of `dof` degrees of freedom exceeds with probability `chance`, between zero and one."""
     return chdtri(dof, chance)
 
 
@@ -31,5 +31,5 @@ def norm_sf(x: ArrayLike) -> np.ndarray:
 
 
 def norm_ppf(chance: ArrayLike) -> np.ndarray:
-    """Return what a standard Gaussian number stays below by a `chance`."""
+    """Return the value below which a standard Gaussian number lies with probability `chance`."""
     return ndtri(chance)

@@ -1,11 +1,11 @@
-"""Physical constants and units of people, each named once; multiply to come to SI, divide to leave it."""
+"""Physical constants and customary units, each named once; multiply to convert to SI, divide to convert from SI."""
 
 import math
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2: the g of people's units, never the gravity of a place."""
 STANDARD_GRAVITY_SD = 0.02
-"""What it may be off by where nobody knows the local gravity, m/s^2."""
+"""Standard deviation of an unknown local gravity, m/s^2."""
 MILLI_G = 1e-3 * STANDARD_GRAVITY
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 HOTTEST_C = 200.0

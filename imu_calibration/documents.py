@@ -8,19 +8,19 @@ from typing import Any
 from imu_calibration.errors import InputError, shortened
 
 LARGEST = 2_000_000
-"""Characters of a document at most; the covariance of a hundred parameters takes 300 000."""
+"""Largest number of characters of a document; the covariance of a hundred parameters has 300 000."""
 MOST_PARTS = 60_000
-"""Numbers, texts, lists and mappings in a document at most: reading so many takes half a second."""
+"""Largest number of numbers, texts, lists and mappings in a document: they are read in half a second."""
 LONGEST = 5000
-"""Characters of one text or number at most; a number in base sixty takes time with the square of its length."""
+"""Largest number of characters of one text or number; the time of a number in base sixty grows with the square of its length."""
 NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
-"""What the parser raises for dates and numbers that are none."""
+"""Exceptions of the parser for malformed dates and numbers."""
 NUMBER, LONGEST_NUMBER = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
-"""What may be a number, and its characters at most; larger whole numbers do not fit into a float."""
+"""Start of a number, and its largest number of characters; larger integers do not fit into a float."""
 FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
 """Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
 DEEPEST = 20
-"""Levels of lists and mappings inside each other at most; a parser that calls itself for each runs out of stack far beyond."""
+"""Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it."""
 
 
 def to_text(document: dict[str, Any]) -> str:
@@ -78,15 +78,15 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
     ----------
     text : str
     what : str
-        What it is, for errors.
+        Name of the document in errors.
     aliases : bool
-        Whether a part may stand for an earlier one; recorders write so.
+        Whether a part may refer to an earlier one, as recorders write it.
 
     Raises
     ------
     InputError
         When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a text of a few lines could otherwise
-        take all memory.
+        exhaust the memory.
 
     """
     import yaml
@@ -100,7 +100,7 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
 
 
 def _look_through(events, what, aliases):
-    """Refuse what would take long or much memory to build, from the parser's events, which take neither."""
+    """Refuse documents that need much time or memory, from the events of the parser, which need neither."""
     count, sizes, open_parts = 0, {}, []   # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
     for event in events:
         kind = type(event).__name__
@@ -111,7 +111,7 @@ def _look_through(events, what, aliases):
             sizes[anchor] = count - start
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
-            raise InputError(f'a {what} must say everything where it stands, this one has YAML aliases (*{event.anchor}); write it without',
+            raise InputError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
                              code='yaml_alias')
         if open_parts and open_parts[-1][2] is not None:
             _check_key(event, open_parts[-1], what)

@@ -1,8 +1,8 @@
 """
-Errors that a user can act on: one line saying what must hold, what came, and what to do.
+Errors that a user can act on: one line with the requirement, the value received and the remedy.
 
-The core speaks of what must hold. Where something has to be given, the error carries a key of `KEYS`, and whoever shows the error adds what
-that is called there: an option of the command line, a parameter or topic of a node, an argument in a notebook.
+The core states the requirement. If an input is missing, the error has a key of `KEYS`, and the program that prints the error adds its
+local name: an option of the command line, a parameter or topic of a node, an argument in a notebook.
 """
 
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from difflib import get_close_matches
 
 KEYS = {
     'allow_xacro': 'permission to run a .xacro file',
-    'anyway': 'consent to use what is not shown to help', 'calibration': 'the calibration document',
+    'anyway': 'consent to use an unproven calibration', 'calibration': 'the calibration document',
     'columns': 'the columns of a text log', 'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
@@ -18,7 +18,7 @@ KEYS = {
     'temperature_topic': 'the topic of the temperature', 'imu_link': 'the link that carries the IMU', 'up': 'where up is',
     'urdf': 'the robot description',
 }
-"""What an error may ask for."""
+"""Inputs that an error may request."""
 
 
 class ImuCalibrationError(Exception):
@@ -28,9 +28,9 @@ class ImuCalibrationError(Exception):
     Parameters
     ----------
     text : str
-        What must hold, what came, what to do.
+        Requirement, value received, remedy.
     key : str, optional
-        What has to be given, a key of `KEYS`.
+        The missing input, a key of `KEYS`.
     code : str
         Stable name of the requirement that is not met, for programs and tests; the text may change.
 
@@ -41,11 +41,11 @@ class ImuCalibrationError(Exception):
         self.key, self.code = key, code
 
     def named(self, name: str) -> 'ImuCalibrationError':
-        """Return the error with the name of what it is about before its text."""
+        """Return the error with the name of its subject before its text."""
         return type(self)(f'{name}: {self}', key=self.key, code=self.code)
 
     def told(self, hints: dict[str, str]) -> str:
-        """Return the text with what the key is called here; `hints` as for `with_hint`."""
+        """Return the text with the local name of the key; `hints` as for `with_hint`."""
         return with_hint(str(self), self.key, hints)
 
 
@@ -54,7 +54,7 @@ class InputError(ImuCalibrationError):
 
 
 class NotObservableError(ImuCalibrationError):
-    """The data do not determine what was asked for."""
+    """The data do not determine the requested parameters."""
 
 
 class DocumentError(InputError):
@@ -74,14 +74,14 @@ def shortened(text: str, length: int = 60) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return '; did you mean NAME?' with the known name that is closest, else an empty text."""
+    """Return '; did you mean NAME?' with the closest known name, or an empty text."""
     close = get_close_matches(name, list(known), n=1)
     return f'; did you mean {close[0]}?' if close else ''
 
 
 def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     """
-    Return a text with what has to be given in the words of whoever shows it.
+    Return a text with the missing input in the terms of the program that prints it.
 
     Parameters
     ----------
@@ -89,8 +89,7 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     key : str or None
         A key of `KEYS`.
     hints : dict
-        Key -> what it is called here, such as ``{'gravity': "parameter 'gravity'"}``; what has no name here
-        gets no hint.
+        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``; a key without a local name
 
     """
     return printable(f'{text} ({hints[key]})' if key in hints else text)

@@ -1,4 +1,4 @@
-"""Opening files that somebody else may have placed: only regular ones, and archives only up to a size."""
+"""Opening untrusted files: regular files only, and archives only up to a size."""
 
 import io
 import os
@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 ARRAYS_BASE, ARRAYS_RATIO = 64 << 20, 20
-"""Arrays may take this many bytes, plus this many times their compressed size."""
+"""Largest size of arrays: this many bytes, plus this many times their compressed size."""
 
 
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
@@ -33,16 +33,16 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
 
 def load_arrays(data: bytes) -> Any:
     """
-    Return the arrays of an .npz archive, to be used as a context manager; none is decompressed before it is asked for.
+    Return the arrays of an .npz archive as a context manager; each is decompressed at its first use.
 
     Raises
     ------
     ValueError, zipfile.BadZipFile
-        When it is no such archive, or its arrays would take much more memory than a session does.
+        If it is no such archive, or its arrays need much more memory than a session.
 
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         n_bytes, limit = sum(member.file_size for member in archive.infolist()), ARRAYS_BASE + ARRAYS_RATIO * len(data)
     if n_bytes > limit:
-        raise ValueError(f'its arrays take {n_bytes} bytes, at most {limit} are accepted')
+        raise ValueError(f'its arrays need {n_bytes} bytes, at most {limit} are accepted')
     return np.load(io.BytesIO(data), allow_pickle=False)

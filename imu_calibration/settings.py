@@ -18,17 +18,17 @@ class Setting:
     unit: str
     """'' or '1' without one."""
     text: str
-    """What it means."""
+    """Meaning."""
     bounds: tuple
     """(smallest, largest) value; None: no end."""
     symptom: str
-    """What a wrong value looks like."""
+    """Symptoms of a wrong value."""
     live: bool
-    """Whether a running session takes a change."""
+    """Whether a change applies to a running session."""
     fixed: str
     """Why not, when it does not."""
     session: bool
-    """Whether it names what a session works on: files of settings leave it out, or they would undo what was said before them."""
+    """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
     path: bool
     """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set the others."""
 

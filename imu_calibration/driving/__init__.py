@@ -1,6 +1,6 @@
 """
 Driving joints through motions, safely.
 
-In: motions that a planner asks for, what the joints really did. Out: what to send, when to measure, when and why to stop.
+In: motions from a planner and measured joint states. Out: trajectories to send, times of measurement, and stops with their reason.
 Read `driver` first.
 """

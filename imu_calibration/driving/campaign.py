@@ -1,4 +1,4 @@
-"""What to do next until nothing is left to do: a motion, a question to the diagnosis, or the end with its reason."""
+"""The next step of a campaign: a motion, a diagnosis, or the end with its reason."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.settings import setting
 
 TIME_OVER = 'the time given is over'
-IN_VAIN = 'motions no longer bring what the plan promises: what limits is not noise'
+IN_VAIN = 'motions no longer reduce the standard deviations as planned: the limit is not noise'
 PATIENCE = 6
-"""Motions after which something must have come of them."""
+"""Motions after which the standard deviations must have decreased."""
 LEAST_SHARE = 0.93
-"""Share of the logarithms of excess over tolerance that may be left after them; what is left beyond is not worth the time."""
+"""Largest share of the logarithms of excess over tolerance that may remain after them; otherwise further motions do not pay."""
 
 
 class MotionPlanner(Protocol):
-    """What a campaign asks of a planner (`planning.planner.Planner`)."""
+    """Interface of a planner (`planning.planner.Planner`)."""
 
     @property
     def excess(self) -> dict[str, float]:
-        """Standard deviation over tolerance of each parameter asked for."""
+        """Standard deviation over tolerance of each requested parameter."""
 
     def take(self, calibration: Any) -> None:
-        """Take what was really learnt."""
+        """Replace the predicted information by the measured information."""
 
     def next_motion(self, position: np.ndarray) -> Any:
         """Return the NextMotion from where the joints are, and count on it."""
@@ -41,30 +41,30 @@ class CampaignSettings:
 
     time_limit: float = setting(1800.0, 's', 'time given to all motions together, by the stamps of the joint states', (1.0, 1e6),
                                 'too small: parameters stay outside their tolerance', live=True)
-    separations: int = setting(2, '1', 'how often motions are asked for that tell apart what the diagnosis cannot; 0: never, and '
-                               'nothing is diagnosed at the end', (0, 20), 'too small: a finding keeps its mates', live=True)
+    separations: int = setting(2, '1', 'largest number of extra motions that separate collinear causes of the diagnosis; 0: none, and '
+                               'no diagnosis at the end', (0, 20), 'too small: a finding remains collinear with other effects', live=True)
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """What a diagnosis named, and what it cannot be told from."""
+    """A finding of a diagnosis and the effects that are collinear with it."""
 
     effect: str
     """Published name."""
     mates: tuple[str, ...] = ()
-    """Effects that cannot be told from it."""
+    """Effects that are collinear with it."""
     sizes: dict[str, float] = field(default_factory=dict)
     """Parameter -> value, SI, of the effect and of each mate in its place."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do next: exactly one of a motion, a question and an end."""
+    """The next step: exactly one of a motion, a diagnosis and the end."""
 
     motion: Any = None
     """PlannedMotion to be driven."""
     diagnose: bool = False
-    """Whether to ask what the model gets wrong."""
+    """Whether to diagnose."""
     why: str = ''
     """One line."""
 
@@ -78,7 +78,7 @@ class Campaign:
     planner : MotionPlanner
     settings : CampaignSettings
     make_separator : callable, optional
-        Returns a planner of the motions that tell a Suspect from its mates, or raises an ImuCalibrationError when there are none.
+        Returns a planner of motions that separate a Suspect from its mates, or raises an ImuCalibrationError if none exists.
     first : callable, optional
         Returns the first motion from a position, None for none.
     unwind : callable, optional
@@ -94,10 +94,10 @@ class Campaign:
         self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: MotionPlanner | None = None
         self.findings: list[Suspect] | None = None
-        """What the last diagnosis named, the strongest first; None before the first."""
+        """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0
         self.told_apart: tuple[str, ...] = ()
-        """The class whose members were to be told apart last."""
+        """The collinear class of the last separating motion."""
         self._is_asked = False
         self._left: list[float] = []
 
@@ -108,17 +108,17 @@ class Campaign:
         return max(excess.items(), key=lambda item: item[1]) if excess else ('', 0.0)
 
     def take(self, calibration: Any) -> None:
-        """Take what was really learnt from the motions so far."""
+        """Replace the predicted information by that measured in the motions so far."""
         self.planner.take(calibration)
         self._left.append(sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0))
 
     def take_findings(self, findings: list[Suspect] | None) -> str:
-        """Take what the diagnosis said, None when it did not answer; return what is done about it, '' for nothing."""
+        """Store the findings of a diagnosis, None if it failed; return the resulting action as text, '' for none."""
         self._is_asked = True
         self.findings = self.findings if findings is None else findings
         for finding in findings or []:
             if finding.mates and self.separations < self.settings.separations and self._make_separator is not None:
-                what = f'{finding.effect} cannot be told from {", ".join(finding.mates)} by the motion so far'
+                what = f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
                 try:
                     self._separator = self._make_separator(finding)
                 except ImuCalibrationError as error:
@@ -130,7 +130,7 @@ class Campaign:
 
     @property
     def is_separating(self) -> bool:
-        """Whether the motions at present are those that tell causes apart."""
+        """Whether the present motions separate collinear causes."""
         return self._separator is not None
 
     def decide(self, position: np.ndarray, elapsed: float) -> Decision:
@@ -157,10 +157,10 @@ class Campaign:
         if elapsed >= self.settings.time_limit:
             return Decision(why=f'{TIME_OVER}{self._outside()}')
         step = None if self._separator is None else self._separator.next_motion(position)
-        if step is None or step.motion is None:   # a calibration knows nothing of causes that its model lacks: what they say is hoped for
+        if step is None or step.motion is None:   # predicted only: a calibration has no information on causes that its model lacks
             has_separated, self._separator = self._separator is not None, None
             if has_separated:
-                return Decision(diagnose=True, why='the causes should be told apart by now')
+                return Decision(diagnose=True, why='the causes should be separable now')
             if self._promises_in_vain:
                 return self._ending(IN_VAIN)
             step = self.planner.next_motion(position)
@@ -178,7 +178,7 @@ class Campaign:
 
     @property
     def _promises_in_vain(self):
-        """Whether the last motions have brought next to nothing of what a planner must have hoped for when it chose them."""
+        """Whether the last motions gave almost none of the predicted reduction."""
         return len(self._left) > PATIENCE and self._left[-1] > LEAST_SHARE * self._left[-1 - PATIENCE] > 0
 
     def _outside(self):
@@ -190,5 +190,5 @@ class Campaign:
     def _named(self):
         if not self.findings:
             return ''
-        mates = [f' (not to be told from {", ".join(each.mates)})' if each.mates else '' for each in self.findings]
+        mates = [f' (collinear with {", ".join(each.mates)})' if each.mates else '' for each in self.findings]
         return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))

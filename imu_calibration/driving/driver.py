@@ -1,4 +1,4 @@
-"""The driver: one motion after the other, watched by what the joints really do; whatever is wrong stops everything with one sentence."""
+"""The driver: one motion after another, monitored by the measured joint states; each fault stops all joints with one sentence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imu_calibration.settings import setting
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 
 MARGIN = 1e-6
-"""What a trajectory may lie beyond a limit by rounding, relative to it."""
+"""Relative excess of a trajectory over a limit that is accepted as rounding."""
 OVERSPEED = 1.25
 """Measured speed in units of the limit from which the joints are stopped; rates from encoders are noisy."""
 STILL = 0.1
@@ -24,39 +24,39 @@ STILL = 0.1
 
 
 class DriveState(StrEnum):
-    """What a driver is doing."""
+    """States of a driver."""
 
     IDLE = 'idle'
-    """Nothing moves before it is asked for."""
+    """No motion has been requested."""
     MOVING = 'moving'
     """The joints follow a trajectory."""
     SETTLING = 'settling'
-    """They have come to its end and swing out."""
+    """The joints have reached its end and vibrations decay."""
     MEASURING = 'measuring'
-    """They rest, and the calibration takes what was seen."""
+    """The joints rest, and the calibration reads the new windows."""
     STOPPED = 'stopped'
-    """Something was wrong, or somebody said stop."""
+    """A fault or a stop request."""
     DONE = 'done'
-    """There is nothing more to do."""
+    """The plan is complete."""
 
 
 @dataclass(frozen=True)
 class DriverSettings:
-    """How far joints may stray, and how long they may take."""
+    """Tolerances on the path and on times."""
 
-    following_tolerance: float = setting(0.05, 'rad', 'a joint that turns stops everything when it is further from its path, however late '
-                                         'and slow it goes along it', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
+    following_tolerance: float = setting(0.05, 'rad', 'largest distance of a rotating joint from its path, independent of delay '
+                                         'and speed; all joints stop beyond it', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
                                          live=True)
     following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above', live=True)
-    stall_patience: float = setting(3.0, 's', 'joints that do not come further for so long, by their clock and by ours, have stalled, or '
+    stall_patience: float = setting(3.0, 's', 'joints without progress for this time, by their clock and by ours, have stalled, or '
                                     'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
                                     'stop may be as late',
                                     (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing', live=True)
-    silence: float = setting(1.0, 's', 'without joint states for so long everything is stopped', (0.1, 60.0),
+    silence: float = setting(1.0, 's', 'all joints stop after this time without joint states', (0.1, 60.0),
                              'too small: stops when the machine is busy', live=True)
     settling_time: float = setting(0.5, 's', 'the joints must have rested for so long before the next motion', (0.0, 60.0),
-                                   'too small: what swings out is measured', live=True)
-    settling_patience: float = setting(20.0, 's', 'joints that do not come to rest for so long stop everything', (0.5, 600.0),
+                                   'too small: decaying vibration is measured', live=True)
+    settling_patience: float = setting(20.0, 's', 'all joints stop if they do not rest within this time', (0.5, 600.0),
                                        'too small: a soft arm is called restless', live=True)
     first_reach: float = setting(0.1, 'rad', 'the very first motion turns each joint by at most this and back; 0: none', (0.0, 1.0),
                                  'too small: a wrong sign or joint is not noticed', live=True)
@@ -68,7 +68,7 @@ class DriverSettings:
 
 class Driver:
     """
-    Takes motions, hands out what to send, and watches.
+    Accepts motions, returns trajectories to send, and monitors the joints.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Driver:
     def __init__(self, joint_names: tuple[str, ...], limits: MotionLimits, settings: DriverSettings = DriverSettings()):
         self.joint_names, self.limits = tuple(joint_names), limits
         self.change(settings)
-        self.state, self.reason, self.motions = DriveState.IDLE, 'nothing moves before start', 0
+        self.state, self.reason, self.motions = DriveState.IDLE, 'no motion before start', 0
         self.position: np.ndarray | None = None
         """Where the joints were seen last."""
         self.ignored: dict[str, int] = {}
@@ -106,34 +106,34 @@ class Driver:
 
     @property
     def is_driving(self) -> bool:
-        """Whether joints may be in motion at the driver's word."""
+        """Whether the driver has commanded a motion that may be in progress."""
         return self.state in (DriveState.MOVING, DriveState.SETTLING)
 
     @property
     def progress(self) -> float:
-        """How far along its path the motion is, s of the path's own time; 0 without one."""
+        """Progress along the path, s of the time of the path; 0 without a motion."""
         return 0.0 if self._watch is None else self._watch.progress
 
     @property
     def rests(self) -> bool:
-        """Whether the joints have rested for the settling time where they are, and nothing that was sent is still to come."""
+        """Whether the joints have rested for the settling time and no command is pending."""
         return (self._rested_at is not None and self._time - self._rested_since >= self.settings.settling_time
                 and not self.awaits_stop)
 
     @property
     def awaits_stop(self) -> bool:
         """
-        Whether a motion that was stopped may still begin, or go on after a rest.
+        Whether a stopped motion may still begin, or continue after a rest.
 
-        A controller may take `stall_patience` to do what it is told, by its clock and by ours: joints that rest before that
-        say nothing.
+        A controller may need `stall_patience` to execute a command, by its clock and by ours: a rest before that
+        is no evidence.
         """
         if self._stopped is None:
             return False
         return min(self._time - self._stopped[0], self._heard - self._stopped[1]) < self.settings.stall_patience
 
     def is_silent(self, now: float) -> bool:
-        """Whether no joint state has come for too long, by a steady clock."""
+        """Whether the time since the last joint state exceeds `silence`, by a steady clock."""
         return now - self._heard > self.settings.silence
 
     def stamp_fault(self, now: float) -> str:
@@ -151,25 +151,25 @@ class Driver:
 
     def begin(self, points: TrajectoryPoints, words: str, now: float) -> TrajectoryPoints:
         """
-        Return what is to be sent for a motion from where the joints are.
+        Return the trajectory of a motion from the present joint positions.
 
         Parameters
         ----------
         points : TrajectoryPoints
         words : str
-            What the motion is, for people.
+            Description of the motion.
         now : float
             Seconds of a steady clock.
 
-        Raises an InputError when nothing may move at present, or the motion goes beyond a limit.
+        Raises an InputError if no motion is allowed at present, or the motion exceeds a limit.
         """
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
-            raise InputError(f'a motion may begin where the joints rest and nothing is wrong, the state is {self.state}: {self.reason}; '
+            raise InputError(f'a motion may begin if the joints rest and no fault is present, the state is {self.state}: {self.reason}; '
                              'start anew', code='wrong_state')
         if self.position is None or self.is_silent(now):
-            raise InputError('joint states must come before anything moves, none came; publish them', code='no_joint_states')
+            raise InputError('joint states are needed before a motion, none were received; publish them', code='no_joint_states')
         if not self.rests:
-            raise InputError('the joints must rest before a motion begins, they have just moved; start anew where they rest',
+            raise InputError('the joints must rest before a motion begins, they have just moved; start again when they rest',
                              code='joints_moving')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
@@ -183,7 +183,7 @@ class Driver:
         assert self.position is not None
         path = trajectory_from(at_rest(self.position), points)
         beyond, speed, acceleration = excess(path, self.limits)
-        # Where an encoder says that a joint stands a little beyond its end, it may go back from there.
+        # A joint whose encoder reads slightly outside its range may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
         beyond -= max(float(np.max(outside)), 0.0)
         if beyond > MARGIN or max(speed, acceleration) > 1.0 + MARGIN or points.acceleration is None:
@@ -193,7 +193,7 @@ class Driver:
 
     def observe(self, time: float, position: np.ndarray, rate: np.ndarray, *, now: float) -> bool:
         """
-        Take one joint state; return whether everything has to be stopped.
+        Process one joint state; return whether all joints must stop.
 
         A position that is not finite makes the message count as ignored, a rate that is not finite as missing.
 
@@ -234,7 +234,7 @@ class Driver:
         return self._settle()
 
     def tick(self, now: float) -> bool:
-        """Look at the clock; return whether everything has to be stopped."""
+        """Check the time limits; return whether all joints must stop."""
         if self.is_driving and self.is_silent(now):
             return self.stop(f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint states are published'
                              + self.ignored_words())
@@ -246,7 +246,7 @@ class Driver:
         return f' (ignored because a position was not finite: {counts})' if counts else ''
 
     def refused(self, why: str) -> bool:
-        """Take note that the controller does not do what it was asked; return whether everything has to be stopped."""
+        """Record that the controller rejected or aborted the goal; return whether all joints must stop."""
         return self.is_driving and self.stop(f'the controller does not follow: {why}')
 
     def stop(self, why: str) -> bool:
@@ -263,7 +263,7 @@ class Driver:
         self._become(DriveState.IDLE, why)
 
     def finish(self, why: str) -> None:
-        """There is nothing more to do."""
+        """The plan is complete."""
         self._watch = None
         self._become(DriveState.DONE, why)
 
@@ -271,7 +271,7 @@ class Driver:
         self.state, self.reason = state, reason
 
     def _beyond(self, position, rate):
-        """Return what is wrong with where the joints are and how fast they go, '' when nothing is."""
+        """Return the fault of joint positions and speeds, '' for none."""
         assert self.position is not None
         over = np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
         if np.max(over) > 0:
@@ -285,7 +285,7 @@ class Driver:
         return ''
 
     def _straying(self):
-        """Return what is wrong with how the joints follow, '' when nothing is."""
+        """Return the fault of path tracking, '' for none."""
         watch = self._watch
         if watch.has_strayed:
             joint = watch.suspect()
@@ -296,23 +296,23 @@ class Driver:
             return ''
         if not watch.has_begun:
             return (f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '
-                    'listen, see what it says')
-        return (f'joint {self.joint_names[watch.suspect()]} has not come further for {watch.waited:.1f} s: stopped; '
+                    'listen, see its log')
+        return (f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f} s: stopped; '
                 'see whether something holds it')
 
     def _note_rest(self):
-        """Begin to count anew where the joints have moved, or their clock was set back."""
+        """Restart the timer when the joints have moved, or their clock was set back."""
         if (self._rested_at is None or self._time < self._rested_since
                 or np.any(np.abs(self.position - self._rested_at) > STILL * self.tolerance)):
             self._rested_at, self._rested_since = self.position, self._time
 
     def _settle(self):
-        """Wait for rest; return whether everything has to be stopped."""
+        """Wait for rest; return whether all joints must stop."""
         if self.rests:
             self._watch = None
             self._become(DriveState.MEASURING, self.reason)
         elif self._time - self._settling_since > self.settings.settling_patience:
-            return self.stop(f'the joints do not come to rest within {self.settings.settling_patience:g} s: stopped; see what moves them')
+            return self.stop(f'the joints do not rest within {self.settings.settling_patience:g} s: stopped; find the cause of the motion')
         return False
 
     def _told(self, joint, position):

@@ -1,4 +1,4 @@
-"""Whether joints are on the path that they were asked for, however slowly they go along it."""
+"""Distance of the joints from the commanded path, independent of their speed along it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.joint_trajectory import trajectory_from
 
 STEP = 0.01
-"""Distance of the instants at which the path is looked at, s."""
+"""Step of the instants at which the path is evaluated, s."""
 REACH = 0.1
-"""How much further than the clock says joints may have come between two looks, s: stamps jitter."""
+"""Largest progress in excess of the elapsed time between two joint states, s: stamps jitter."""
 DEAD_BAND = 0.5
 """Places of the path as near as this, in tolerances, fit alike: turning points of swings look the same
 from both sides, and arms sag."""
@@ -22,7 +22,7 @@ SLOWEST = 0.05
 MOVED = 0.4
 """Tolerances from where they were by which joints have begun to move."""
 MEMORY = 1.0
-"""Seconds of motion that tell which joint it is that does not move."""
+"""Seconds of motion that identify a joint that does not move."""
 FAST = 0.05
 """Largest rate at which a path counts as at rest, in tolerances per second."""
 
@@ -41,7 +41,7 @@ class PathWatch:
     """
     Follows joints along a trajectory.
 
-    The clock does not say where they ought to be: a controller may lag, and scale its speed. How far they have come is where on the path
+    The clock does not determine the position: a controller may lag, and scale its speed. The progress is the point where on the path
     they are, never backwards and never faster than the clock; while the path rests, the clock counts.
 
     Parameters
@@ -50,7 +50,7 @@ class PathWatch:
         Where the joints rest.
     points : TrajectoryPoints
     tolerance : ndarray, shape (n_joints,)
-        How far from the path each joint may be.
+        Largest distance of each joint from the path.
 
     """
 
@@ -60,7 +60,7 @@ class PathWatch:
         self._time = np.linspace(0.0, points.duration, count + 1)
         motion = path.at(self._time)
         self._path, self.tolerance = motion.position / tolerance, np.asarray(tolerance, float)
-        # The spline's rate at an instant may vanish where a swing turns: at rest is what does not move over several steps.
+        # The rate of the spline may vanish where an oscillation reverses: rest means no motion over several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
         self._rests = moved < FAST * STEP
         edge = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
@@ -74,46 +74,46 @@ class PathWatch:
         self.has_begun = False
         """Whether the joints have left where they were."""
         self.waited = 0.0
-        """Seconds of their clock since the joints last came further along a path that goes on."""
+        """Seconds of their clock since the last progress of the joints along an unfinished path."""
         self.deviation = np.zeros(len(start))
         """Distance of each joint from the path, in tolerances."""
 
     @property
     def progress(self) -> float:
-        """How far along the path the joints are, s of its own time."""
+        """Progress of the joints along the path, s of the time of the path."""
         return float(self._time[self._at])
 
     @property
     def at_end(self) -> bool:
-        """Whether they have come to the last point."""
+        """Whether they have reached the last point."""
         return self._at == len(self._time) - 1
 
     @property
     def pace(self) -> float:
-        """Share of the path's speed at which the joints have come along it."""
+        """Speed of the joints along the path as a share of the speed of the path."""
         return float(np.clip(self._came / self._took, SLOWEST, 1.0)) if self._took > 0 else 1.0
 
     @property
     def has_stalled_for(self) -> float:
         """
-        Seconds that the joints have not come further, by their clock and by ours, as they would count at the path's own speed.
+        Seconds without progress of the joints, by their clock and by ours, scaled to the speed of the path.
 
-        A simulated clock that runs ahead of ours gives the controller less time than it says.
+        A simulated clock that runs faster than ours gives the controller less time than its stamps show.
         """
         return min(self.waited, self._now - self._further) * self.pace
 
     def observe(self, time: float, position: np.ndarray, *, now: float) -> None:
-        """Take where the joints are at `time`, s of their own clock, and `now`, s of a steady one."""
+        """Process joint positions at `time`, s of their clock, and `now`, s of a steady clock."""
         elapsed = 0.0 if self._last is None else max(time - self._last, 0.0)
         self._last, place = time, position / self.tolerance
         self._remember(time, place)
         rests = self._rests[self._at]
-        # Joints may leave a rest before the clock says so, so its end is looked at as well.
+        # Joints may end a rest before the scheduled time, so its end is evaluated as well.
         stop = np.searchsorted(self._time, self._time[self._rest_end[self._at]] + elapsed + REACH, side='right')
         ahead = slice(self._at, max(stop, self._at + 1))
         away = np.max(np.abs(self._path[ahead] - place), axis=1)
         fits = np.flatnonzero(away <= max(DEAD_BAND, np.min(away)))
-        # The remainder below a step is kept, or a slow pace would never leave a rest.
+        # The remainder below a step is kept; otherwise a slow pace would never end a rest.
         expected = self.progress + self._remainder + elapsed * (self.pace if rests else 1.0)
         before, self._at = self._at, self._at + int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))])
         self._remainder = float(np.clip(expected - self.progress, -STEP, STEP))
@@ -138,11 +138,11 @@ class PathWatch:
         return bool(np.max(self.deviation) > 1.0)
 
     def suspect(self) -> int:
-        """Return the joint that has moved least of what the path asks for: just before when it has strayed, next when the joints wait."""
+        """Return the joint with the smallest share of the commanded motion: before the present point after a deviation, after it in a stall."""
         near, place = int(MEMORY * self.pace / STEP) + 1, self._recent[-1][1]
         if self.has_strayed:
             wanted = np.ptp(self._path[max(self._at - near, 0):self._at + 1], axis=0)
-        else:   # distance to the path ahead: of joints that move alike, those that have arrived do not hold up the others
+        else:   # distance to the following path: of joints with equal motion, a joint that has arrived is not the cause
             wanted = np.max(np.abs(self._path[self._at:self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
         return int(np.argmax(wanted - moved - TIE * self._most))

@@ -1,4 +1,4 @@
-"""From what a diagnosis said on a topic to the planner of the motion that tells its causes apart."""
+"""From a diagnosis on a topic to the planner of the motion that separates its collinear causes."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.reference.table import Table
 
 LONGEST = 180.0
-"""What no plan of this length tells apart is one cause for this table, s."""
+"""Causes that no plan of this length separates count as one cause for this table, s."""
 
 
 def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,
                  options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None) -> Planner:
     """
-    Return the planner of the motion that tells a suspect from its mates.
+    Return the planner of the motion that separates a suspect from its mates.
 
     Parameters
     ----------
     table : Table
     calibration : Calibration
-        What is known, of a model that may lack the suspect.
+        The calibration, of a model that may lack the suspect.
     suspect : Suspect
     noise : mapping
         Sensor -> NoiseModel of single samples at `rate`.
@@ -39,7 +39,7 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
     options : CalibrationOptions
         Tolerances and catalogue.
     limits : MotionLimits, optional
-        Default those of the table.
+        Default: the limits of the table.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
 
 
 def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]) -> Calibration:
-    """Return the calibration with an effect as large as it was found; what is known of the others stays."""
+    """Return the calibration with an effect at its estimated size; the other parameters do not change."""
     if cause in calibration.model.slices:
         return calibration
     model = calibration.model.with_effect(*cause)

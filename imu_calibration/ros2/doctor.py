@@ -16,20 +16,20 @@ CATEGORY = 'imu'
 
 @cache
 def _streams() -> list[StreamFindings]:
-    """Return what is found, once for the check and the report of it."""
+    """Return the findings, computed once for check and report."""
     with DirectNode(None) as direct:
         return look(direct.node, rclpy.spin_once)
 
 
 class ImuCheck(DoctorCheck):
-    """Check that Imu messages are what others make of them."""
+    """Check that Imu messages follow the conventions of sensor_msgs."""
 
     def category(self) -> str:
         """Return the name that links the check and its report."""
         return CATEGORY
 
     def check(self) -> Result:
-        """Say what is wrong with each topic."""
+        """Return the faults of each topic."""
         result = Result()
         kinds: dict[str, tuple[Callable, Callable]] = {REFUSE: (doctor_error, result.add_error), WARNING: (doctor_warn, result.add_warning)}
         for stream in _streams():
@@ -42,7 +42,7 @@ class ImuCheck(DoctorCheck):
 
 
 class ImuReport(DoctorReport):
-    """Report what every Imu topic is like."""
+    """Report the properties of every Imu topic."""
 
     def category(self) -> str:
         """Return the name that links the check and its report."""

@@ -1,4 +1,4 @@
-"""The Imu topics of a running system, heard for a few seconds and looked at by preflight."""
+"""The Imu topics of a running system, recorded for a few seconds and checked by preflight."""
 
 import time
 from collections import deque
@@ -19,12 +19,12 @@ from msg_adapters.live import LiveGatherer
 
 TYPE = 'sensor_msgs/msg/Imu'
 SECONDS = 3.0
-"""How long topics are listened to, up to `PATIENCE` times where less than `ENOUGH` came."""
+"""Seconds of recording, up to `PATIENCE` times as many if fewer than `ENOUGH` messages were received."""
 DISCOVERY = 2.0
 """Seconds in which the nodes of the system are found, up to `PATIENCE` times where no Imu topic was."""
 PATIENCE = 3
 ENOUGH = 100
-"""Messages that tell what a topic is like."""
+"""Messages that suffice to check a topic."""
 NAMES = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
 """Endings of topics that carry Imu messages by convention (REP 145)."""
 NOT_MEASURED = ('/imu/residual',)
@@ -33,26 +33,26 @@ NOT_MEASURED = ('/imu/residual',)
 
 @dataclass(frozen=True)
 class StreamFindings:
-    """What is known of one topic."""
+    """Properties of one topic."""
 
     topic: str
     """Full name."""
     source: str
     """Its publishers and how reliable they are."""
     findings: tuple[CheckFinding, ...]
-    """What looks right and wrong."""
+    """Findings of preflight."""
 
 
 def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     """
-    Listen to every Imu topic for some seconds and return what was found, by name.
+    Record every Imu topic for some seconds and return the findings by name.
 
     Parameters
     ----------
     node : Node
         Subscribes for that time.
     spin_once : callable
-        Lets the node work once; called with the node and ``timeout_sec=``.
+        Spins the node once; called with the node and ``timeout_sec=``.
 
     """
     for _ in range(PATIENCE):
@@ -71,7 +71,7 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
 
 
 def _imu_topics(node):
-    """Return the topics that carry Imu messages, or should by their names, and that somebody publishes."""
+    """Return the published topics with Imu messages, or with names of Imu topics."""
     return [name for name, types in sorted(node.get_topic_names_and_types())
             if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
 
@@ -88,14 +88,14 @@ class _Stream:
     def __init__(self, node, topic):
         self.node, self.topic = node, topic
         self._begin()
-        self.by_wall_clock = not node.count_publishers('/clock')   # else stamps belong to the time that is played
+        self.by_wall_clock = not node.count_publishers('/clock')   # otherwise stamps are in simulated time
         self.input = BatchInput(node, Imu, topic, add=self._add)
 
     def _begin(self):
         self.heads, self.gatherer, self.count = ImuHeads(), LiveGatherer(), 0
 
     def ask_for_what_is_offered(self):
-        """Subscribe as the publishers offer it; begin anew, for what waited for the first subscription comes twice."""
+        """Subscribe with the QoS of the publishers; start again, because messages queued for the first subscription are received twice."""
         self.input.look()
         self._begin()
 
@@ -118,10 +118,10 @@ class _Stream:
                                f'of {TYPE}; rename its topic')
         names = sorted(self.input.names())
         if len(names) > 1:
-            yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): what they '
-                               'send mixes; stop all but one, or rename their topics')
+            yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
+                               'messages mix; stop all but one, or rename their topics')
         if names and not self.heads.evidence().frame_ids:
-            yield CheckFinding('silence', WARNING, f'messages must come, none came in {PATIENCE * SECONDS:g} s; look at the driver')
+            yield CheckFinding('silence', WARNING, f'messages are required, none were received in {PATIENCE * SECONDS:g} s; check the driver')
 
     def _listeners(self):
         wrong = 0
@@ -130,8 +130,8 @@ class _Stream:
                 answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
                 if answer == QoSCompatibility.ERROR:
                     wrong += 1
-                    yield CheckFinding('qos', REFUSE, f'who listens must ask for no more than is offered, {listener.node_name} hears '
-                                       f'nothing of {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
+                    yield CheckFinding('qos', REFUSE, f'a subscriber must request no more than the publisher offers, {listener.node_name} receives '
+                                       f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
         if self.input.publishers and not wrong:
-            reliable = 'reliable' if self.input.reliable else 'best effort: what the network loses is lost'
+            reliable = 'reliable' if self.input.reliable else 'best effort: messages lost by the network are not repeated'
             yield CheckFinding('qos', GOOD, f'published {reliable}')

@@ -211,7 +211,7 @@ def test_stop_is_safe_at_any_moment(moment):
 
 
 @pytest.mark.parametrize('controller, sentence', [
-    ({'stall_joint': 'inner', 'stall_time': 2.0}, r'joint inner(, at .* deg, does not follow: the joints are .* deg from their path| has not come further)'),
+    ({'stall_joint': 'inner', 'stall_time': 2.0}, r'joint inner(, at .* deg, does not follow: the joints are .* deg from their path| has made no progress)'),
     ({'stall_joint': 'inner', 'stall_time': 0.0}, r'joint inner'),
     ({'refuse_after': 0}, r'nothing moved for 3\.\d s after a trajectory was sent: stopped; the controller refused it or does not listen')])
 def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_sentence(controller, sentence):
@@ -247,7 +247,7 @@ def test_a_controller_has_its_patience_by_the_clock_of_the_joints_and_by_ours(cl
         bench.look()
     bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))   # somebody else stops it, long after it was sent
     stopped = bench.now
-    assert bench.until_it_rests() is DriveState.STOPPED and 'has not come further for' in bench.driver.reason
+    assert bench.until_it_rests() is DriveState.STOPPED and 'has made no progress for' in bench.driver.reason
     assert 0.0 <= bench.now - stopped - patience < 1.0
 
 
@@ -282,7 +282,7 @@ def test_joints_that_do_not_come_to_rest_stop_everything():
     for k in range(300):
         if bench.driver.observe(bench.now + k * STEP, place + 0.02 * np.sin(k * 0.5), np.zeros(2), now=bench.now):
             break
-    assert 'do not come to rest within 2 s' in bench.driver.reason
+    assert 'do not rest within 2 s' in bench.driver.reason
 
 
 def random_limits(seed):
@@ -376,7 +376,7 @@ def test_a_campaign_moves_asks_what_is_wrong_separates_and_ends_with_its_reason(
     assert decided == ['move'] * 4 + ['diagnose', 'move', 'move', 'diagnose', 'all within tolerance; beyond bias and matrix there is gyro_scale_asymmetry']
     assert hand.separated == [alike] and campaign.separations == 1
     stubborn = Campaign(hand := OldHand(), CampaignSettings(separations=2), hand.separator)
-    assert carried_out(stubborn, [[alike]] * 9)[-1].endswith('there is gyro_quadratic (not to be told from gyro_scale_asymmetry)')
+    assert carried_out(stubborn, [[alike]] * 9)[-1].endswith('there is gyro_quadratic (collinear with gyro_scale_asymmetry)')
     assert stubborn.separations == 2
     hand.separable = False
     assert 'no motion is known that separates them: no joint turns' in Campaign(hand, make_separator=hand.separator).take_findings([alike])
