@@ -45,7 +45,7 @@ class DriverSettings:
     """Tolerances on the path and on times."""
 
     following_tolerance: float = setting(0.05, 'rad', 'largest distance of a rotating joint from its path, independent of delay '
-                                         'and speed; all joints stop beyond it', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
+                                         'and speed; beyond it all stop', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
                                          live=True)
     following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above', live=True)
     stall_patience: float = setting(3.0, 's', 'joints without progress for this time, by their clock and by ours, have stalled, or '

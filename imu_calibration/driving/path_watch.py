@@ -138,7 +138,7 @@ class PathWatch:
         return bool(np.max(self.deviation) > 1.0)
 
     def suspect(self) -> int:
-        """Return the joint with the smallest share of the commanded motion: before the present point after a deviation, after it in a stall."""
+        """Return the joint with the smallest share of the commanded motion: before this point after a deviation, after it in a stall."""
         near, place = int(MEMORY * self.pace / STEP) + 1, self._recent[-1][1]
         if self.has_strayed:
             wanted = np.ptp(self._path[max(self._at - near, 0):self._at + 1], axis=0)

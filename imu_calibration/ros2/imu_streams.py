@@ -121,7 +121,7 @@ class _Stream:
             yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
                                'messages mix; stop all but one, or rename their topics')
         if names and not self.heads.evidence().frame_ids:
-            yield CheckFinding('silence', WARNING, f'messages are required, none were received in {PATIENCE * SECONDS:g} s; check the driver')
+            yield CheckFinding('silence', WARNING, f'messages are required, none came in {PATIENCE * SECONDS:g} s; check the driver')
 
     def _listeners(self):
         wrong = 0
@@ -130,7 +130,7 @@ class _Stream:
                 answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
                 if answer == QoSCompatibility.ERROR:
                     wrong += 1
-                    yield CheckFinding('qos', REFUSE, f'a subscriber must request no more than the publisher offers, {listener.node_name} receives '
+                    yield CheckFinding('qos', REFUSE, f'a subscriber must request at most the offered QoS, {listener.node_name} receives '
                                        f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
         if self.input.publishers and not wrong:
             reliable = 'reliable' if self.input.reliable else 'best effort: messages lost by the network are not repeated'
