@@ -66,7 +66,7 @@ def from_text(text: str, what: str = 'document') -> dict[str, Any]:
     """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
     document = parsed(text, what)
     if not isinstance(document, dict):
-        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file')
+        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file', code='not_a_mapping')
     return document
 
 
@@ -96,7 +96,7 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
         _look_through(yaml.parse(text, Loader=loader), what, aliases)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
-        raise InputError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file') from error
+        raise InputError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file', code='not_yaml') from error
 
 
 def _look_through(events, what, aliases):
@@ -136,7 +136,7 @@ def _check_key(event, mapping, what):
     key = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
         raise InputError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
-                         f'{event.start_mark.line + 1}; remove it')
+                         f'{event.start_mark.line + 1}; remove it', code='key_repeated')
     mapping[2].update([key] if key is not None else [])
 
 

@@ -113,7 +113,8 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     try:
         import xacro
     except ImportError as error:
-        raise InputError("a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'") from error
+        raise InputError("a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'",
+                         code='package_missing') from error
     try:
         return xacro.process_file(str(path)).toxml()
     except Exception as error:   # macros raise whatever their expressions do

@@ -105,7 +105,7 @@ def noise_from_text(text: str) -> NoiseFigures:
     try:
         document = from_text(text, 'noise document')
     except InputError as error:
-        raise DocumentError(str(error)) from error
+        raise DocumentError(str(error), code=error.code) from error
     found = str(document.get('format'))
     if found != FORMAT:
         raise DocumentError(f"a noise document must say 'format: {FORMAT}', got '{found}'; give a file written by 'imu_calibration noise'",
@@ -113,8 +113,8 @@ def noise_from_text(text: str) -> NoiseFigures:
     try:
         return _parse(document)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DocumentError(f'a noise document must have the parts of {FORMAT}, something is missing or misshapen '
-                            f'({type(error).__name__}: {error}); write it anew', code='document_parts') from error
+        raise DocumentError(f'a noise document must have the parts of {FORMAT}, one is missing or has another shape '
+                            f'({type(error).__name__}: {error}); identify the noise again', code='document_parts') from error
 
 
 def _parse(document):

@@ -181,8 +181,8 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
     known = {section: [name for owner, name in catalogue.effects() if owner == section] for section in SECTIONS}
     for section, entries in mapping.items():
         if section not in known or not isinstance(entries, dict):
-            raise InputError(f'a tolerance file must hold the mappings {", ".join(SECTIONS)}, it holds {shortened(repr(section))}: '
-                             f'{shortened(repr(entries))}; correct it')
+            raise InputError(f'a tolerance file must have the mappings {", ".join(SECTIONS)}, it has {shortened(repr(section))}: '
+                             f'{shortened(repr(entries))}; correct it', code='tolerance_section')
         for name, value in entries.items():
             if name not in known[section]:
                 raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; '
@@ -257,14 +257,14 @@ def from_mapping(document: Any) -> Calibration:
     """
     if not isinstance(document, dict):
         raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; "
-                            "give a file written by 'imu_calibration calibrate'")
+                            "give a file written by 'imu_calibration calibrate'", code='not_a_mapping')
     _check_format(document.get('format'))
     check_parts(document)
     try:
         calibration = Calibration(**parts_of(document))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
-        raise DocumentError(f'a calibration document must have the parts of {FORMAT}, something is missing or misshapen '
-                            f'({_one_line(error)}); write it anew', code='document_parts') from error
+        raise DocumentError(f'a calibration document must have the parts of {FORMAT}, one is missing or has another shape '
+                            f'({_one_line(error)}); calibrate again', code=getattr(error, 'code', '') or 'document_parts') from error
     return check_numbers(calibration)
 
 
@@ -300,5 +300,5 @@ def calibration_from_text(text: str) -> Calibration:
     try:
         mapping = from_text(text, 'calibration document')
     except InputError as error:
-        raise DocumentError(str(error), code='document_too_long') from error
+        raise DocumentError(str(error), code=error.code) from error
     return from_mapping(mapping)

@@ -1,4 +1,4 @@
-"""What must hold of a calibration document beyond its layout: whoever uses one that was read needs no checks of its own."""
+"""Checks of the values in a calibration document; a document that was read needs no further checks."""
 
 import math
 from collections.abc import Mapping
@@ -104,7 +104,7 @@ KNOWN = {
 
 def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> None:
     """
-    Refuse a document (dict) in which a part that others read is not what it must be; further parts may be anything.
+    Refuse a document in which a part of `known` has another type or range; other parts are not checked.
 
     Raises
     ------
@@ -118,43 +118,43 @@ def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> N
         if isinstance(wanted, dict):
             if not isinstance(value, dict) and (value is not None or place):
                 raise DocumentError(f"'{place}{name}' must be a mapping, got {shortened(repr(value))}; "
-                                    "correct the calibration file or write it anew")
+                                    "correct the calibration file or calibrate again", code='not_a_mapping')
             check_parts(value or {}, wanted, f'{place}{name}.')
         elif not wanted(value):
-            raise DocumentError(f"'{place}{name}' has a value that it cannot have, {shortened(repr(value))}; "
-                                "correct the calibration file or write it anew")
+            raise DocumentError(f"'{place}{name}' must have the type and range of the format, got {shortened(repr(value))}; "
+                                "correct the calibration file or calibrate again", code='part_value')
 
 
 def check_numbers(calibration: 'Calibration') -> 'Calibration':
     """
-    Return the calibration when its numbers can belong to an IMU.
+    Return the calibration if its values are possible for an IMU.
 
-    A sensor whose matrix is ill-conditioned has nominal parameters and the decision `harms` in the result: the other one can be used.
+    In the result a sensor with an ill-conditioned matrix has nominal parameters and the decision `harms`; the other sensor can be used.
 
     Raises
     ------
     DocumentError
-        When a value is not finite, a covariance is none, or neither sensor matrix can be inverted.
+        When a value is not finite, a covariance is not positive semidefinite, or both sensor matrices are ill-conditioned.
 
     """
     values, covariance = calibration.values, calibration.covariance
     effects = calibration.model.effects
     levels = np.repeat([e.role is Role.LIMIT for e in effects], [e.size for e in effects])
     if not np.all(np.isfinite(values[~levels])) or not np.all(np.isfinite(covariance)):
-        raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again')
+        raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again', code='not_finite')
     if not np.all(values[levels] > 0):
-        raise DocumentError('a saturation level must be larger than zero, one is not; calibrate again')
+        raise DocumentError('a saturation level must be larger than zero, one is not; calibrate again', code='saturation_level')
     if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > LARGEST:
-        raise DocumentError(f'values and standard deviations must stay below {LARGEST:g}, some do not; calibrate again')
+        raise DocumentError(f'values and standard deviations must be below {LARGEST:g}, some are not; calibrate again', code='too_large')
     _check_covariance(covariance)
     terms, variance = calibration.covariance_terms, np.diag(covariance)
     parts = np.array(list(terms.values()))
     if terms and not np.all(np.abs(parts.sum(axis=0) - variance) <= ROUNDING * np.abs(parts).sum(axis=0)):
-        raise DocumentError('the terms of each variance must sum to it, those of some do not; calibrate again')
+        raise DocumentError('the terms of each variance must sum to it, some do not; calibrate again', code='covariance_terms')
     for sensor in SENSORS:
         for needed in BASE:
             if not calibration.has(sensor, needed):
-                raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again")
+                raise DocumentError(f"the {sensor} must have '{needed}', it is missing; calibrate again", code='effect_missing')
     return _without_ill_conditioned(calibration)
 
 
@@ -163,7 +163,7 @@ def _without_ill_conditioned(calibration):
     wrong = {sensor: f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {number:.3g}; '
                      'calibrate again with more attitudes' for sensor, number in condition.items() if not number < CONDITION_LIMIT}
     if len(wrong) == len(SENSORS):
-        raise DocumentError(next(iter(wrong.values())))
+        raise DocumentError(next(iter(wrong.values())), code='ill_conditioned')
     if not wrong:
         return calibration
     return replace(with_nominal(calibration, list(wrong)), decision=calibration.decision | dict.fromkeys(wrong, str(HARMS)),
@@ -173,8 +173,9 @@ def _without_ill_conditioned(calibration):
 def _check_covariance(covariance):
     variance = np.diag(covariance)
     if np.any(variance < 0):
-        raise DocumentError('variances must not be negative, some are; calibrate again')
+        raise DocumentError('variances must not be negative, some are; calibrate again', code='negative_variance')
     scale = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = covariance / np.outer(scale, scale)
     if np.max(np.abs(correlation - correlation.T)) > ROUNDING or np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
-        raise DocumentError('the covariance must be symmetric and without negative directions, this one is not; calibrate again')
+        raise DocumentError('the covariance must be symmetric and positive semidefinite, it is not; calibrate again',
+                            code='not_a_covariance')

@@ -32,7 +32,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         _check_unit(entry.get('unit'), effect)
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
             raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; "
-                                "write it anew")
+                                "calibrate again", code='negative_sd')
     return {'model': replace(model.at(values), centre=_centre(model, entries)), 'values': values,
             'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
@@ -55,7 +55,7 @@ def _model(document):
         for name in part['effects']:
             sensor = owners.get(name, section)
             if (sensor, name) in entries:
-                raise DocumentError(f"an effect must be listed once, '{name}' is there twice")
+                raise DocumentError(f"an effect must be listed once, '{name}' is listed twice; remove one", code='effect_repeated')
             members[sensor].append(name)
             entries[sensor, name] = part[name]
     return SensorModel(*(tuple(members[s]) for s in SECTIONS), joint_names=joint_names,
@@ -65,21 +65,21 @@ def _model(document):
 def _shaped(value, effect):
     array = np.asarray(value, float)
     if array.shape != effect.shape or np.asarray(value).dtype == bool:
-        raise DocumentError(f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct the calibration file")
+        raise DocumentError(f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct the file", code='shape')
     return array.ravel()
 
 
 def _statuses(value, effect):
     words = np.array(value, dtype=object).reshape(effect.size).tolist()
     if any(word not in tuple(Status) for word in words):
-        raise DocumentError(f"the status of '{effect.name}' must be {', '.join(Status)}; correct the calibration file")
+        raise DocumentError(f"the status of '{effect.name}' must be {', '.join(Status)}; correct the file", code='status_unknown')
     return map(Status, words)
 
 
 def _check_unit(found, effect):
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
-        raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the calibration file")
+        raise DocumentError(f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the file", code='unit')
 
 
 def _centre(model, entries):
@@ -89,7 +89,7 @@ def _centre(model, entries):
     for name, value in found.items():
         if name not in known or value.shape != (known[name].width,) or not np.all(np.isfinite(value)):
             raise DocumentError(f'the centre {shortened(repr(name))} must have one finite number for each column of its effect; '
-                                'correct the calibration file')
+                                'correct the calibration file', code='centre')
     return found
 
 

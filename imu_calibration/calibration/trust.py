@@ -35,10 +35,10 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     """
     Return the part of a calibration that is applied.
 
-    A sensor with the decision `helps` is applied always. Offline `unproven` is applied with a caution, and `harms` with the user's consent
-    only. Live `unproven` is applied with consent only, and `harms` never. By hand the gyroscope's axes are those of the accelerometer, so
-    that it is not applied without the accelerometer. A sensor with values that no instrument has is never applied, nor, live, an unproven
-    one with most of its parameters undetermined.
+    A sensor with the decision `helps` is always corrected. Offline `unproven` is corrected with a caution, and `harms` only with the user's
+    consent. Live `unproven` is corrected only with consent, and `harms` never. By hand the accelerometer defines the axes of the gyroscope,
+    so that the gyroscope is not corrected without it. A sensor with implausible values is never corrected, nor, live, an unproven sensor
+    with most of its parameters undetermined.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     Raises
     ------
     DocumentError
-        When no sensor is left.
+        When no sensor is corrected (code `no_sensor_helps`); the key is `anyway` where consent would change that.
 
     """
     words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
@@ -60,7 +60,7 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
         consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(SENSORS)
         text = ('a calibration must help a sensor on held-out data to be applied, this one does not: '
                 f'{first} {refused[first]}; calibrate again')
-        raise DocumentError(f'{text}, or give your consent', key='anyway') if consent else DocumentError(text)
+        raise DocumentError(f'{text}{", or give your consent" * consent}', key='anyway' if consent else None, code='no_sensor_helps')
     cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
                      if sensor not in refused and words[sensor] is not HELPS)
     return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions)

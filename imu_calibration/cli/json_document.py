@@ -1,4 +1,4 @@
-"""The JSON document that --json prints; `docs/cli.schema.json` describes it."""
+"""The JSON document that --json prints"""
 
 import json
 import math

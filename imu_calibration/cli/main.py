@@ -44,11 +44,11 @@ def run(options: Namespace) -> int:
         return 1
     except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
         if isinstance(error, ImuCalibrationError):
-            text, key = error.told(hints_of(options)), error.key
+            text, key, name = error.told(hints_of(options)), error.key, error.code
         else:
-            text, key = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None
+            text, key, name = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None, ''
         print(f'{prog}: {text}', file=sys.stderr)
-        code, document = 1, {'error': text, 'key': key}
+        code, document = 1, {'error': text, 'key': key, 'code': name}
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.json:

@@ -76,7 +76,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
     calibration = used.calibration
     if rate is not None and not 0 < rate < np.inf:
-        raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it')
+        raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive')
     found, unknown = _noise_numbers(calibration, target, noise, rate)
     placement, numbers = placed_numbers(calibration, target)
     motion = motion or standard_motion(calibration)

@@ -87,8 +87,8 @@ class CompensatorNode(Node):
     def _start(self) -> None:
         if self.settings.calibration_file and not (path := files.user_path(self.settings.calibration_file)).exists():
             if not self.settings.wait_for_file:
-                raise InputError(f"parameter 'calibration_file' must name an existing file, {path} is missing; correct "
-                                 'it, or wait for it with wait_for_file:=true')
+                raise InputError(f"parameter 'calibration_file' must name an existing file, {path} is missing; correct it, or "
+                                 'wait for it with wait_for_file:=true', code='calibration_missing')
             self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
             self.get_logger().info(f'waits for the file {path}')
         elif self.settings.calibration_file:

@@ -76,7 +76,8 @@ class PlannerNode(Node):
         announce(self, ['joint_states', 'imu/calibration', '/diagnostics'], ['joint_trajectory', 'imu/coverage'], note=NOT_CHECKED)
         table = chain_of(self, robot, settings.table_file)
         if table is None:
-            raise InputError("planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them")
+            raise InputError("planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them",
+                             code='table_missing')
         self._table = table
         own = settings.tolerances_file
         tolerances = files.read_tolerances(files.user_path(own) if own else config_file('tolerances.yaml'))

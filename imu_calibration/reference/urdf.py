@@ -93,7 +93,8 @@ def _read(text):
     try:
         from urdf_parser_py.urdf import Robot
     except ImportError as error:
-        raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'") from error
+        raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
+                         code='package_missing') from error
     try:
         if len(text) > LARGEST:
             raise ValueError(f'it has {len(text)} characters, at most {LARGEST} are accepted')

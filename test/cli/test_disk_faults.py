@@ -115,5 +115,5 @@ def test_no_more_than_a_document_may_hold_is_read_from_a_large_file(tmp_path):
         files.read_calibration('/dev/zero')
     with open(tmp_path / 'large.yaml', 'wb') as stream:
         stream.truncate(1 << 40)   # without blocks on the disk
-    with refused(InputError, 'document_too_long'):
+    with refused(InputError, 'document_limit', 2000000):
         files.read_calibration(tmp_path / 'large.yaml')

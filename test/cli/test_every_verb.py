@@ -71,13 +71,13 @@ def test_the_closest_model_effect_topic_profile_or_program_is_suggested(argument
     (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),
     (['effects'], 0, {'effects'}),
     (['export', '--list'], 0, {'targets'}),
-    (['compare', TRUTH, 'nowhere.yaml'], 1, None),
+    (['compare', TRUTH, 'nowhere.yaml'], 1, 'file_unreadable'),
 ])
 def test_json_is_one_document_and_nothing_else(arguments, code, keys, capsys):
     assert main([*arguments, '--json']) == code
     document = json.loads(capsys.readouterr().out)
     assert document['format'] == 'imu_calibration/cli/1' and document['verb'] == arguments[0] and document['exit_code'] == code
-    assert set(document['result']) == keys if keys else 'error' in document['error']
+    assert set(document['result']) == keys if code == 0 else document['error']['code'] == keys
 
 
 def test_quiet_prints_no_result(capsys):

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 
-from imu_calibration.calibration import trust
+from imu_calibration.calibration import decision, trust
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.decision import HARMS, HELPS, NO_PROOF, UNPROVEN, decide, most_cautious, reason_of
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text, from_mapping, to_mapping
@@ -34,7 +35,8 @@ def proven(accelerometer, gyroscope, **changes):
 def test_the_decision_follows_from_the_interval(interval, word):
     assert decide(ENTRY | {'ci95': interval}) is word
     assert decide(ENTRY | {'ci95': interval, 'windows': 0}) is UNPROVEN and decide(None) is UNPROVEN
-    assert ('likely cause' in reason_of(ENTRY | {'ci95': interval})) == (word is not HELPS) and reason_of(None) == NO_PROOF
+    entry = ENTRY | {'ci95': interval}
+    assert (decision._cause(entry) in reason_of(entry)) == (word is not HELPS) and reason_of(None) == NO_PROOF
     assert most_cautious([HELPS, word]) is word
 
 
@@ -45,7 +47,7 @@ def test_a_file_without_a_decision_derives_it_and_one_with_a_decision_cannot_hid
         assert list(from_mapping(document).decisions.values()) == [word or UNPROVEN for word in words]
         assert from_mapping(document | {'decision': {'gyroscope': 'helps'}}).decisions['gyroscope'] is (words[1] or HELPS)
         assert from_mapping(document | {'decision': {'accelerometer': 'harms'}}).decisions['accelerometer'] is HARMS
-    with pytest.raises(DocumentError, match='decision.accelerometer'):
+    with refused(DocumentError, 'part_value', 'decision.accelerometer', 'good'):
         from_mapping(document | {'decision': {'accelerometer': 'good'}})
 
 
@@ -59,7 +61,7 @@ def test_what_is_applied(first, second, anyway, live):
     applied = {HELPS: True, UNPROVEN: anyway or not live, HARMS: anyway and not live}
     known = proven(first, second)
     if not applied[first] and not applied[second]:
-        with pytest.raises(DocumentError) as refusal:
+        with refused(DocumentError, 'no_sensor_helps') as refusal:
             trust.usable(known, anyway=anyway, live=live)
         assert (refusal.value.key == 'anyway') == (not live or UNPROVEN in (first, second)) and '\n' not in str(refusal.value)
         return
@@ -73,13 +75,14 @@ def test_what_is_applied(first, second, anyway, live):
 def test_by_hand_the_gyroscope_is_not_applied_without_the_accelerometer():
     gauge = {'axes': HAND_AXES}
     assert trust.usable(proven(HELPS, HARMS, gauge=gauge)).refused.keys() == {'gyroscope'}
-    with pytest.raises(DocumentError):
+    with refused(DocumentError, 'no_sensor_helps', HARMS):
         trust.usable(proven(HARMS, HELPS, gauge=gauge))
 
 
 def test_parameters_that_are_not_determined_are_named():
     weak = replace(PLAIN, status=(HELD,) * 2 + PLAIN.status[2:])
-    assert trust.caveats(weak) == ['2 of 33 parameters not determined (accelerometer.bias.x, accelerometer.bias.y)']
+    line, = trust.caveats(weak)
+    assert all(value in line for value in ('2', '33', 'accelerometer.bias.x', 'accelerometer.bias.y')) and 'accelerometer.bias.z' not in line
     assert trust.caveats(PLAIN) == []
 
 
@@ -88,12 +91,12 @@ def test_a_document_with_one_ill_conditioned_sensor_loads_for_the_other():
     document = to_mapping(proven(HELPS, HELPS))
     document['accelerometer']['matrix']['value'] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.03]]
     found = from_mapping(document)
-    assert found.decisions == {'accelerometer': HARMS, 'gyroscope': HELPS} and 'condition number' in found.decision_reasons['accelerometer']
+    assert found.decisions == {'accelerometer': HARMS, 'gyroscope': HELPS} and '33.' in found.decision_reasons['accelerometer']
     np.testing.assert_array_equal(found.value('gyroscope', 'matrix'), PLAIN.value('gyroscope', 'matrix'))
     np.testing.assert_array_equal(found.value('accelerometer', 'matrix'), np.eye(3))
     assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions
     document['gyroscope']['matrix']['value'] = np.zeros((3, 3)).tolist()
-    with pytest.raises(DocumentError, match='condition number'):
+    with refused(DocumentError, 'ill_conditioned', 20, 33.3):
         from_mapping(document)
 
 
@@ -102,7 +105,7 @@ def test_a_rest_in_one_attitude_is_unproven():
     imu, joints, _, _ = make_session(3, seconds=8.0)
     found = calibrate([lambda: iter([SampleBlock(imu, joints)])], TABLE, OPTIONS).calibration
     assert set(found.decisions.values()) == {UNPROVEN}
-    assert any('does not determine the accelerometer' in line for line in found.notes)
+    assert any('accelerometer' in line for line in found.notes)
     assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions
 
 

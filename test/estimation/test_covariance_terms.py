@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 
 import imu_calibration as imu
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text, from_mapping, to_mapping
@@ -78,7 +79,7 @@ def test_terms_and_reasons_pass_through_the_file(by_table):
         np.testing.assert_array_equal(found.covariance_terms[name], variance)
     document = to_mapping(by_table.calibration)
     document['covariance_terms']['noise'][0] *= 2
-    with pytest.raises(DocumentError, match='sum'):
+    with refused(DocumentError, 'covariance_terms'):
         from_mapping(document)
 
 

@@ -138,7 +138,7 @@ def test_more_layouts_than_are_worth_grouping():
 @pytest.mark.parametrize('encapsulation', [b'\0\2', b'\0\3', b'\0\7', b'\0\x0b', b'\1\1'])
 def test_other_representations_than_plain_cdr_are_dropped(encapsulation):
     data = encapsulation + encode_imu(make_session(1)[0])[0].tobytes()[2:]
-    with pytest.raises(MessageError, match='plain CDR'):
+    with pytest.raises(MessageError, match=f'0x{encapsulation.hex()}'):
         parse_imu(data)
     decoder = Decoder(IMU_TYPE)
     assert decoder.decode(Packed.join([data])) is None

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.documents import version_of
@@ -213,7 +214,7 @@ def test_a_new_calibration_is_no_error(bench, place):
 def test_a_missing_file_ends_the_node_unless_it_is_waited_for(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(compensator_node, 'LOOK_FOR_FILE', 0.05)
     missing = tmp_path / 'later.yaml'
-    with pytest.raises(InputError, match='wait_for_file:=true'):
+    with refused(InputError, 'calibration_missing', str(missing), 'wait_for_file'):
         bench.start(CompensatorNode, {'calibration_file': str(missing)})
     node = bench.start(CompensatorNode, {'calibration_file': str(missing), 'wait_for_file': True}, namespace='patient')
     bench.until(lambda: bench.heard('waits for the file'), 'the line')

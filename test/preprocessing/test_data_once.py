@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
@@ -72,9 +73,10 @@ def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, se
 
 def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):
     def enough(windows, *arguments, **options):
-        raise ImuCalibrationError(f'{len(windows)} windows')
+        assert len(windows) >= 10
+        raise ImuCalibrationError(code='enough')
     monkeypatch.setattr('imu_calibration.calibration.by_evidence.inquire', enough)
-    with pytest.raises(ImuCalibrationError, match=r'^\d\d+ windows'):
+    with refused(ImuCalibrationError, 'enough'):
         diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
 
