@@ -183,11 +183,11 @@ class Effect:
 
     def prior_values(self) -> np.ndarray:
         """Return the prior values, shape (size,)."""
-        return np.array(np.broadcast_to(np.asarray(self.prior, float), (self.size,)))
+        return np.full(self.size, self.prior, float)
 
     def prior_sds(self) -> np.ndarray:
         """Return the standard deviations of the prior, shape (size,)."""
-        return np.array(np.broadcast_to(np.asarray(self.prior_sd, float), (self.size,)))
+        return np.full(self.size, self.prior_sd, float)
 
     def amplitudes(self, values: Any) -> Any:
         """Return the values without the time constant."""

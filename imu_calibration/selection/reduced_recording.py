@@ -6,6 +6,7 @@ from typing import Callable, Sequence
 
 import numpy as np
 
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import all_arms, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
@@ -111,9 +112,12 @@ class ReducedRecording:
         """Indices of each session's windows in order of time."""
         return sessions_of(self.windows)
 
+    @cached_property
+    def _coefficients(self):
+        return {sensor: coefficients(self.model, sensor, self.values) for sensor in SENSORS}
+
     def _with_residual(self, sensor, rows):
-        own = coefficients(self.model, sensor, self.values)
-        rows = rows.copy()
+        own, rows = self._coefficients[sensor], rows.copy()
         rows[..., -3:] -= rows[..., :len(own)] @ own
         return rows
 
