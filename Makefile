@@ -9,6 +9,7 @@ PY = $(VENV)/bin/python
 OUTPUT ?= demo
 TEST_OPTIONS ?=
 SOAK_HOURS ?= 6
+MINUTES ?= 10
 
 # One thread per process: the tests run on two cores already, and sums come out in the same order every time.
 export OMP_NUM_THREADS ?= 1
@@ -36,11 +37,11 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 3
 
-.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak noise-coverage hide-and-seek clean
+.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, noise-coverage, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, clean'
 
 setup: $(STAMP)
 
@@ -124,6 +125,10 @@ bench: $(STAMP)
 
 soak: $(STAMP)
 	@$(PY) test/ros/soak.py --hours $(SOAK_HOURS)
+
+# Mutated recordings, documents and messages for every reader, with limits of memory and processor time; fails on a finding.
+fuzz: $(STAMP)
+	@$(PY) test/fuzz/run.py --minutes $(MINUTES)
 
 hide-and-seek: $(STAMP)
 	@$(PY) test/worlds/hide_and_seek.py

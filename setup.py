@@ -54,11 +54,13 @@ setup(
     ],
     python_requires='>=3.11',
     install_requires=[
-        'numpy>=1.26', 'scipy>=1.11', 'PyYAML', 'matplotlib>=3.6', 'Jinja2', 'rich', 'rosbags>=0.11',
-        'lz4', 'backports.zstd; python_version < "3.14"',
+        # The oldest versions that are tested, constraints/oldest.txt; a test compares.
+        'numpy>=1.26', 'scipy>=1.11', 'PyYAML>=6.0.1', 'matplotlib>=3.6', 'Jinja2>=3.1.2', 'rich>=13.7', 'rosbags>=0.11',
+        'lz4>=4.4', 'backports.zstd>=1.8; python_version < "3.14"',
     ],
     # urdfdom-py brings lxml (12 MB), which only robot descriptions need.
-    extras_require={'arm': ['urdfdom-py', 'xacro'], 'dask': ['dask', 'distributed'], 'view': ['foxglove-sdk']},
+    extras_require={'arm': ['urdfdom-py>=1.2', 'xacro>=2.1'], 'view': ['foxglove-sdk>=0.30'],
+                    'dask': ['dask>=2026.8', 'distributed>=2026.8']},
     zip_safe=False,
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={

@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -50,6 +51,8 @@ NAMES = (
 """Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force and rate."""
 PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
 """Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within the usual rates."""
+LONGEST = 4e9
+"""s; stamps in ns and their differences fit into 64 bits."""
 GRAVITY_BAND = 1.15
 """The median of the specific force may differ from gravity by this factor."""
 RATE_BAND = 1.6
@@ -98,6 +101,7 @@ def is_csv(path: str | PathLike[str]) -> bool:
     return Path(path).suffix.lower() in SUFFIXES
 
 
+@np.errstate(over='ignore', invalid='ignore')   # readings that are not finite are counted where samples are used
 def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     """
     Read a text log with a header line.
@@ -232,10 +236,12 @@ class _Table:
             lines = file.read().splitlines()[self.first:]
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
-        try:
-            data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
-        except ValueError:   # empty cells, text such as "nan" in other languages, truncated rows
-            data = np.genfromtxt(lines, usecols=numbers, invalid_raise=False, **options).reshape(-1, len(numbers))
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', UserWarning)   # rows without all columns, which are left out, and files without rows
+            try:
+                data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
+            except ValueError:   # empty cells, text such as "nan" in other languages, truncated rows
+                data = np.genfromtxt(lines, usecols=numbers, invalid_raise=False, **options).reshape(-1, len(numbers))
         self._values = dict(zip(numbers, data.T, strict=True))
         for k in set(wanted) & self.dates:
             cells = [self._cells(line) for line in lines if line.strip()]
@@ -258,10 +264,12 @@ class _Table:
         values = self.raw(time.names[0])
         if values.dtype.kind == 'M':
             return values.astype(np.int64)
-        if not np.isfinite(values).all():
-            raise InputError(f'the time of every row of {self.path} must be a number, got {np.count_nonzero(~np.isfinite(values))} without '
-                             'one; remove these rows')
-        return stamps_of(values, UNITS['time'][time.unit])
+        unit = UNITS['time'][time.unit]
+        bad = np.count_nonzero(~(np.abs(values * unit) < LONGEST))
+        if bad:
+            raise InputError(f'the time of every row of {self.path} must be a number below {LONGEST:g} s, got {bad} without one; '
+                             'remove these rows', code='csv_time')
+        return stamps_of(values, unit)
 
 
 def _delimiter(lines):

@@ -124,6 +124,9 @@ class HandStore:
                     raise DocumentError(f"saved samples must say '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
                                         'without resume')
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
+            for values, kind, shape in ((imu.stamp_ns, 'i', ()), (imu.force_s, 'f', (3,)), (imu.rate_s, 'f', (3,))):
+                if values.dtype.kind != kind or values.shape != (imu.stamp_ns.size, *shape):
+                    raise ValueError(f'it holds {values.dtype} of shape {values.shape}')
         except ImuCalibrationError:
             raise
         except Exception as error:   # damaged archives and arrays raise many kinds

@@ -17,6 +17,7 @@ from imu_calibration.exports.pose import find_pose
 from imu_calibration.exports.target import Read, Target
 
 
+@np.errstate(all='ignore')   # `check_numbers` refuses what is not finite
 def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = '') -> Calibration:
     """
     Return the calibration in a file of another program.

@@ -141,8 +141,9 @@ def _chain(robot, link):
 
 
 def _origin(joint):
-    origin = joint.origin
-    return np.array((origin and origin.xyz) or (0, 0, 0), float), rotation_from_rpy((origin and origin.rpy) or (0, 0, 0))
+    xyz, rpy = (three_numbers((joint.origin and getattr(joint.origin, name)) or (0, 0, 0), f'origin {name} of joint {joint.name}')
+                for name in ('xyz', 'rpy'))
+    return np.array(xyz), rotation_from_rpy(rpy)
 
 
 def _mimic(robot, joint):

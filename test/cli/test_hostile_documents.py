@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,6 +19,8 @@ from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.cli.fleet_run import units_csv
 from imu_calibration.documents import from_text
 from imu_calibration.errors import DocumentError, InputError
+from imu_calibration.exports.export import export
+from imu_calibration.exports.registry import find_target
 from imu_calibration.files import make_folder, write_text
 from imu_calibration.reference.urdf import root_of
 from imu_calibration.report.figures import draw
@@ -131,7 +134,34 @@ class UnitResult:
         self.name = name
 
 
+def test_saved_samples_of_another_shape_are_refused():
+    import io
+    good = {'format': np.array('imu_calibration/hand_samples/1'), 'frame_id': np.array('imu'), 'stamp_ns': np.arange(4), 'force_s': np.ones((4, 3)),
+            'rate_s': np.ones((4, 3))}
+    for change in ({}, {'stamp_ns': np.array(1)}, {'force_s': np.ones((4, 2))}, {'rate_s': np.ones((5, 3))}, {'force_s': np.ones((4, 3), int)}):
+        target = io.BytesIO()
+        np.savez(target, **good | change)
+        if change:
+            with expected(DocumentError, 'samples_damaged'):
+                HandStore(1000).load(target.getvalue())
+        else:
+            HandStore(1000).load(target.getvalue())
+
+
 # Text that breaks its parser
+
+def test_damaged_files_of_other_programs_are_one_line(tmp_path):
+    """A byte more in a struct of a .mat file ended the process by a segmentation fault in scipy."""
+    content = export(random_calibration(0, ()), find_target('mat')).content
+    at = content.index(b'\x10\0\0\0\x14\0\0\0accelerometer.bias.x')
+    (tmp_path / 'x.mat').write_bytes(content[:at] + b'\0' + content[at:])
+    refused('import', tmp_path / 'x.mat', '--from', 'mat', '--output', tmp_path / 'out.yaml')
+    text = export(random_calibration(0, ()), find_target('autoware'), rate=200.0).content.decode()
+    for value in ('0.9{', '.', '1e999'):
+        (tmp_path / 'x.yaml').write_text(re.sub(r'\{x: [^,]*', '{x: ' + value, text))
+        refused('import', tmp_path / 'x.yaml', '--from', 'autoware', '--output', tmp_path / 'out.yaml')
+
+
 
 def test_deep_and_long_texts_are_one_line(tmp_path, bag):
     (tmp_path / 'deep.json').write_text('[' * 100_000)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusal import refused
 
 import imu_calibration
 from imu_calibration.cli.main import main
@@ -149,3 +150,12 @@ def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_us
     assert bag.exists()
     csv_bag._converted.cache_clear()
     assert not bag.exists()
+
+
+@pytest.mark.parametrize('number', ['1e300', '1e10', 'nan', ''])
+def test_times_beyond_64_bits_are_refused_without_a_warning(tmp_path, number):
+    rows = [(0.005 * k, 0.0, 0.0, 9.81, 1e308, 0.0, 0.0) for k in range(40)]
+    lines = [','.join(map(str, row)) for row in rows] + [f'{number},0,0,9.81,0,0,0', 'short']
+    (tmp_path / 'x.csv').write_text('\n'.join(['time [s],ax [g],ay [g],az [g],gx [deg/s],gy [deg/s],gz [deg/s]', *lines]) + '\n')
+    with refused(InputError, 'csv_time', '4e+09', 1):
+        read_csv(tmp_path / 'x.csv')

@@ -46,7 +46,7 @@ import json, setuptools
 from distutils.core import run_setup
 found = run_setup('setup.py', stop_after='init')
 print(json.dumps({'name': found.get_name(), 'version': found.get_version(), 'packages': found.packages, 'requires': found.install_requires,
-                  'scripts': found.entry_points['console_scripts'], 'data': found.data_files, 'license': found.get_license()}))
+                  'scripts': found.entry_points['console_scripts'], 'data': found.data_files, 'extras': found.extras_require, 'license': found.get_license()}))
 '''
 
 
@@ -166,11 +166,12 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
 
 @pytest.mark.live
 def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
-    oldest = {distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned('oldest.txt')}
-    for requirement in installed['requires']:
-        if '>=' in requirement:
-            name, least = requirement.split('>=')
-            assert oldest[distribution(name)].startswith(least), requirement
+    oldest, newest = ({distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned(name)} for name in ('oldest.txt', 'pypi.txt'))
+    extras = [requirement for requirements in installed['extras'].values() for requirement in requirements]
+    for requirement in [*installed['requires'], *extras]:
+        name, least = re.match(r'([\w.-]+)>=([\d.]+)', requirement).groups()
+        tested = (oldest if distribution(name) in oldest else newest)[distribution(name)]
+        assert f'{tested}.'.startswith(f'{least}.'), requirement
 
 
 def test_the_readme_is_short_and_has_the_equation():

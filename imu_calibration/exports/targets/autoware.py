@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imu_calibration.errors import InputError, shortened
 from imu_calibration.exports.affine import AffineImu
 from imu_calibration.exports.holdings import OFFSETS, SCALES, of
 from imu_calibration.exports.target import Noise, Page, Read, Readings, Target
@@ -57,7 +58,10 @@ def read(content: bytes, _path: str | Path) -> Read:
     found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
     offsets = {name: float(numbers_at(found, name, (), what=what)) for name in (f'angular_velocity_offset_{a}' for a in AXES)}
     scale = re.search(rf'^#.*{TOPIC} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M)
-    values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
+    try:
+        values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
+    except ValueError as error:
+        raise InputError(f'the {what} must repeat three numbers in its comment on {TOPIC}: {shortened(str(error))}; correct it') from error
     return Read({**offsets, TOPIC: values}, () if scale else of('gyroscope', SCALES))
 
 

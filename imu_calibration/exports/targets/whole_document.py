@@ -47,7 +47,7 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
     from scipy.io.matlab import MatReadError
     what = 'MATLAB calibration'
     try:
-        text = str(loadmat(io.BytesIO(content))[DOCUMENT][0])
+        text = str(loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0])   # damaged structs crash scipy
     except (MatReadError, ValueError, KeyError, IndexError, TypeError, NotImplementedError, OSError, MemoryError, zlib.error) as error:
         raise InputError(f"the {what} must be a .mat file with '{DOCUMENT}', as an export writes it; give another file") from error
     return Read(read_json(text.encode(), what))
