@@ -1,4 +1,4 @@
-"""What is known in the middle of a plan: parameters, and the biases as they stand now, jointly."""
+"""Joint information on parameters and present biases in the middle of a plan."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Belief:
     """
     Covariance of the coordinates z and of every bias process of every axis.
 
-    Between motions the processes forget, ``u <- exp(-dt / time) u + noise``, so that what was seen of a bias long ago says little of it
-    now: a dwell saturates, a return does not. Within one motion they are taken as constant.
+    Between motions the processes decay, ``u <- exp(-dt / time) u + noise``, so that early observations of a bias contain little information
+    on its present value: a dwell saturates, a return does not. They are constant within one motion.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Belief:
         return np.linalg.inv(np.linalg.inv(self._forgotten(0.5 * (self._last + seconds))) + information)
 
     def take(self, information: np.ndarray, seconds: float) -> None:
-        """Go on by a motion that was chosen."""
+        """Advance by a chosen motion."""
         self.covariance = self.after(information[None], np.array([seconds]))[0]
         self._last = seconds
 
@@ -129,7 +129,7 @@ def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share
     The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an Ornstein-Uhlenbeck process seen at the middles
     of the windows, whose inverse is tridiagonal. Its rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller
     distance to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g is at least half the window's
-    own length. A larger covariance says less: with every G_j replaced by its bound the means are independent, and information adds up.
+    own length. A larger covariance is less information: with each G_j at its bound the means are independent, and information adds up.
     """
     total = window.within / factor
     for sensor in SENSORS:
@@ -145,7 +145,7 @@ def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarra
     """
     Return c such that the bias processes seen at any instants within so many seconds have a covariance of at least ``c 1 1'``.
 
-    ``1' G^-1 1`` is the information about a constant beside the process, at most ``(T + 2 time) / (2 time sd^2)``, which is that of seeing
+    ``1' G^-1 1`` is the information about a constant with the process, at most ``(T + 2 time) / (2 time sd^2)``, that of observing
     it all the time; of several processes the inverses add up.
     """
     return sum(process.sd**2 * 2 * process.time / (seconds + 2 * process.time) for process in noise.bias_processes)
@@ -153,11 +153,11 @@ def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarra
 
 def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) -> np.ndarray:
     """
-    Return the variance of a constant bias that is observed all the time, beside white noise and the bias processes, shape of `seconds`.
+    Return the variance of a constant bias from continuous observation, with white noise and the bias processes, shape of `seconds`.
 
     For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a + b cosh(k (t - T / 2))`` with
     ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is ``1 / integral(h)``. Of several processes the variances add up
-    (parallel sums are concave), with the white noise counted beside any one of them.
+    (parallel sums are concave), with the white noise added to any one of them.
 
     Parameters
     ----------

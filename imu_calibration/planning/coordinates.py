@@ -15,7 +15,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 
 EXACT = 1e-4
-"""What a calibration knows better than to this share of a tolerance counts as known to it."""
+"""A parameter counts as known if its sd is below this share of its tolerance."""
 
 
 class Coordinates:
@@ -28,7 +28,7 @@ class Coordinates:
     tolerances : ndarray, shape (n_params,)
         Largest standard deviation that will do, SI.
     values : ndarray, optional
-        Where the model is linearised; the prior's where nothing is known.
+        Values at which the model is linearised; the prior mean for unknown parameters.
 
     """
 
@@ -54,7 +54,7 @@ class Coordinates:
 
     @cached_property
     def asked(self) -> np.ndarray:
-        """Rows that give the parameters asked for, in tolerances, from z, shape (k, n)."""
+        """Rows that map z to the requested parameters, in tolerances, shape (k, n)."""
         return self.basis[self.wanted]
 
     @cached_property
@@ -94,7 +94,7 @@ class Coordinates:
 
 
 def _basis(gauge):
-    """Return orthonormal directions that a gauge leaves free; parameters that it does not concern are coordinates of their own."""
+    """Return orthonormal directions that a gauge leaves free; unaffected parameters are separate coordinates."""
     concerned = np.any(gauge != 0, axis=0)
     inner = scipy.linalg.null_space(gauge[:, concerned] / np.abs(gauge).max()) if concerned.any() else np.zeros((0, 0))
     free = np.flatnonzero(~concerned)

@@ -1,4 +1,4 @@
-"""plan.yaml: motions with angles, rates and seconds, what they promise, and how far from the least time they are."""
+"""plan.yaml: motions with angles, rates and seconds, predicted standard deviations, and the ratio to the lower bound of the time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORMAT = 'imu_calibration/plan/1'
 
 
 def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
-    """Return what plan.yaml holds: plain data, SI but for angles of joints, which are degrees and say so."""
+    """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
     begins = np.concatenate([[0.0], plan.ends[:-1]]) if len(plan.ends) else []
     return {
         'format': FORMAT,

@@ -1,4 +1,4 @@
-"""What a plan is for, as a number that falls to zero: every tolerance met, or causes told apart."""
+"""Goals of a plan as a number that decreases to zero: every tolerance met, or causes separated."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 POWER = 0.95
-"""Chance with which causes shall be told apart."""
+"""Probability with which causes are to be separated."""
 
 
 class Goal(Protocol):
-    """What is wanted of the covariance of z."""
+    """Requirement on the covariance of z."""
 
     words: str
-    """The causes to be told apart, if that is what is wanted."""
+    """The causes to be separated, if that is the goal."""
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return how far covariances, shape (k, n, n), their roots taken larger by `margin`, are from the goal, shape (k,); zero there."""
+        """Return the distance of covariances, shape (k, n, n), with roots enlarged by `margin`, from the goal, shape (k,); zero at it."""
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
-        """Return the names of what is missing with one covariance, shape (n, n)."""
+        """Return the names of unmet requirements with one covariance, shape (n, n)."""
 
 
 class WithinTolerances:
@@ -38,7 +38,7 @@ class WithinTolerances:
         self.coordinates, self.weights = coordinates, weights
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """Return standard deviations of the parameters asked for, in tolerances, shape (k, p)."""
+        """Return standard deviations of the requested parameters, in tolerances, shape (k, p)."""
         asked = self.coordinates.asked
         return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
 
@@ -54,22 +54,22 @@ class WithinTolerances:
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One effect of a class that a recording does not tell apart."""
+    """One effect of a class that is collinear in a recording."""
 
     key: tuple[str, str]
     """(sensor, effect name)."""
     places: np.ndarray
     """Its coordinates."""
     size: np.ndarray
-    """How large it would be, in those coordinates."""
+    """Its assumed size, in those coordinates."""
 
 
 class ToldApart:
     """
-    Each cause of a class as large as it is suspected, seen through whichever other one is in the model instead.
+    Each cause of a class with its assumed size, with another member of the class in the model instead.
 
-    The noncentrality of cause a beside cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with r the baseline and b
-    (Atkinson and Fedorov 1975); other members of the class are left out there. A pair is told apart when both have enough.
+    The noncentrality of cause a with cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with r the baseline and b
+    (Atkinson and Fedorov 1975); other members of the class are omitted. A pair is separated when both noncentralities suffice.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class ToldApart:
         Of the baseline with all causes.
     causes : sequence of Cause
     questions : int
-        Effects that the search asks about.
+        Candidate effects of the search.
 
     """
 
@@ -87,10 +87,10 @@ class ToldApart:
         self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
         self.reachable = np.ones(len(self.pairs), bool)
-        """Pairs that some motion can tell apart: no time is spent on the others, which stay missing."""
+        """Pairs that some motion separates: no time is planned for the remaining pairs, which are reported."""
 
     def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
-        """Return lambda of each pair in units of what is enough, shape (k, n_pairs)."""
+        """Return lambda of each pair in units of the sufficient value, shape (k, n_pairs)."""
         found = np.empty((len(covariance), len(self.pairs)))
         prior = self.coordinates.prior_information
         for number, (a, b) in enumerate(self.pairs):
@@ -105,18 +105,18 @@ class ToldApart:
         return np.maximum(found, 1e-12)
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return half the sum of logarithms of what pairs that can be told apart lack, the worst of them three times."""
+        """Return half the sum of the logarithms of the shortfall of separable pairs, the worst weighted three times."""
         lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0)
         return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
 
     def leave_out_of_reach(self, covariance: np.ndarray) -> None:
-        """Spend no time on pairs, in either order, that even this covariance, (n, n), better than any plan's, does not tell apart."""
+        """Drop pairs, in either order, that this covariance, (n, n), a lower bound of all plans, does not separate."""
         enough_left = self.noncentrality(covariance[None])[0] >= 1.0
         apart = {(a.key, b.key) for (a, b), reached in zip(self.pairs, enough_left, strict=True) if reached}
         self.reachable = np.array([(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs])
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
-        """Return the pairs that would not be told apart."""
+        """Return the pairs that would not be separated."""
         found = self.noncentrality(covariance[None])[0]
         return tuple(dict.fromkeys(' and '.join(sorted((a.key[1], b.key[1])))
                                    for (a, b), value in zip(self.pairs, found, strict=True) if value < 1.0))
@@ -124,12 +124,12 @@ class ToldApart:
 
 def enough(size: int, questions: int) -> float:
     """
-    Return the noncentrality with which an effect of so many parameters is named, and preferred to another, with the chance POWER.
+    Return the noncentrality with which an effect of this number of parameters is identified and preferred with probability POWER.
 
     Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
     logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
     """
-    from scipy.stats import ncx2  # here, because it takes long to import
+    from scipy.stats import ncx2  # here, because its import is slow
 
     threshold = chi2_isf(FAMILY_WISE / questions, size)
     named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= POWER)

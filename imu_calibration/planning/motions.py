@@ -1,4 +1,4 @@
-"""A motion that a planner may ask for: it starts and ends at rest at one place of the joints, and never leaves their limits."""
+"""A motion of a plan: it starts and ends at rest at one position of the joints, within their limits."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ STEP = 0.05
 
 
 class MotionKind(StrEnum):
-    """What the IMU does."""
+    """Motion of the IMU."""
 
     MOVE = 'move'
-    """It goes from one place to another, which says as much as a swing."""
+    """A move from one position to another, with as much information as a swing."""
     POSE = 'pose'
     """It rests."""
     SPIN = 'spin'
@@ -31,27 +31,27 @@ class MotionKind(StrEnum):
     TOGETHER = 'two axes'
     """Several joints move at once."""
     RETURN = 'return'
-    """It rests where it rested before, so that what the biases did in between is seen."""
+    """A rest at an earlier position, which shows the change of the biases."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A motion from rest to rest at one place, and how to say it."""
+    """A motion from rest to rest at one position, with its description."""
 
     kind: MotionKind
-    """What it is."""
+    """Kind of motion."""
     joint_names: tuple[str, ...]
     """Joints in the order of the columns."""
     place: np.ndarray
-    """Where it starts and ends, rad or m, shape (n_joints,); after whole turns an endless joint counts as back."""
+    """Start and end, rad or m, shape (n_joints,); after whole turns an endless joint counts as returned."""
     segments: tuple[Segment, ...]
-    """What happens there."""
+    """Segments of the motion."""
     text: str
-    """What happens there, in words."""
+    """Description of the segments."""
     limits: MotionLimits
     """Limits that it keeps, with which the way to it is timed."""
     number: int = -1
-    """Number in the catalogue that it comes from."""
+    """Number in the catalogue."""
 
     @property
     def seconds(self) -> float:
@@ -65,7 +65,7 @@ class PlannedMotion:
         return tuple(builder.segments)
 
     def from_position(self, position: np.ndarray) -> tuple[Segment, ...]:
-        """Return all segments from where the joints are, whole turns of endless joints kept as they are."""
+        """Return all segments from the present position, with whole turns of endless joints unchanged."""
         way = self.travel(position)
         shift = (way[-1].end if way else np.asarray(position, float)) - self.place
         return way + tuple(replace(segment, start=segment.start + shift) for segment in self.segments)
@@ -80,13 +80,13 @@ class PlannedMotion:
 
     @property
     def words(self) -> str:
-        """What to do, in one line."""
+        """One line of instruction."""
         there = f'go to {place_words(self.joint_names, self.place, self.limits)}'
         return f'{there}, {self.text}' if self.text else there
 
 
 def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> TrajectoryPoints:
-    """Return the points of consecutive segments, a point at every joint between them; no points where nothing moves."""
+    """Return the points of consecutive segments, one at each transition; no points without motion."""
     if not segments:
         return TrajectoryPoints.stop(joint_names)
     edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
@@ -104,6 +104,6 @@ def motion_at(segments: tuple[Segment, ...], time: np.ndarray) -> JointMotion:
 
 
 def place_words(names: tuple[str, ...], place: np.ndarray, limits: MotionLimits) -> str:
-    """Return a place in words: ``outer 45°, slide 120 mm``."""
+    """Return the text of a position: ``outer 45°, slide 120 mm``."""
     units = [(1 / DEG, '°') if turning else (1000.0, ' mm') for turning in limits.turns]
     return ', '.join(f'{name} {round(value * factor):d}{unit}' for name, value, (factor, unit) in zip(names, place, units, strict=True))

@@ -1,4 +1,4 @@
-"""The noise that a plan counts with: that of a grade, or what an Allan analysis found."""
+"""The assumed noise of a plan: that of a grade, or the result of an Allan analysis."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
 
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
-    """Return sensor -> NoiseModel of samples at `rate` (Hz): that which was identified, else that of a grade."""
+    """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
     require_grade(grade)
     return noise_of_grade(GRADES[grade].noise, rate) if figures is None else noise_of_figures(figures, rate)
 

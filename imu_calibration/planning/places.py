@@ -1,4 +1,4 @@
-"""Where the joints may stand: attitudes spread over all that the chain reaches within its limits."""
+"""Positions of the joints: attitudes spread over the reach of the chain within its limits."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from imu_calibration.reference.table import Table
 N_TRIED = 512
 """Positions that places are chosen from: a power of two, as the sequence wants it."""
 GRID = np.pi / 4
-"""Joints of a table with few of them stand at multiples of this, so that faces, edges and corners are among the places."""
+"""On a table with few joints the positions are multiples of this, so that they include faces, edges and corners."""
 UNBOUNDED = 1e9
 """Finite stand-in for the ends of endless joints, rad."""
 HEADING = 0.4
-"""Weight of the horizontal axes beside the vertical where attitudes are compared: headings show the tilt, attitudes all the rest."""
+"""Weight of the horizontal axes relative to the vertical in comparisons of attitudes: headings show the tilt only."""
 
 
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
@@ -53,9 +53,9 @@ def candidates(limits: MotionLimits) -> np.ndarray:
 
 def choose_places(table: Table, limits: MotionLimits, count: int) -> np.ndarray:
     """
-    Return places whose attitudes lie as far from one another as can be, the first at home, shape (n, n_joints).
+    Return positions whose attitudes have the largest distances, the first at home, shape (n, n_joints).
 
-    One after the other that whose attitude is furthest from those chosen; of equals the one nearest to zero, which the order of
+    Each next position has the attitude furthest from the chosen ones; of equals the one nearest to zero, which the order of
     `candidates` sees to. Where all attitudes that are left are as good as there already, fewer are returned.
     """
     tried = candidates(limits)

@@ -1,12 +1,12 @@
 """
-The planner: what to do next, and the whole plan, so that every parameter comes within its tolerance in little time.
+The planner: the next motion, and the whole plan, with every parameter within its tolerance in a short time.
 
 Use it in three steps, as often as anything new is known::
 
     planner = make_planner(table, tolerances={...}, noise=noise_of_grade(GRADES['industrial'].noise, 100.0))
-    step = planner.next_motion(position)     # NextMotion: .motion is None when all is done, .reason says why in words
+    step = planner.next_motion(position)     # NextMotion: .motion is None at the end, .reason is its text
     points = step.motion.points(position)    # TrajectoryPoints: positions, velocities, accelerations, at rest at the end
-    planner.take(calibration)                # what was really learnt replaces what was hoped for
+    planner.take(calibration)                # estimated covariances replace predicted ones
     plan = planner.plan(position)            # Plan: motions, predicted sd, seconds, lower_bound_seconds
 
 Between two calls of `take` the planner counts on the motions that it gave out. All joints are in the order of ``table.joint_names``.
@@ -36,19 +36,19 @@ from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 DONE = 'all that was wanted is reached'
-STUCK = 'nothing that can be reached brings the rest closer to its tolerance'
+STUCK = 'no motion within the limits reduces the remaining standard deviations'
 WORTH, LEAST_WEIGHT = 1.1, 0.03
 """A plan this many times longer than the bound is searched again, each parameter with at least this share of the largest weight."""
 
 
 @dataclass(frozen=True, eq=False)
 class NextMotion:
-    """What to do next."""
+    """The next step."""
 
     motion: PlannedMotion | None
-    """None: nothing more to do."""
+    """None at the end of the plan."""
     reason: str
-    """Why this, or why nothing."""
+    """Reason of the choice or of the end."""
     seconds: float = 0.0
     """Length with the way to it, s."""
     missing: tuple[str, ...] = ()
@@ -57,10 +57,10 @@ class NextMotion:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Motions one after the other, and what they promise."""
+    """Consecutive motions and their predicted standard deviations."""
 
     model: SensorModel
-    """What is to be determined."""
+    """Parameters to be determined."""
     motions: tuple[PlannedMotion, ...]
     """In the order of time."""
     start: np.ndarray
@@ -72,15 +72,15 @@ class Plan:
     tolerances: np.ndarray
     """SI, shape (n_params,)."""
     wanted: np.ndarray
-    """Whether each parameter is asked for, shape (n_params,)."""
+    """Whether each parameter is requested, shape (n_params,)."""
     history: np.ndarray
-    """Standard deviations in tolerances before the first motion and after each, of the parameters asked for, shape (n_motions + 1, k)."""
+    """Standard deviations in tolerances before the first motion and after each, of the requested parameters, shape (n_motions + 1, k)."""
     lower_bound_seconds: float
     """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
     missing: tuple[str, ...]
-    """Parameters that stay outside their tolerance, or pairs of causes that would not be told apart."""
+    """Parameters outside their tolerance at the end, or pairs of causes that remain collinear."""
     told_apart: str = ''
-    """The causes that the plan is to tell apart, where it is for that."""
+    """The causes that the plan separates, if that is its goal."""
 
     @property
     def seconds(self) -> float:
@@ -114,7 +114,7 @@ class Planner:
     situation : Situation
         Motions, model in tolerances, noise.
     known : ndarray, optional
-        Information about the coordinates beside the prior.
+        Information about the coordinates in addition to the prior.
 
     """
 
@@ -125,14 +125,14 @@ class Planner:
         self._first: list[int] | None = None if known is None else []
 
     def take(self, calibration: Calibration) -> None:
-        """Replace what was hoped for by what a calibration knows: its covariance, for the parameters that the model shares with it."""
+        """Replace the prediction by the covariance of a calibration, for the parameters that the model shares with it."""
         names = {name: k for k, name in enumerate(calibration.param_names)}
         self.known = self.situation.coordinates.information_from(names, calibration.covariance)
         self._belief = self.situation.belief(self.known)
 
     @property
     def excess(self) -> dict[str, float]:
-        """Standard deviation over tolerance of each parameter asked for, as far as is known or hoped for now."""
+        """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.situation.coordinates
         names = np.array(coordinates.model.param_names)[coordinates.wanted]
         return dict(zip(names.tolist(), self.situation.excess(self._belief.known).tolist(), strict=True))
@@ -151,7 +151,7 @@ class Planner:
             return NextMotion(None, STUCK, missing=missing)
         self._belief.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
-        reason = 'a session begins with rests in attitudes far apart' if must else f'it gains most per second for {", ".join(missing[:3])}'
+        reason = 'a session begins with rests in many attitudes' if must else f'it gains most per second for {", ".join(missing[:3])}'
         return NextMotion(motion, reason, motion.seconds_from(position), missing)
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
@@ -176,11 +176,11 @@ class Planner:
         far = np.abs(position - middle) > np.pi
         if not np.any(far):
             return None
-        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.where(far, middle, position), (), 'the turns taken back', limits)
+        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.where(far, middle, position), (), 'unwinding', limits)
 
     def plan(self, position: np.ndarray | None = None, *, progress: Callable[[float], None] | None = None,
              with_bound: bool = True, longest: float = np.inf) -> Plan:
-        """Return a whole plan from where the joints are (default: at home)."""
+        """Return a whole plan from the present position (default: home)."""
         situation = self.situation
         start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
         place = situation.place_near(start)
@@ -208,7 +208,7 @@ class Planner:
         return exchanged(self.situation, sequence, place, known=self.known, fixed=len(first))
 
     def within(self, seconds: float) -> None:
-        """Spend no time on causes that no plan of so many seconds tells apart."""
+        """Drop causes that no plan of this time separates."""
         if isinstance(self.situation.goal, ToldApart) and np.isfinite(seconds):
             self.situation.goal.leave_out_of_reach(self.situation.best_covariance(seconds, self.known))
 
@@ -241,17 +241,17 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     ----------
     table : Table
     noise : mapping
-        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`; steps of the encoders are those of the table.
+        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`; encoder steps are those of the table.
     tolerances : mapping, optional
         {section: {effect: tolerance}}, SI.
     rate : float
         Samples of the IMU per second.
     options : CalibrationOptions
-        What is to be estimated.
+        Model to be estimated.
     limits : MotionLimits, optional
-        Default those of the table.
+        Default: the limits of the table.
     calibration : Calibration, optional
-        What is known already.
+        Prior calibration.
 
     """
     model = choose_model(options, table)

@@ -1,7 +1,7 @@
 """
 A lower bound on the time of every plan, by convex relaxation, with a certificate that can be checked by itself.
 
-A plan visits motion k n_k times. It takes at least ``sum_k c_k n_k`` seconds (c_k the motion's own length) and knows z with at most the
+A plan visits motion k n_k times. It takes at least ``sum_k c_k n_k`` seconds (c_k the length of the motion) and gives at most the
 information ``M_0 + sum_k n_k M_k`` (`belief.additive_bound`). So its time is at least the value of the semidefinite programme
 
     minimise c'y   such that   e_i' (M_0 + sum_k y_k M_k)^-1 e_i <= 1 for all i,  y >= 0,
@@ -13,7 +13,7 @@ in which motions may be visited a fraction of a time; e_i picks a parameter in u
 
     c'y >= sum_k y_k tr(M_k X) = tr(M X) - tr(M_0 X) >= sum_i w_i (2 x_i'e_i - 1) - tr(M_0 X).
 
-The right-hand side needs no optimality of anything: whatever w and x were found with, it is a bound. At the optimum it is the value.
+The right-hand side is a bound for any w and x, without optimality. At the optimum it equals the value.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 ROUNDS = 600
 """Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
 LONGEST = 1e7
-"""Tolerances that are not met after every motion has taken this time are out of reach, s."""
+"""Tolerances that are not met after this time for every motion are out of reach, s."""
 CLOSE = 1.01
 """The search ends when the relaxed value is within this factor of the certificate."""
 
@@ -42,7 +42,7 @@ class Relaxation:
     visits: np.ndarray
     """How often the relaxed plan visits each motion, shape (k,)."""
     prices: np.ndarray
-    """Matrix X: what a unit of information is worth, s, shape (n, n)."""
+    """Matrix X: value of a unit of information, s, shape (n, n)."""
     relaxed_seconds: float
     """Time of the relaxed plan, s; the value of the programme lies between this and the bound."""
     weights: np.ndarray
@@ -54,14 +54,14 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
     Visits and weights are improved by turns with multiplicative steps: visits of motions that are worth more than they cost grow (the
-    algorithm of A-optimal design), and so do the weights of parameters that are further from their tolerance than others.
+    algorithm of A-optimal design), and so do the weights of parameters with the largest excess over tolerance.
 
     Parameters
     ----------
     information : ndarray, shape (k, n, n)
         Most that one visit adds.
     seconds : ndarray, shape (k,)
-        What it costs.
+        Cost.
     known : ndarray, shape (n, n)
         Information to start with.
     asked : ndarray, shape (p, n)
@@ -79,7 +79,7 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf, weights)
     for number in range(rounds):
         total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
-        covariance = inverse_normal(total)   # what nobody can reach is all but singular
+        covariance = inverse_normal(total)   # nearly singular in unreachable directions
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T

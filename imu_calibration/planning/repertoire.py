@@ -1,4 +1,4 @@
-"""Everything that a planner chooses from: rests, spins in either sense, swings and joint turns at places of the chain."""
+"""The candidate motions of a planner: rests, spins in either sense, swings and joint turns at positions of the chain."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Repertoire:
                         yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
-        """Return some of the places, others for other motions; fewer of a long chain, because moves number the square of the places."""
+        """Return a subset of the positions, different for each motion; fewer for a long chain, because moves grow with their square."""
         count = max(1, min(count, 3 * count // len(self.names)))
         some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
         return self.spread[np.unique(some)]
@@ -116,7 +116,7 @@ class Repertoire:
         return MotionBuilder(len(self.names), limits=self.limits, start=place)
 
     def _whole_turns(self, place, rates, seconds):
-        """Turn at constant rates for at least `seconds`, and so long that endless joints come back to where they were."""
+        """Turn at constant rates for at least `seconds`, until endless joints have returned."""
         speed = np.abs(rates).max()
         ramp = self._spun(place, rates, 1.0)
         extra = np.abs(sum(segment.end - segment.start for segment in ramp)).max() - speed
@@ -126,7 +126,7 @@ class Repertoire:
         return place, self._spun(place, rates, held), f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
 
     def _sweep(self, place, rates):
-        """Turn a joint with ends at a constant rate up and back, as far as it goes; None where it is too short for a window."""
+        """Turn a limited joint at a constant rate through its range and back; None if that is too short for a window."""
         joint = int(np.argmax(np.abs(rates)))
         lower, upper = self.limits.lower[joint], self.limits.upper[joint]
         start = place.copy()
@@ -140,7 +140,7 @@ class Repertoire:
         return None
 
     def _longest(self, start, rates, joint):
-        """Return how long a rate can be held before the end comes, s."""
+        """Return the time at a rate until the end of the range, s."""
         trial = self._spun(start, rates, 1.0)
         time = np.linspace(0.0, sum(segment.duration for segment in trial), 400)
         reached = np.abs(motion_at(trial, time).position[:, joint] - start[joint]).max()
@@ -152,7 +152,7 @@ class Repertoire:
         return tuple(builder.segments)
 
     def _swing(self, place, shares, frequency, seconds):
-        """Swing as far as range, speed and acceleration allow."""
+        """Swing with the largest amplitude within range, speed and acceleration."""
         frequency = np.broadcast_to(frequency, place.shape).astype(float)
         unit = np.where(shares, 1.0, 0.0)
         builder = self._builder(np.zeros(len(place)))

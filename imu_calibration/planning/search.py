@@ -1,4 +1,4 @@
-"""Finding a plan: greedily by gain per second, then by exchange until nothing makes it shorter."""
+"""Search for a plan: greedy by gain per second, then by exchange until no exchange shortens it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Offers:
         self.least = LEAST_GAIN * min(1.0, float(before))
 
     def hopeless(self, number: int) -> bool:
-        """Return whether a motion brings next to nothing, and does not reach the goal either."""
+        """Return whether a motion has almost no gain and does not reach the goal."""
         return bool(self.gain[number] < self.least and self.left[number] > 0)
 
     @property
@@ -45,7 +45,7 @@ class Offers:
 def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
            progress: Callable[[float], None] | None = None, longest: float = np.inf) -> list[int]:
     """
-    Return motions that reach the goal, or come as near as can be, each the best per second at its time.
+    Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
     start : int
         Place where the joints are.
     known : ndarray, optional
-        Information about z beside the prior.
+        Information about z in addition to the prior.
     first : sequence of int
-        Motions that come first anyway.
+        Mandatory first motions.
     progress : callable, optional
-        Told the share of the way that is done.
+        Called with the completed share.
     longest : float
         Time at most, s.
 
@@ -86,7 +86,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         if left == 0.0 and len(chosen) >= len(first):
             if meets(situation, chosen, start, known=known):
                 break
-            # The belief takes the biases as constant within a motion; where that was too good, it has to aim further.
+            # The belief has constant biases within a motion; if that was optimistic, the target must be lower.
             margin *= FURTHER
     return chosen
 

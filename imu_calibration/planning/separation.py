@@ -1,4 +1,4 @@
-"""A planner that tells causes apart: the motion after which one name remains of a class that a recording left."""
+"""A planner that separates causes: motions after which one member of a collinear class remains."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
 SESSION = 'quick'
-"""Profile on which the mates are taken to imitate the effect that was found."""
+"""Profile on which the mates imitate the finding."""
 
 
 def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
                    rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(),
                    sizes: Mapping[str, float] | None = None, limits: MotionLimits | None = None) -> Planner:
     """
-    Return a planner whose goal is to tell causes apart.
+    Return a planner whose goal is to separate causes.
 
     Parameters
     ----------
     table : Table
     calibration : Calibration
-        Of the extended model that a diagnosis ended with: it says how large the first cause is.
+        Calibration of the extended model of a diagnosis, with the size of the first cause.
     causes : sequence of (sensor, effect name)
-        The effect that was found, then those that would do as well.
+        The finding, then its collinear alternatives.
     noise : mapping
         Sensor -> NoiseModel of single samples at `rate`.
     rate : float
@@ -47,10 +47,10 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     options : CalibrationOptions
         Its tolerances and catalogue.
     sizes : mapping, optional
-        Parameter -> value, SI, of the others as the diagnosis would have them in the place of the first; where it does not say, as
+        Parameter -> value, SI, of the alternatives as estimated in the diagnosis in place of the first; without an estimate, as
         large as they must be to pass for it on a usual session.
     limits : MotionLimits, optional
-        Default those of the table.
+        Default: the limits of the table.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     """
     first, *mates = causes
     if first not in calibration.model.slices:
-        raise InputError(f"the calibration must contain '{first[1]}', which is to be told from others; give that of the diagnosis",
+        raise InputError(f"the calibration must contain '{first[1]}', which is to be separated; give that of the diagnosis",
                          key='calibration')
     model = calibration.model
     for sensor, name in mates:
@@ -80,9 +80,9 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
 def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table, *,
               sizes: Mapping[str, float]) -> list[Cause]:
     """
-    Return the causes with their sizes: the first as it was found, the mates as large as they would have to be to pass for it.
+    Return the causes with their sizes: the first as estimated, the mates with the size that imitates it.
 
-    Where `sizes` has nothing of a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the
+    If `sizes` lacks a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the
     information of a usual session, r the baseline.
     """
     coordinates = situation.coordinates
@@ -124,5 +124,5 @@ def _places(coordinates, key):
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
     if effect.role is Role.LIMIT or effect.time_constant or 'temperature' in effect.needs:
-        raise InputError(f"effects that are told apart by motion must depend on it, '{key[1]}' shows with time, temperature or range; "
-                         'leave it out')
+        raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
+                         'omit it')

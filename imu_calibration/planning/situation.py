@@ -1,4 +1,4 @@
-"""What a plan is made for: the chain, the model in tolerances, the noise; and what every motion would say about it."""
+"""The inputs of a plan: the chain, the model in tolerances, the noise, and the information of every motion."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ROUNDS_OF_LENGTH = 3
 
 class Situation:
     """
-    What a planner chooses from and judges with.
+    Candidates and criteria of a planner.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Situation:
 
     @cached_property
     def information(self) -> np.ndarray:
-        """What each motion says about z and the biases as they are then, shape (k, m, m)."""
+        """Information of each motion about z and the biases at its time, shape (k, m, m)."""
         belief = self.belief()
         return np.array([belief.information_of(windows) for windows in self.windows])
 
@@ -102,18 +102,18 @@ class Situation:
         return found[targets]
 
     def belief(self, known: np.ndarray | None = None) -> Belief:
-        """Return the belief before any motion, with information about z beside the prior."""
+        """Return the belief before any motion, with information about z in addition to the prior."""
         prior = self.coordinates.prior_information
         return Belief(prior if known is None else prior + known, self.noise)
 
     def place_near(self, position: np.ndarray) -> int:
-        """Return the number of the place nearest to a position, endless joints counted without whole turns."""
+        """Return the number of the place nearest to a position, without whole turns of endless joints."""
         away = self.repertoire.places - position
         turns = np.where(self.repertoire.limits.endless, np.round(away / (2 * np.pi)), 0.0)
         return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
 
     def first_rests(self, place: int) -> list[int]:
-        """Return the rests with which a session begins, in attitudes far apart, each place the nearest one; the first rest is longer."""
+        """Return the first rests of a session, in widely different attitudes, each place the nearest one; the first rest is longer."""
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
         left, chosen = {int(self.repertoire.place_of[k]): None for k in rests}, []
         left = dict.fromkeys(list(left)[:LEAST_RESTS])   # places are in the order of their distance in attitude
@@ -128,10 +128,10 @@ class Situation:
 
     def variance_factor(self, windows: Sequence[PlannedWindow], known: np.ndarray | None = None) -> float:
         """
-        Return the factor on the variance of the noise that its estimate exceeds on none of six axes, with the chance PROBABILITY.
+        Return the factor on the noise variance that its estimate exceeds on none of six axes, with probability PROBABILITY.
 
         ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest, weighted by its samples. Where something is
-        known, the noise was estimated from the rests of a whole session already. Causes to be told apart have a chance in their goal.
+        known, the noise was estimated from the rests of a whole session already. Goals of separation contain a probability.
         """
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
@@ -152,9 +152,9 @@ class Situation:
         With the variance of the noise within windows larger by `factor`. NaN where a tolerance is out of reach. `relaxed` is the relaxation
         for the same arguments where it is available already.
 
-        With nothing known of the biases, a share of their wander is common to a whole session no longer than T, which keeps their
-        parameters from being known better however much is measured: every plan takes at least ``min(T, value(T))``, the value that of the
-        relaxation for sessions of T. The best T is looked for; without any T the share is zero.
+        Without prior information on the biases, a share of their wander is common to a session of at most T, which limits their
+        parameters for any amount of data: every plan needs at least ``min(T, value(T))``, the value that of the
+        relaxation for sessions of T. The largest bound over T is used; without any T the share is zero.
         """
         best = (relaxed or self.relaxation(known, factor=factor)).seconds
         if known is not None or not np.isfinite(best):
@@ -173,7 +173,7 @@ class Situation:
         return max(best, floor, self.least_session())
 
     def _bias_floor(self, factor: float) -> float:
-        """Return how long the biases alone must be observed, whatever else is known, s; infinite where they are out of reach."""
+        """Return the observation time that the biases alone need, s; infinite if they are out of reach."""
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
         lengths = np.geomspace(0.01, LONGEST, 2000)
         for sensor in SENSORS:
@@ -204,7 +204,7 @@ class Situation:
 
     def _with_common(self, prior, asked, share, seconds):
         """
-        Return (prior information, rows asked for) where a bias and the offset common to the session are one coordinate b.
+        Return (prior information, requested rows) where a bias and the offset common to the session are one coordinate b.
 
         With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' - P))^-1 + (P / P')^2 var(b)``.
         """
@@ -217,7 +217,7 @@ class Situation:
                 after = before + offset
                 room = (1.0 - before * offset / after) * (after / before)**2
                 prior[place, place] = 1.0 / after
-                # Where there is no room at all a small number stands for it: the value is then longer than any session that counts.
+                # Without any margin a small number is used: the value then exceeds any session of interest.
                 asked[np.abs(asked[:, place]) > 0.5] /= np.sqrt(max(room, 1e-4))
         return prior, asked
 
@@ -245,9 +245,9 @@ class Situation:
 
     def best_covariance(self, seconds: float, known: np.ndarray | None = None) -> np.ndarray:
         """
-        Return a covariance of z below that of any plan of these motions and the moves between them that takes so long.
+        Return a lower bound of the covariance of z of all plans of these motions and their moves in this time.
 
-        Every motion fills all of the time at once, with every window seen beside biases that forget what was before it.
+        Every motion fills the whole time at once, and the biases are independent between windows.
         """
         moves = [(windows, float(self.way_seconds[key])) for key, windows in self.way_windows.items() if windows]
         everything = [*zip(self.windows, self.seconds.tolist(), strict=True), *moves]
@@ -258,6 +258,6 @@ class Situation:
         return np.linalg.inv(total)
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the standard deviations of the parameters asked for, in tolerances, shape (p,)."""
+        """Return the standard deviations of the requested parameters, in tolerances, shape (p,)."""
         asked = self.coordinates.asked
         return np.sqrt(np.einsum('pn,nm,pm->p', asked, covariance, asked))

@@ -1,4 +1,4 @@
-"""What windows of planned motions say: rows of the window means and information of what varies within, in planning coordinates."""
+"""Information of windows of planned motions: rows of the means, and information of the variation within, in planning coordinates."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.motion_builder import Profile, Segment
 
 SAMPLING = 16.0
-"""Instants per second at which columns are taken: a turn at 300 deg/s has 19."""
+"""Instants per second at which columns are evaluated: a turn at 300 deg/s has 19."""
 LEAST_INSTANTS = 4
 """Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion."""
 BLOCK = 8192
 """Instants whose columns are held in memory at a time."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
-"""Segment -> window; everything else is dynamic."""
+"""Segment -> window; all remaining segments are dynamic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class PlannedWindow:
     middle: float
     """Time since the motion began, s."""
     length: float
-    """s, with what is lost before it."""
+    """s, with the lost time before it."""
     samples: float
     """Number of samples in it."""
     means: dict[str, np.ndarray]
     """Sensor -> rows of the means, shape (3, n)."""
     variance: dict[str, np.ndarray]
-    """Sensor -> variance of the means beside the bias in the middle of the window, shape (3,)."""
+    """Sensor -> variance of the means in addition to the bias in the middle of the window, shape (3,)."""
     within: np.ndarray
     """Information of the samples about their means, of both sensors together, shape (n, n)."""
 
@@ -55,7 +55,7 @@ class WindowPredictor:
     ----------
     table : Table
     coordinates : Coordinates
-        The model where it is linearised, and what its parameters are measured in.
+        The model at its point of linearisation, with the units of its parameters.
     noise : dict
         Sensor -> NoiseModel of single samples.
     rate : float
@@ -88,7 +88,7 @@ class WindowPredictor:
         return [self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander) for cut, a, b in zip(cuts, edges, edges[1:], strict=False)]
 
     def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
-        """Yield (motion at some instants, kind, middle, length with what settles, seconds of data) of each window."""
+        """Yield (motion at some instants, kind, middle, length with settling, seconds of data) of each window."""
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')

@@ -5,7 +5,7 @@ from imu_calibration.reference.joint import Joint, JointLimits
 from imu_calibration.reference.table import Table
 
 SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
-"""What a mobile base does on the spot, rad/s and rad/s^2."""
+"""Rotation of a mobile base on the spot, rad/s and rad/s^2."""
 
 
 def yaw_table(gravity: float | None = None) -> Table:
