@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from imu_calibration.reference.table import Table
 
 PARALLEL = 0.02
-"""Sine of the angle up to which two axes count as parallel: their common perpendicular means nothing there."""
+"""Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""
 
 
 class AxisAngle(NamedTuple):
-    """One angle by which an axis may stand wrong against the axis before it."""
+    """One angular error of an axis relative to the preceding axis."""
 
     name: str
     """The two joints; with u or v where the axes are parallel."""
@@ -81,7 +81,7 @@ def with_axis_places(table: Table, errors: np.ndarray) -> Table:
     table : Table
         The nominal table.
     errors : array, shape (2 (n_turning - 1),)
-        For each of these axes how far it lies along its `axis_error_directions`, m; the chain behind it goes along.
+        For each of these axes its displacement along its `axis_error_directions`, m; the following chain moves with it.
 
     """
     shifts, joints, first = iter(np.reshape(errors, (-1, 2))), [], True

@@ -8,11 +8,11 @@ import numpy as np
 from imu_calibration.errors import InputError
 
 LARGEST = 1e6
-"""No number of a table (axis, place, angle, speed) is larger; the products of larger ones would leave the range of numbers."""
+"""Largest number of a table (axis, place, angle, speed); products of larger numbers would overflow."""
 
 
 def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
-    """Refuse what is not a mapping, and keys that are not `known`."""
+    """Refuse values that are not a mapping, and keys that are not `known`."""
     if not isinstance(mapping, Mapping):
         raise InputError(f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description',
                          code='not_a_mapping')
@@ -22,7 +22,7 @@ def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
 
 
 def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
-    """Return the direction of three numbers as a unit vector; one that is a unit vector already stays as it is."""
+    """Return the direction of three numbers as a unit vector; a unit vector is returned unchanged."""
     vector = np.array(three_numbers(value, what))
     norm = np.linalg.norm(vector)
     if norm < 1e-9:
@@ -46,7 +46,7 @@ def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
 
 
 def finite_number(value: Any, what: str, low: float | None, *, high: float | None, advice: str) -> float:
-    """Return one finite number within [low, high], which default to what any number of a table can be."""
+    """Return one finite number within [low, high], by default the limits of any number of a table."""
     low, high = -LARGEST if low is None else low, LARGEST if high is None else high
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:

@@ -16,7 +16,7 @@ def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.nd
     Parameters
     ----------
     motion : JointMotion
-        Motion as the encoders tell it.
+        Motion measured by the encoders.
     order : int
         Periods per turn, k.
     cos_amplitude, sin_amplitude : array, shape (n_joints,)

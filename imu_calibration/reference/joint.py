@@ -1,4 +1,4 @@
-"""One joint of a chain: how it moves, where it sits, how far and how fast it may go; and the names that a chain's joints go by."""
+"""One joint of a chain: motion, place and limits; and the names of the joints of a chain."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -28,7 +28,7 @@ class JointLimits:
     endless: bool = False
     """Whether the joint is declared to turn without end."""
     described: frozenset[str] = field(default=frozenset(), compare=False)
-    """Names of the fields that come from a robot description (URDF); the others come from a table file."""
+    """Names of the fields that come from a robot description (URDF); the remaining fields are from a table file."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Mimic:
     joint: str
     """Name of the other."""
     multiplier: float = 1.0
-    """How far it goes for one unit of the other."""
+    """Motion per unit of the followed joint."""
     offset: float = 0.0
     """Where it is when the other is at zero, rad or m."""
 
@@ -60,7 +60,7 @@ class Joint:
     mimic: Mimic | None = None
     """Set when the joint follows another one."""
     limits: JointLimits = field(default=JointLimits())
-    """How far and how fast it may go."""
+    """Range, speed and acceleration."""
     sag: float = 0.0
     """Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`): estimated, no description holds it."""
     wobble: tuple[tuple[int, complex], ...] = ()
@@ -76,7 +76,7 @@ class Joint:
 
     @property
     def turns(self) -> bool:
-        """Whether it turns; else it slides."""
+        """Whether it rotates; otherwise it slides."""
         return self.type == 'revolute'
 
     @property
@@ -86,7 +86,7 @@ class Joint:
 
     @property
     def source(self) -> str:
-        """Name of the joint whose readings tell its position: its own, or the one that it follows."""
+        """Name of the joint whose readings give its position: its own, or that of the followed joint."""
         return self.name if self.mimic is None else self.mimic.joint
 
     @property
@@ -97,26 +97,26 @@ class Joint:
 
 @dataclass(frozen=True)
 class JointNames(Sequence):
-    """Names that the readings of a chain and the parameters of its errors go by; as a sequence: the joints that are read."""
+    """Names in the readings of a chain and in the parameters of its errors; as a sequence: the joints with readings."""
 
     read: tuple[str, ...]
     """Joints that are read, in the order of the columns of a `JointMotion`."""
     turning: tuple[str, ...]
-    """Those of them that turn."""
+    """The rotating joints of them."""
     zeros: tuple[str, ...]
-    """Those whose zero is an error of its own: the first one's is the azimuth, the last one's belongs to the mount."""
+    """Joints whose zero is a separate error: the zero of the first is the azimuth, that of the last belongs to the mount."""
     angles: tuple[str, ...]
     """Angles between neighbouring axes."""
     places: tuple[str, ...] = ()
-    """Directions in which an axis may pass beside the place it should: those of the first axis are nobody's business."""
+    """Directions of the displacement of an axis from its nominal place; those of the first axis have no effect."""
     angle_sd: float | None = None
-    """What zeros and angles may be off by, rad; None: not said."""
+    """Standard deviation of zeros and angles, rad; None: not given."""
     place_sd: float | None = None
-    """What places may be off by, m; None: they are taken as described."""
+    """Standard deviation of places, m; None: they are exact."""
 
     @classmethod
     def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
-        """Return `names` as they are, or, unless `errors` says, those of turning joints no two neighbours of which are parallel."""
+        """Return `names` unchanged, or, if None and `errors` is not given, the rotating joints without parallel neighbours."""
         if isinstance(names, cls):
             return names
         names = tuple(names)
@@ -127,7 +127,7 @@ class JointNames(Sequence):
 
     @property
     def errors(self) -> dict[str, Any] | None:
-        """Return what `of` needs beside the names that are read, or None when these say it all."""
+        """Return the arguments that `of` needs in addition to the names with readings, or None if these suffice."""
         if self == self.of(self.read):
             return None
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'read'}
@@ -135,7 +135,7 @@ class JointNames(Sequence):
 
     @property
     def taken_as_described(self) -> tuple[str, ...]:
-        """Joints whose zero is the azimuth or belongs to the mount, so that nothing can tell it from them."""
+        """Joints whose zero is collinear with the azimuth or with the mount."""
         return tuple(name for name in self.turning if name not in self.zeros)
 
     def __getitem__(self, index: int | slice) -> Any:
@@ -188,13 +188,13 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
 def _require_limits(limits: JointLimits, what: str) -> None:
     lower, upper = limits.lower, limits.upper
     if (lower is None) != (upper is None) or (lower is not None and upper is not None and lower > upper):
-        raise InputError(f'table: the range of {what} must go from a smaller to a larger number, got [{lower}, {upper}]; correct it')
+        raise InputError(f'table: the range of {what} must be a smaller and a larger number, got [{lower}, {upper}]; correct it')
     if limits.endless and lower is not None:
-        raise InputError(f'table: {what} must have a range or be endless, got both; leave one out', code='range_and_endless')
+        raise InputError(f'table: {what} must have a range or be endless, got both; omit one', code='range_and_endless')
     for name in ('speed', 'acceleration'):
         value = getattr(limits, name)
         if value is not None and not value > 0:
-            raise InputError(f'table: the largest {name} of {what} must be above zero, got {value:g}; correct it, or leave it out')
+            raise InputError(f'table: the largest {name} of {what} must be above zero, got {value:g}; correct or omit it')
 
 
 def _mimic(item: Any, name: str) -> Mimic:
@@ -207,7 +207,7 @@ def _mimic(item: Any, name: str) -> Mimic:
 
 
 def joint_to_mapping(joint: Joint) -> dict[str, Any]:
-    """Return the entry that `joint_from_mapping` turns into an equal joint; what is at its default is left out, but for the place."""
+    """Return the entry that `joint_from_mapping` turns into an equal joint; values at their default are omitted, except the place."""
     item: dict[str, Any] = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
     if any(joint.rpy_deg):
         item['rpy_deg'] = list(joint.rpy_deg)
@@ -221,6 +221,6 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
         item['endless'] = True
     for key, value in zip(LIMIT_KEYS[joint.type][:3], (ends, limits.speed, limits.acceleration), strict=True):
         if value is not None:
-            # Twelve digits of a degree's fraction, so that what was read comes back as it was written.
+            # Twelve decimals of a degree, so that values survive reading and writing.
             item[key] = np.round(np.asarray(value) / unit, 10).tolist()
     return item

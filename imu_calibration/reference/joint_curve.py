@@ -25,11 +25,11 @@ class JointCurve:
     pieces: np.ndarray
     """Polynomials between the knots, shape (6, n_intervals, n_joints)."""
     noise_sd: np.ndarray
-    """Noise of the positions, rad, shape (n_joints,): as found in the residuals, not below what is known of the encoder."""
+    """Noise of the positions, rad, shape (n_joints,): estimated from the residuals, at least the known noise of the encoder."""
     velocity_trusted: np.ndarray
     """Whether the velocities agree with the positions, shape (n_joints,)."""
     bandwidth: np.ndarray
-    """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint that stands still."""
+    """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint at rest."""
 
     def at(self, time: np.ndarray, derivatives: int = 3) -> JointMotion:
         """
@@ -50,11 +50,11 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
                     noise_sd: np.ndarray | float | None = None,
                     settings: JointSettings = JointSettings()) -> JointCurve:
     """
-    Return the smooth curve behind readings of the joints.
+    Return the smooth curve through readings of the joints.
 
     A penalised quintic spline per joint, one knot per reading; the penalty follows from the data (`smoothing.smooth`), so
     that readings without noise are interpolated and those of a coarse encoder give sane accelerations. Velocities that
-    agree with the positions in scale and lag take part.
+    agree with the positions in scale and lag are used.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
 
 def _check(time, position):
     if not len(time) or not np.isfinite(position).all():
-        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; drop what is not a number',
+        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; remove non-finite values',
                          code='not_finite')
     if np.any(np.diff(time) < 0):
         raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those',
@@ -130,7 +130,7 @@ def _place_knots(time):
 
 
 def _noise_floor(position, noise_sd):
-    """Return the noise that the readings have at least: what the caller knows, rounding, coarse steps."""
+    """Return the lower limit of the noise of the readings: the given value, rounding, coarse steps."""
     floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
     steps = np.array([encoder_step(column) for column in position.T])
     return np.maximum.reduce([floor, steps / np.sqrt(12), np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape)])

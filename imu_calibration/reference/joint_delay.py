@@ -8,15 +8,15 @@ import numpy as np
 from imu_calibration.reference.joint_motion import JointMotion
 
 LINKED = 0.1
-"""Between stamps further apart than this nothing is interpolated, s: other windows, other rests."""
+"""Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or rests."""
 
 BLOCK = 4096
-"""Rows that are worked on at once, so that they stay in the processor's cache."""
+"""Rows per block, so that they fit in the processor's cache."""
 
 
 def shifted(motion: JointMotion, delay: float) -> JointMotion:
     """
-    Return the motion at ``time - delay``, with `time` left as it is: what the IMU felt when its stamps are `delay` late.
+    Return the motion at ``time - delay``, with unchanged `time`: the motion of the IMU if its stamps are `delay` late.
 
     Between two stamps the polynomial of degree seven that meets position, rate, acceleration and jerk at both (Hermite), so that
     the error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps' frequency. Before the first of a run of
@@ -55,7 +55,7 @@ def _interpolated(time, step, derivatives, target, backwards):
     moved = np.empty((4, len(target), derivatives.shape[2]))
     moved[:, inside] = between
     beyond = np.flatnonzero(~inside)
-    # The end of the run that the stamp itself belongs to: a stamp alone, of a rest, is its own.
+    # The end of the run that contains the stamp: an isolated stamp, of a rest, is its own run.
     base = np.searchsorted(time, target[beyond], side='left') if backwards else np.searchsorted(time, target[beyond], side='right') - 1
     base = np.clip(base, 0, len(time) - 1)
     moved[:, beyond] = _taylor(derivatives[:, base], (target[beyond] - time[base])[:, None])
@@ -78,7 +78,7 @@ def _hermite(left, right, step, by):
     """Return value and first three derivatives, shape (4, m, n_joints), at `by` from the left end of intervals of length `step`, (m, 1)."""
     scale = np.stack([step**0, step, step**2, step**3])
     left = scale * left
-    # What the cubic from the left end lacks at the right end is made up by the powers four to seven.
+    # The powers four to seven correct the error of the left-end cubic at the right end.
     upper = np.tensordot(_FROM_ENDS, scale * right - _taylor(left, 1.0), 1)
     coefficients = [left[0], left[1], left[2] / 2, left[3] / 6, *upper]
     u, found = by / step, np.empty_like(left)

@@ -1,4 +1,4 @@
-"""Least squares behind the joints' curve: positions, velocities that are believed, and the trend taken off before."""
+"""Least squares of the joints' curve: positions, accepted velocities, and the trend removed before."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class JointRows:
         return design_matrix(self.knots, interval, values), normal_bands(self.knots, interval, values)
 
     def positions(self) -> PenalisedSpline:
-        """Return the least squares of positions alone."""
+        """Return the least squares of positions only."""
         return PenalisedSpline(*self._position)
 
     def both(self, weight: np.ndarray) -> PenalisedSpline:
@@ -40,7 +40,7 @@ def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, vel
     trend.add_to(pieces, rows.knots)
     _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
     trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof, settings=settings)
-    # What velocities add at the edge of the band, against the positions.
+    # Information of velocities at the edge of the band, relative to positions.
     if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
         return trusted, fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
@@ -51,7 +51,7 @@ def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, vel
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Parabolas, which the penalty leaves free; taken off first for the sake of rounding."""
+    """Parabolas, which the penalty does not constrain; removed first to reduce rounding."""
 
     centre: float
     """Origin of their time, s."""
@@ -60,7 +60,7 @@ class Trend:
 
     @classmethod
     def through(cls, time: np.ndarray, position: np.ndarray, still: np.ndarray) -> 'Trend':
-        """Return those of least squares (of lower degree for few stamps); constants for joints that are `still`."""
+        """Return the parabolas of least squares (of lower degree for few stamps); constants for joints that are `still`."""
         centre = 0.5 * (time[0] + time[-1])
         degree = min(2, len(np.unique(time)) - 1)
         scale = max(time[-1] - centre, 1e-9) ** np.arange(degree + 1)
@@ -97,14 +97,14 @@ class JointSettings:
                                 'too large: rough accelerations now and then; too small: sharp ramps are rounded')
     velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
                                     'too large: filtered velocities distort the reference')
-    velocity_lag: float = setting(2e-4, 's', 'joint velocities are used when their lag behind the positions stays below this', (0.0, 0.1),
-                                  'too large: late velocities look like a time offset of the IMU')
+    velocity_lag: float = setting(2e-4, 's', 'joint velocities are used if their lag behind the positions is below this', (0.0, 0.1),
+                                  'too large: late velocities imitate a time offset of the IMU')
 
 
 def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float,
                    settings: JointSettings) -> tuple[bool, float]:
     """
-    Compare a joint's velocities with those of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
+    Compare a joint's velocities with the derivative of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndar
     Returns
     -------
     trusted : bool
-        Whether scale, lag and offset agree; false when the motion is too weak to tell.
+        Whether scale, lag and offset agree; false if the motion is too weak for the test.
     noise_sd : float
         Scatter of the velocities, rad/s, that of the curve included.
 

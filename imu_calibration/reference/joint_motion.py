@@ -22,9 +22,9 @@ class JointMotion:
     jerk: np.ndarray
     """Third derivative, rad/s^3, shape (n, n_joints)."""
     thermal_branch: np.ndarray | None = None
-    """Which way the temperature came to these instants (`reference.thermal_branch`), shape (n,); None: nobody knows."""
+    """Thermal branch at these instants (`reference.thermal_branch`), shape (n,); None: unknown."""
     vibration: np.ndarray | None = None
-    """How much it vibrates there (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: nobody knows."""
+    """Variance of vibration (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: unknown."""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -37,7 +37,7 @@ class JointMotion:
 
     @classmethod
     def joined(cls, parts: Sequence['JointMotion']) -> 'JointMotion':
-        """Return motions one after the other; what one of them does not know nobody knows."""
+        """Return consecutive motions; a quantity that one of them lacks is unknown."""
         columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(cls)}
         joined: dict[str, Any] = {name: None if any(each is None for each in some) else np.concatenate(some)
                                   for name, some in columns.items()}

@@ -43,7 +43,7 @@ class _Link(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What happens to vectors on the way out: an offset, a constant matrix, then the joint."""
+    """One step of the outward transformation of vectors: an offset, a constant matrix, then the joint."""
 
     offset: np.ndarray
     matrix: np.ndarray
@@ -58,9 +58,9 @@ class _Step(NamedTuple):
 
 def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None) -> Reference:
     """
-    Return what a perfect sensor at the reference point of the mount feels.
+    Return the readings of a perfect sensor at the reference point of the mount.
 
-    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin and q how far it has turned::
+    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin and q its angle::
 
         force' = C (force + alpha x r + omega x (omega x r)),   omega' = C omega + a q',
         alpha' = C alpha + a q'' + (C omega) x a q'
@@ -100,7 +100,7 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
 
 
 def _chain_steps(constants, motion):
-    """Return the `_Step`s; joints that stand still are folded into the constant matrix and the offset of the next one."""
+    """Return the `_Step`s; joints at rest are merged into the constant matrix and the offset of the next one."""
     steps, matrix, offset = [], np.eye(3), np.zeros(3)
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
@@ -134,7 +134,7 @@ def _to_coordinate_axis(axis):
 
 
 class _Constants(NamedTuple):
-    """What the recursion needs of a table."""
+    """Interface of a table for the recursion."""
 
     base: np.ndarray
     """`_base_columns`."""
@@ -204,7 +204,7 @@ def _lean(columns, step, angle, rate, acceleration):
         vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
     if link.sag:
         up, spin, alpha = columns[:, 2], columns[:, 3], columns[:, 4]
-        moves = _cross(up, spin)   # up stays in space; the Earth's turn of it is nothing beside the sag
+        moves = _cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
         axis = np.zeros((3, 1))
         axis[step.third] = step.sense * link.sag
         vector += np.stack([_cross(each, axis) for each in (up, moves, _cross(moves, spin) + _cross(up, alpha))])

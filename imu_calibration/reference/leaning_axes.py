@@ -14,7 +14,7 @@ WOBBLES = (-1, 2)
 """
 Turns of the lean for one turn of the joint: once against it, twice with it.
 
-What turns once with the joint is the direction of the next axis or the mount, what stays is that of this one.
+A component that rotates once with the joint is the direction of the next axis or the mount, a constant one that of this axis.
 """
 
 
@@ -22,7 +22,7 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
     """
     Return the table whose turning axes, but the first, hang towards the ground.
 
-    What a joint carries turns by the rotation vector ``angle (up x axis)``: by the full angle where the axis lies level.
+    The load of a joint rotates by the rotation vector ``angle (up x axis)``: by the full angle if the axis is level.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
     """
     Return the table whose axes lean as they turn.
 
-    What a joint carries turns by the rotation vector ``Re(z) u + Im(z) v`` with u, v its `axis_error_directions` and
+    The load of a joint rotates by the rotation vector ``Re(z) u + Im(z) v`` with u, v its `axis_error_directions` and
     ``z = sum over m of (c + i s) exp(i m q)`` at the joint angle q.
 
     Parameters

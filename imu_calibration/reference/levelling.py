@@ -1,4 +1,4 @@
-"""A table that does not stand level."""
+"""A table that is not level."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ def tilt(table: Table, angles: np.ndarray) -> Table:
     Return the table with its true `up` turned by the rotation vector (tx, ty, 0) of the level frame.
 
     A levelling error: ``up_true = exp((tx, ty, 0) x) up``, rad. North turns with it, so that the Earth's rate is the same
-    vector of n turned alike; `azimuth_deg` changes where the convention of n asks for it.
+    vector of n turned alike; `azimuth_deg` changes where the convention of n requires it.
     """
     mat_bn = table.mat_nb.T @ rotation(np.array([angles[0], angles[1], 0.0]))
     tilted = replace(table, up=tuple(mat_bn[:, 2].tolist()))

@@ -1,4 +1,4 @@
-"""How far and how fast the joints that are driven may go, as arrays."""
+"""Range, speed and acceleration of the driven joints, as arrays."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from imu_calibration.reference.joint import Joint
 from imu_calibration.reference.table import Table
 
 USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
-"""Speed and acceleration of joints that turn, and of those that slide, whose description says nothing: rad/s, rad/s^2; m/s, m/s^2."""
+"""Default speed and acceleration of rotating and of sliding joints: rad/s, rad/s^2; m/s, m/s^2."""
 NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
 """Stated wherever a plan is printed, saved or driven."""
 DEFAULT, ROBOT, TABLE = 'default', 'robot description', 'table file'
 """Origins of limits; default: no description gives it."""
 RADIANS = 2 * np.pi
-"""A range in degrees whose ends are smaller than this looks like radians."""
+"""A range in degrees with smaller ends is probably in radians."""
 WIDEST = 20 * np.pi
-"""A range of ten turns in a robot description looks like degrees, rad."""
+"""A range of ten turns in a robot description is probably in degrees, rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class MotionLimits:
         return replace(self, lower=lower, upper=upper)
 
     def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
-        """Return the limits with joints that turn restricted to so many degrees to either side of a position; joints that slide stay."""
+        """Return the limits with rotating joints restricted to `reach_deg` on either side of a position; sliding joints do not change."""
         return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
 
     def hold(self, position: np.ndarray, margin: float = 1e-9) -> bool:
@@ -99,7 +99,7 @@ def limits_of(table: Table) -> MotionLimits:
     turns = np.ones(len(names), bool)
     lower, upper, fastest = np.full(len(names), -np.inf), np.full(len(names), np.inf), np.full((2, len(names)), np.inf)
     origins = [[DEFAULT] * 3 for _ in names]
-    # A joint's own entry comes last, so that a follower does not determine its type.
+    # A joint's own entry is last, so that a follower does not determine its type.
     for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
         column, limits = names.index(joint.source), joint.limits
         turns[column] = joint.turns

@@ -71,7 +71,7 @@ def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any
 
 
 def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the lower bands of design.T @ design, shape (6, n_coefficients), as `scipy.linalg.solveh_banded` takes them."""
+    """Return the lower bands of design.T @ design, shape (6, n_coefficients), in the format of `scipy.linalg.solveh_banded`."""
     size = knots.n_coefficients
     bands = np.zeros((ORDER, size))
     for first in range(ORDER):

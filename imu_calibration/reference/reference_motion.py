@@ -1,4 +1,4 @@
-"""What a perfect sensor would feel: the true motion, as far as table and clock tell it."""
+"""Readings of a perfect sensor: the motion according to table and clock."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -28,9 +28,9 @@ class Reference:
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
-    """Which way the temperature came to the samples (`reference.thermal_branch`), shape (n,); None: nobody knows."""
+    """Thermal branch at the samples (`reference.thermal_branch`), shape (n,); None: unknown."""
     shaking: np.ndarray | None = None
-    """How much it vibrates at the samples (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: nobody knows."""
+    """Variance of vibration at the samples (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: unknown."""
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
@@ -39,12 +39,12 @@ class Reference:
 
     @property
     def thermal_branch(self) -> np.ndarray:
-        """Which way the temperature came, in [-1, 1], shape (n,); zero, between the branches, where nobody knows."""
+        """Thermal branch in [-1, 1], shape (n,); zero, between the branches, if unknown."""
         return np.zeros(len(self)) if self.branch is None else self.branch
 
     @property
     def vibration(self) -> np.ndarray:
-        """How much it vibrates, (m/s^2)^2, shape (n, 3); zero where nobody knows."""
+        """Variance of vibration, (m/s^2)^2, shape (n, 3); zero if unknown."""
         return np.zeros((len(self), 3)) if self.shaking is None else self.shaking
 
     @property
@@ -60,7 +60,7 @@ class Reference:
     @property
     def _joints(self):
         if self.motion is None:
-            raise InputError('a column that speaks of joints needs a table or an arm, there is none; leave the effect out')
+            raise InputError('an effect that depends on joints needs a table or an arm, there is none; omit the effect')
         return self.motion
 
     def select(self, index: np.ndarray | slice) -> 'Reference':

@@ -1,4 +1,4 @@
-"""How the root of a robot stands, from transforms between frames that do not move."""
+"""Attitude of the root of a robot, from static transforms."""
 
 from collections.abc import Iterable
 
@@ -32,7 +32,7 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
         passed.append(frame)
         frame, quaternion = parents[frame]
         if frame in passed:
-            raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or say where up is",
+            raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
                              key='up', code='frame_circle')
         mats.append(_matrix(quaternion))
     for matrix in reversed(mats):

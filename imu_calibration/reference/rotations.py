@@ -20,7 +20,7 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
     """
     Return roll, pitch and yaw of a rotation matrix, rad, shape (3,): ``rotation_from_rpy`` gives the matrix back to rounding.
 
-    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw is taken from what roll leaves (Shoemake), so
+    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw follows from the remainder (Shoemake), so
     that their errors cancel there.
     """
     roll = np.arctan2(matrix[2, 1], matrix[2, 2])
@@ -30,7 +30,7 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def align(direction: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that takes the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
+    """Return the smallest rotation from the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
     x, y, z = direction
     across = x * x + y * y
     if z < 0 and across < 1e-24:

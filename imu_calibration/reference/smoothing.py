@@ -15,7 +15,7 @@ from imu_calibration.samples import runs_of
 _COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
 _PILOT = -2.0  # rough, but tame where readings lie close together
 _TAPER = 0.2  # share of a record in which the weight of the ends rises
-_LONG = 1000  # rows from which on the residuals are taken from the spectrum
+_LONG = 1000  # rows from which on the spectrum gives the residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +88,8 @@ class PenalisedSpline:
         """
         Return weights of the penalty that fall towards both ends, shape (n_coefficients - 3,).
 
-        A penalty lets the third and higher derivatives die away at the ends. Weights that fall with the cube of the
-        distance, over a period of the bandwidth, take that bias away for some more noise: the error of the
+        A penalty reduces the third and higher derivatives towards zero at the ends. Weights that decrease with the cube of the
+        distance, over a period of the bandwidth, remove this bias for some more noise: the error of the
         acceleration in the last hundredths of a second falls to a third and less.
         """
         distance = np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1]) - 2
@@ -155,7 +155,7 @@ def _squares_by_spectrum(spline, values):
     Return the function decade -> mean squared residuals, from one rough fit.
 
     With d the third differences of the unpenalised coefficients, the residuals have the power
-    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; what no spline of these knots can follow comes on top.
+    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; the error of approximation by splines with these knots is added.
     """
     pilot = _penalty(spline, _PILOT)
     coefficients, floor = spline.fit(values, pilot)
@@ -163,7 +163,7 @@ def _squares_by_spectrum(spline, values):
     power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(taper ** 2)
     theta = np.arange(len(power)) * 2 * np.pi / len(taper)
     normal, damping = spline.symbols(theta)
-    # Third differences of the rough fit lack what its own penalty took.
+    # Third differences of the rough fit lack the part removed by its own penalty.
     power *= ((1 + pilot * damping / normal) ** 2 * normal * damping)[:, None]
     power[1:] *= 2.0 if len(taper) % 2 else np.where(np.arange(1, len(power)) == len(power) - 1, 1.0, 2.0)[:, None]
     power /= len(taper) * spline.density
@@ -178,7 +178,7 @@ def _squares_by_spectrum(spline, values):
 
 
 def _taper(size):
-    """Return a window with raised-cosine edges (Tukey's; scipy.signal takes seconds to import)."""
+    """Return a window with raised-cosine edges (Tukey's; the import of scipy.signal is slow)."""
     inside = np.minimum(np.arange(size), np.arange(size)[::-1]) / max(0.5 * _TAPER * (size - 1), 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * np.minimum(inside, 1.0))
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 NAMED = 6
-"""Frames that are named at most in a line for people."""
+"""Largest number of frames in one line."""
 
 
 class StaticTransforms:
@@ -17,7 +17,7 @@ class StaticTransforms:
 
     def add(self, parent: str, child: str, *, xyz: Sequence[float], quaternion: Sequence[float]) -> bool:
         """
-        Take the pose of a child frame in its parent: translation in m, quaternion (x, y, z, w).
+        Add the pose of a child frame in its parent: translation in m, quaternion (x, y, z, w).
 
         Returns
         -------
@@ -33,7 +33,7 @@ class StaticTransforms:
 
     def pose(self, target: str, source: str) -> tuple[np.ndarray, np.ndarray] | None:
         """
-        Return the pose of `source` in `target`, or None when nothing connects them.
+        Return the pose of `source` in `target`, or None if they are not connected.
 
         Returns
         -------
@@ -50,14 +50,14 @@ class StaticTransforms:
         return mat_rt.T @ (xyz_s - xyz_t), mat_rt.T @ mat_rs
 
     def why_not(self, target: str, source: str) -> str:
-        """Return what is missing between two frames, for people."""
+        """Return the missing connection of two frames as text."""
         known = {*self._parents, *(parent for parent, _, _ in self._parents.values())}
         if not known:
             return 'no static transform has come'
         absent = [f"'{name}'" for name in (target, source) if name not in known]
         names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
         return f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})' if absent else \
-            f"'{target}' and '{source}' are in trees that nothing static connects (roots: {self._to_root(target)[-1][0]}, " \
+            f"'{target}' and '{source}' are in trees without a static connection (roots: {self._to_root(target)[-1][0]}, " \
             f'{self._to_root(source)[-1][0]})'
 
     def _to_root(self, frame):

@@ -20,7 +20,7 @@ _MOUNT_KEYS = ('rpy_deg', 'xyz')
 @dataclass(frozen=True)
 class Table:
     """
-    A chain of joints that carries the sensor, and where it stands.
+    A chain of joints that carries the sensor, and its site.
 
     The level frame n is the base frame turned by the smallest rotation that makes `up` its z axis (half a turn about
     the base x axis when the base hangs upside down).
@@ -43,9 +43,9 @@ class Table:
     joint_noise_rad: float | None = None
     """Noise or resolution of the encoders, rad; None: estimated from the data."""
     joint_error_rad: float | None = None
-    """What zeros and axes of the joints may be off by, a standard deviation, rad; None: they are taken as described unless asked for."""
+    """Standard deviation of zeros and axes of the joints, rad; None: exact unless their errors are requested."""
     joint_error_m: float | None = None
-    """What the places of the axes may be off by, a standard deviation, m; None: they are taken as described."""
+    """Standard deviation of the places of the axes, m; None: exact."""
     mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Inner link to sensor frame, roll, pitch, yaw about fixed axes as in URDF, degrees."""
     mount_xyz: tuple[float, float, float] | None = None
@@ -90,9 +90,9 @@ class Table:
 
     @cached_property
     def joint_names(self) -> JointNames:
-        """Names of the joints that are read, from the base outwards, and of what may be wrong with them."""
+        """Names of the joints with readings, from the base outwards, and of their errors."""
         turning = [joint.source for joint in self.joints if joint.turns]
-        # A zero that nothing but the first or the last axis feels is the azimuth, or belongs to the mount.
+        # A zero that affects only the first or the last axis is the azimuth, or belongs to the mount.
         apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
         read, turning = (tuple(dict.fromkeys(names)) for names in ((joint.source for joint in self.joints), turning))
         angles = tuple(angle.name for angle in axis_angles(self.joints))
@@ -102,12 +102,12 @@ class Table:
 
     @property
     def gravity_value(self) -> float:
-        """Local gravity, m/s^2: as given, else normal gravity."""
+        """Local gravity, m/s^2: as given, otherwise normal gravity."""
         return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)  # type: ignore[arg-type]
 
     @property
     def gravity_sd_value(self) -> float:
-        """Standard deviation of `gravity_value`, m/s^2: as given, else zero for a given gravity and the accuracy of normal gravity."""
+        """Standard deviation of `gravity_value`, m/s^2: as given; zero for a given gravity, else the accuracy of normal gravity."""
         if self.gravity_sd is not None:
             return self.gravity_sd
         return 0.0 if self.gravity is not None else NORMAL_GRAVITY_ACCURACY * self.gravity_value
@@ -147,7 +147,7 @@ def joint_entries(mapping: Any) -> tuple:
 
 
 def site_from_mapping(mapping: Any) -> dict[str, Any]:
-    """Return what a table description says beside the joints, as arguments of `Table`."""
+    """Return the entries of a table description except the joints, as arguments of `Table`."""
     require_keys(mapping, [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'], 'table')
     values = {name: value for name, value in mapping.items() if value is not None and name not in ('mount', 'joints')}
     mount = mapping.get('mount') or {}

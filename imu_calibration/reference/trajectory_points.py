@@ -1,4 +1,4 @@
-"""Points of a joint trajectory: what is asked of the joints, by name and by time from its start."""
+"""Points of a joint trajectory, by name and by time from its start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from imu_calibration.errors import InputError
 @dataclass(frozen=True, eq=False)
 class TrajectoryPoints:
     """
-    What a JointTrajectory says. Without points it asks the joints to stop.
+    Content of a JointTrajectory. Without points it commands the joints to stop.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class TrajectoryPoints:
         return float(self.time[-1]) if len(self.time) else 0.0
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return what is given at each point, by name."""
+        """Return the quantities of the points, by name."""
         given = {'position': self.position, 'rate': self.rate, 'acceleration': self.acceleration}
         return {name: values for name, values in given.items() if values is not None}
 
@@ -81,7 +81,7 @@ class TrajectoryPoints:
         """
         own, wanted = list(self.joint_names), list(joint_names)
         if sorted(own) != sorted(wanted):
-            raise InputError(f'a trajectory must name the joints {", ".join(wanted)} and no others, got {", ".join(own) or "none"}; '
+            raise InputError(f'a trajectory must name exactly the joints {", ".join(wanted)}, got {", ".join(own) or "none"}; '
                              'name every joint once', code='joint_names')
         order = [own.index(name) for name in wanted]
         columns: dict[str, Any] = {name: values[:, order] for name, values in self.columns().items()}

@@ -18,11 +18,11 @@ from imu_calibration.reference.rotations import rotation_from_rpy, rpy_from_rota
 from imu_calibration.reference.table import Table, joint_entries, site_from_mapping
 
 JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
-"""What an arm's joints may be off by unless the site says better: 0.1 to 1 mrad, 0.1 to 1 mm is what arms have."""
+"""Default standard deviations of an arm's joints: arms have 0.1 to 1 mrad and 0.1 to 1 mm."""
 
 _MOVING = {'revolute': 'revolute', 'continuous': 'revolute', 'prismatic': 'prismatic'}
 _READ = {'link': (), 'joint': ('origin', 'parent', 'child', 'axis', 'limit', 'mimic')}
-"""Elements that say how the robot moves, and their children that do; meshes, materials, controllers and simulators' tags are left aside."""
+"""Elements that describe the kinematics, with their children; meshes, materials, controllers and simulators' tags are ignored."""
 
 
 def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None = None) -> Table:
@@ -30,7 +30,7 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     Return the chain of joints from the root of a robot to one of its links.
 
     Fixed joints are folded into their neighbours; a joint that mimics another one is moved by the readings of that one. The root's
-    z axis points up unless the site says otherwise.
+    z axis points up unless the site differs.
 
     Parameters
     ----------
@@ -39,8 +39,8 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     link : str
         Link whose frame is the sensor's: the frame_id of its messages.
     site : mapping, optional
-        What a table description says beside the joints (up, gravity, latitude, mount, ...); its joints may give limits, by name.
-        Without gravity and latitude the standard gravity is taken, with the standard deviation of not knowing the place.
+        Entries of a table description except the joints (up, gravity, latitude, mount, ...); its joints may give limits, by name.
+        Without gravity and latitude the standard gravity is used, with the standard deviation of an unknown site.
 
     Raises
     ------
@@ -61,11 +61,11 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
 
 
 def root_of(text: str | bytes) -> str:
-    """Return the name of the link that all others hang on."""
+    """Return the name of the root link."""
     robot = _read(text)
     roots = [link for link in robot.link_map if link not in robot.parent_map]
     if len(roots) != 1:
-        raise InputError(f'a robot description must have one link that all others hang on, it has {_listed(roots) or "none"}; correct it')
+        raise InputError(f'a robot description must have one root link, it has {_listed(roots) or "none"}; correct it')
     return roots[0]
 
 
@@ -87,7 +87,7 @@ class _Placement:
 
 
 def _read(text):
-    """Return the robot that the parser makes of what the text says about links and joints."""
+    """Return the parser's robot from the links and joints of the text."""
     from xml.etree import ElementTree
 
     try:
@@ -113,7 +113,7 @@ def _read(text):
 
 
 def _chain(robot, link):
-    """Return the moving joints from the root to `link`, and the placement of the link behind the last of them."""
+    """Return the moving joints from the root to `link`, and the placement of the link after the last of them."""
     if link not in robot.link_map:
         raise InputError(f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
                          'name one of these', key='imu_link', code='link_unknown')
@@ -130,7 +130,7 @@ def _chain(robot, link):
             continue
         if joint.type not in _MOVING:
             raise InputError(f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
-                             f'{joint.type}; use a description that begins behind it')
+                             f'{joint.type}; use a description that begins after it')
         joints.append(Joint(joint.name, tuple(joint.axis or (1.0, 0.0, 0.0)), type=_MOVING[joint.type], mimic=_mimic(robot, joint),
                             limits=_limits(joint), **placement.fields))
         placement = _Placement(np.zeros(3), np.eye(3))
@@ -147,7 +147,7 @@ def _origin(joint):
 
 
 def _mimic(robot, joint):
-    """Return what the joint follows in the end, or None."""
+    """Return the joint at the end of the chain of followed joints, or None."""
     multiplier, offset, name, seen = 1.0, 0.0, joint.name, []
     while robot.joint_map[name].mimic is not None:
         mimic = robot.joint_map[name].mimic

@@ -1,4 +1,4 @@
-"""How much it vibrates: the running variance of what an accelerometer reads above the band of its motions."""
+"""Variance of vibration: the running variance of accelerometer readings above the band of the motions."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 
 CORNER = 5.0
 """
-What passes three times through a high pass of this frequency is vibration, Hz: gravity that turns at 200 deg/s leaves 0.02 m/s^2 of it,
-joints in slow oscillation nothing.
+Frequency of a triple high pass, whose output is vibration, Hz: gravity rotating at 200 deg/s contributes 0.02 m/s^2,
+slow oscillation of joints zero.
 """
 MEMORY = 0.5
 """Time constant of the running mean of its square, s: as long as a table settles."""
@@ -19,8 +19,8 @@ class BandVariance:
     Running variance of specific force above `CORNER`, for each axis.
 
     ``y = h * h * h * x`` with ``h_k: y_k = a y_(k-1) + (1 + a) / 2 (x_k - x_(k-1))``, ``a = exp(-2 pi corner dt)``, and
-    ``v_k = b v_(k-1) + (1 - b) y_k^2``, ``b = exp(-dt / memory)``. It looks at the measured force, sample after sample, never ahead, and
-    remembers fifteen numbers; what is above half the sample rate shows where it is aliased to.
+    ``v_k = b v_(k-1) + (1 - b) y_k^2``, ``b = exp(-dt / memory)``. It is causal, uses the measured force sample by sample, and
+    has fifteen state variables; vibration above half the sample rate is aliased.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class BandVariance:
         """At the last sample, (m/s^2)^2."""
 
     def push(self, period: float, force: tuple[float, float, float]) -> tuple[float, ...]:
-        """Take the next sample, `period` s after the last one, and return the variances, (m/s^2)^2."""
+        """Process the next sample, `period` s after the last one, and return the variances, (m/s^2)^2."""
         if not self._inputs:
             self._begin(force)
         keep, forget = _decays(period)
@@ -46,7 +46,7 @@ class BandVariance:
 
     def of(self, period: float, force_s: np.ndarray) -> np.ndarray:
         """Return the variances after each of the next samples, shape (n, 3): the same as `push` one by one."""
-        from scipy.signal import lfilter  # here, because it takes long to import
+        from scipy.signal import lfilter  # here, because its import is slow
 
         if not len(force_s):
             return np.zeros((0, 3))

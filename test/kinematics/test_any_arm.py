@@ -146,7 +146,7 @@ def test_a_site_may_only_name_joints_on_the_way():
 
 @pytest.mark.parametrize('changes, said', [
     ({'type': 'planar'}, "type of joint 'a' must be revolute or prismatic"),
-    ({'range_deg': [10, -10]}, "range of joint 'a' must go from a smaller to a larger number"),
+    ({'range_deg': [10, -10]}, "range of joint 'a' must be a smaller and a larger number"),
     ({'range_deg': 10}, "range_deg of joint 'a' must be two numbers"),
     ({'speed_deg_s': 0}, "largest speed of joint 'a' must be above zero"),
     ({'type': 'prismatic', 'range_deg': [0, 1]}, "key 'range_deg' is unknown"),

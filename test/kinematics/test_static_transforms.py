@@ -53,7 +53,7 @@ def test_what_is_missing_is_named(tree):
     assert "'a' and 'b' are in none that came" in tree.why_not('a', 'b')
     tree.add('map', 'odom', xyz=[0, 0, 0], quaternion=[0, 0, 0, 1])
     assert tree.pose('odom', 'imu') is None
-    assert tree.why_not('odom', 'imu') == "'odom' and 'imu' are in trees that nothing static connects (roots: map, base)"
+    assert tree.why_not('odom', 'imu') == "'odom' and 'imu' are in trees without a static connection (roots: map, base)"
 
 
 def test_a_ring_of_transforms_ends():
