@@ -4,22 +4,22 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 
-SHOWN = {
-    'm/s^2': (1e3 / STANDARD_GRAVITY, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'), 's': (1e3, 'ms'),
-    '(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³'),
-    '(rad/s)^-1': (1e2 * DEG, '% per deg/s'), '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
-    'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
-    'rad/turn': (1 / DEG, 'deg per turn'),
+NOISE = 'noise'
+"""The quantity of noise figures, which have the units of data sheets."""
+_SHOWN = {
+    '': {'m/s^2': (1e3 / STANDARD_GRAVITY, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'),
+         's': (1e3, 'ms'), '(rad/s)^-1': (1e2 * DEG, '% per deg/s'), '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
+         'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
+         'rad/turn': (1 / DEG, 'deg per turn')},
+    'accelerometer': {'(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³')},
+    'gyroscope': {'(m/s^2)^-1': (1e2 * STANDARD_GRAVITY, '% per g'), '(m/s^2)^-2': (1e2 * STANDARD_GRAVITY**2, '% per g²')},
+    NOISE: {'m/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
+            'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
+            'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'), 'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
+            'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
+            'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
 }
-"""SI unit -> (factor, unit that people use)."""
-SHOWN_OF_NOISE = {
-    'm/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
-    'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
-    'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'),
-    'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'), 'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'),
-    'rad': (3600 / DEG, 'arcsec'), 'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's'),
-}
-"""The same for the figures of noise, as data sheets print them."""
+"""Quantity ('' for all) or sensor -> SI unit -> (factor, unit that people use)."""
 
 
 OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
@@ -31,9 +31,19 @@ def unit_of_rest(length: float) -> str:
     return next((unit for unit, scale in OTHER_UNITS.items() if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25), '')
 
 
-def for_people(unit: str) -> tuple[float, str]:
-    """Return (factor, unit) that turns an SI value into what people read; (1, unit) where SI is what they read."""
-    return SHOWN.get(unit, (1.0, unit))
+def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
+    """
+    Return (factor, unit) that converts an SI value for people; (1, unit) where people read SI.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit.
+    quantity : str
+        `NOISE`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g² of an accelerometer and % per g of a gyroscope.
+
+    """
+    return _SHOWN.get(quantity.partition('.')[0], {}).get(unit) or _SHOWN[''].get(unit, (1.0, unit))
 
 
 def decimals(sd: float, digits: int = 2) -> int:

@@ -10,7 +10,7 @@ from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigur
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
-from imu_calibration.units import SHOWN_OF_NOISE, significant
+from imu_calibration.units import NOISE, for_people, significant
 
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
@@ -57,7 +57,7 @@ def rows(figures: NoiseFigures) -> list[FigureRow]:
 
 
 def _row(sensor, letter, axis, term):
-    factor, unit = SHOWN_OF_NOISE[UNITS[sensor][term.name]]
+    factor, unit = for_people(UNITS[sensor][term.name], NOISE)
     lower, upper = (end * factor for end in term.interval)
     if term.value is None:
         value, interval = f'< {significant(upper)}' if np.isfinite(upper) else NO_BOUND, ''
@@ -144,7 +144,7 @@ def _rest_line(recording):
 def _axis_lines(name, sensor, axis):
     found = []
     for trend in axis.trends:
-        factor, unit = SHOWN_OF_NOISE[UNITS[sensor][trend.name]]
+        factor, unit = for_people(UNITS[sensor][trend.name], NOISE)
         constant = f' within {duration(trend.time)}' if trend.name == 'turn_on' else ''
         size = f'{significant(trend.value * factor)} ± {significant(trend.sd * factor, 2)} {unit}'
         found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; taken out')
@@ -163,7 +163,7 @@ def _hump(sensor, axis):
     """Return the line of the periodogram at the hump of a curve, or ''."""
     if axis.oscillation is None:
         return ''
-    (frequency, amplitude), (factor, unit) = axis.oscillation, SHOWN_OF_NOISE[UNIT[sensor]]
+    (frequency, amplitude), (factor, unit) = axis.oscillation, for_people(UNIT[sensor], NOISE)
     return f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at {significant(frequency, 3)} Hz'
 
 

@@ -239,7 +239,7 @@ def _shown(formula: Formula) -> str:
 
 def _size(effect, values, sd):
     k = int(np.argmax(np.abs(values)))
-    factor, unit = for_people(effect.unit_of(k))
+    factor, unit = for_people(effect.unit_of(k), effect.sensor)
     return f"{' ± '.join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}"
 
 

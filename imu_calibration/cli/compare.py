@@ -27,7 +27,7 @@ def run(options: Namespace) -> VerbResult:
     for heading in ('parameter', 'A', 'B', 'B - A', 'combined sd', 'unit', 'in sd'):
         table.add_column(heading, justify='left' if heading in ('parameter', 'unit') else 'right')
     for row in result.rows:
-        factor, unit = for_people(row.unit)
+        factor, unit = for_people(row.unit, row.name)
         difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
         table.add_row(row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
                       '-' if row.ratio is None else f'{row.ratio:.1f}')

@@ -101,7 +101,7 @@ def _csv(rows):
 
 def shown(spread: Spread) -> tuple[str, ...]:
     """Return the printed cells of a parameter: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
-    factor, unit = for_people(spread.unit)
+    factor, unit = for_people(spread.unit, spread.name)
     if not spread.count:
         return spread.name, 'held', '', '', unit, '', ''
     mean, sd = with_sd(spread.mean * factor, spread.typical_sd * factor)

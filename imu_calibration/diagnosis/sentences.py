@@ -3,21 +3,12 @@
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Candidate
 from imu_calibration.effects.base import Effect
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
-from imu_calibration.units import with_sd
-
-READABLE = {'m/s^2': (1e-3 * STANDARD_GRAVITY, 'mg'), 'rad/s': (DEG, 'deg/s'), 'rad': (DEG / 60, 'arcmin'), 's': (1e-3, 'ms'),
-            'm': (1e-3, 'mm'),
-            '1': (1e-6, 'ppm'), 'm/s^2/K': (1e-3 * STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (DEG, 'deg/s/K'), '1/K': (1e-6, 'ppm/K'),
-            '(m/s^2)^-1': (1e-3 / STANDARD_GRAVITY, 'mg/g^2'),
-            '(m/s^2)^-2': (1e-3 / STANDARD_GRAVITY**2, 'mg/g^3'), '(rad/s)^-1': (1e-6 / DEG, 'ppm per deg/s'),
-            '(rad/s)/(m/s^2)': (DEG / STANDARD_GRAVITY, 'deg/s/g')}
-"""SI unit -> (size of the readable unit in SI, its name)."""
+from imu_calibration.units import for_people, with_sd
 
 LEAVES_MOST = 'refused: it leaves most of the unexplained where it was'
 """Verdict on an effect that is significant, but removes too small a share."""
@@ -44,12 +35,13 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
     # What this recording cannot tell from another, such as the bias, is no size.
     known = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
     label, value, sd, unit = max(known or amplitudes, key=lambda v: abs(v[1]))
-    size = _size(value, sd, unit)
+    factor, unit = for_people(unit, effect.sensor)
+    size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
     if not known and len(values) > 1:
         size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
-        return (f'{effect.explanation} The limit is {readable(value, unit)}; {n_clipped} samples sit on it and were left out, with those '
-                'close to it.')
+        limit = _with_unit(f'{value * factor:.4g}', unit)
+        return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and those close to it were excluded.'
     which = '' if len(values) == 1 else f' (largest: {label})'
     text = f'{effect.explanation} Its size is {size}{which}.'
     if gain is not None and gain.reduction > 0:
@@ -61,15 +53,8 @@ def _percent(share):
     return f'{100 * share:.0f} %' if share >= 0.01 else f'{100 * share:.1g} %'
 
 
-def _size(value, sd, unit):
-    step, name = READABLE.get(unit, (1.0, unit))
-    return f"{' +- '.join(with_sd(value / step, sd / step))} {name}"
-
-
-def readable(value: float, unit: str) -> str:
-    """Return a value with three digits in a unit that people use."""
-    step, name = READABLE.get(unit, (1.0, unit))
-    return f'{value / step:.4g} {name}'
+def _with_unit(number, unit):
+    return number if unit == '1' else f'{number} {unit}'
 
 
 def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[[Sequence[Question], Question], bool] | None = None,

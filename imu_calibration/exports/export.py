@@ -49,8 +49,8 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     """
     Return the file of a target.
 
-    A sensor that compensation would leave as it comes is left so here, too: its numbers are those of a data sheet. A target that holds the
-    whole document includes its decisions.
+    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error by the calibration. A target that
+    holds the whole document includes its decisions.
 
     Parameters
     ----------
@@ -74,20 +74,20 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
 
     """
     used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
-    calibration = used.calibration
+    applied = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive')
-    found, unknown = _noise_numbers(calibration, target, noise, rate)
-    placement, numbers = placed_numbers(calibration, target)
-    motion = motion or standard_motion(calibration)
+    found, unknown = _noise_numbers(applied, target, noise, rate)
+    placement, numbers = placed_numbers(applied, target)
+    motion = motion or standard_motion(applied)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
-    lines = [*_placement_lines(calibration, target, placement), *_worked_sample(target, numbers, placement, calibration),
+    lines = [*_placement_lines(applied, target, placement), *_worked_sample(target, numbers, placement, applied),
              *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(used), *target.ignored(numbers), *unknown)),
              *(f'note: {hint}' for hint in [target.hint] if hint)]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
     assert target.write is not None   # `registry.find_target` gives no other
-    content = target.write(Page(numbers, found, [*head, *lines], calibration, rate))
+    content = target.write(Page(numbers, found, [*head, *lines], applied, rate))
     return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines), used.refused)
 
 

@@ -4,16 +4,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
 from imu_calibration.preflight.exchanges import find_exchange
 from imu_calibration.preflight.finding import REFUSE, CheckFinding
 from imu_calibration.preflight.on_table import exchanged, same_motion, signs_or_delay
 from imu_calibration.preflight.standing_still import standing_still
+from imu_calibration.preflight.value_checks import force_error
 from imu_calibration.reference.table import Table
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
@@ -190,11 +189,6 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table | None = Non
 
 
 def check_force(length: float) -> None:
-    """Refuse a median length of the specific force at rest (what should be m/s^2) that is plainly g, counts or volts."""
-    if 0.8 < length < 1.25:
-        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.3f}: it looks like g; '
-                         'convert it in the driver or '
-                         f'give a nominal scaling with accelerometer_scale {1 / STANDARD_GRAVITY:.6f}', key='nominal')
-    if not 3.0 < length < 30.0:
-        raise InputError(f'specific force must be in m/s^2, its length at rest is {length:.4g}: counts or volts?; '
-                         'give a nominal scaling with offset and scale', key='nominal')
+    """Refuse a median length of the specific force at rest that is not gravity in m/s^2."""
+    if (error := force_error(length)) is not None:
+        raise error

@@ -29,7 +29,8 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     clean = []
     for name, stream in evidence.streams.items():
         found = stream.statistics
-        total = found.count + sum(count for reason, count in found.dropped.items() if reason != 'clock reset')
+        # Spikes are samples with accepted stamps, and a clock reset drops no sample.
+        total = found.count + sum(count for reason, count in found.dropped.items() if reason not in ('clock reset', 'spike'))
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
             yield CheckFinding('stamps', REFUSE,

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.evidence import RecordingEvidence
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
@@ -14,6 +15,8 @@ from imu_calibration.units import OTHER_UNITS, significant, unit_of_rest
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
 GRAVITY_SHARE = 0.02
+LINEAR = 0.8
+"""m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity. Readings in g have at least 0.8."""
 FASTEST = 100.0
 """rad/s, 5700 deg/s: hardly any gyroscope measures more."""
 FASTEST_DEG = 5000.0
@@ -40,14 +43,25 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     length = evidence.length
     if length is None:
         return
-    came = f'specific force must be in m/s^2, its length {"at rest" if evidence.rest is not None else "in the middle"} is {length:.4g}: '
-    convert = 'convert it in the driver or give a nominal scaling with accelerometer_scale'
-    if unit := unit_of_rest(length):
-        yield _unit('force_unit', f'{came}it looks like {unit}; {convert} {OTHER_UNITS[unit]:.6g}')
-    elif not 3.0 < length < 30.0:
-        yield _unit('force_unit', f'{came}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale')
+    if (error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')) is not None:
+        yield CheckFinding('force_unit', REFUSE, str(error), key=error.key or '')
     else:
         yield CheckFinding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
+
+
+def force_error(length: float, where: str = 'at rest') -> InputError | None:
+    """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
+    said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
+    if unit := unit_of_rest(length):
+        return InputError(f'{said}it looks like {unit}; convert it in the driver or give a nominal scaling with accelerometer_scale '
+                          f'{OTHER_UNITS[unit]:.6g}', key='nominal', code='force_unit')
+    if length < LINEAR:
+        return InputError(f'{said}it looks like acceleration without gravity, as phones compute it; record the accelerometer itself',
+                          key='imu_topic', code='without_gravity')
+    if not 3.0 < length < 30.0:
+        return InputError(f'{said}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale',
+                          key='nominal', code='force_unit')
+    return None
 
 
 def _unit(check, text):

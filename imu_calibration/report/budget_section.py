@@ -36,7 +36,7 @@ def _rows(result, causes, total):
     """Return a row per effect: the sd of its largest component by cause, and the total."""
     rows = []
     for effect, part in _effects(result):
-        factor, unit = for_people(effect.unit_of(0))
+        factor, unit = for_people(effect.unit_of(0), effect.sensor)
         parts = [*causes, total]
         rows.append({'name': f'{effect.sensor} {effect.name.replace("_", " ")}', 'unit': '' if unit == '1' else unit,
                      'cells': [text(float(p[part].max()) * factor, 2) if p[part].max() > 1e-15 else '0' for p in parts],

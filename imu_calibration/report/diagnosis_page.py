@@ -113,7 +113,7 @@ def _reduction(gain):
 
 
 def _finding(diagnosis, finding, number):
-    rows = [{'name': name, 'cells': people(value, sd, unit), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
+    rows = [{'name': name, 'cells': people(value, sd, unit, quantity=name), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
             for name, (value, sd, unit) in finding.parameters.items()]
     gain = finding.gain
     return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows,

@@ -8,7 +8,7 @@ from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHIT
 from imu_calibration.allan.terms import predicted
 from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
-from imu_calibration.units import SHOWN_OF_NOISE
+from imu_calibration.units import NOISE, for_people
 
 
 def draw_curve(result: NoiseIdentification, sensor: str) -> str:
@@ -21,7 +21,7 @@ class _Curves:
 
     def __init__(self, result, sensor):
         self.result, self.sensor = result, sensor
-        self.factor, self.unit = SHOWN_OF_NOISE[UNIT[sensor]]
+        self.factor, self.unit = for_people(UNIT[sensor], NOISE)
 
     def __call__(self, figure):
         axes, tau = figure.subplots(), self.result.record.curve.tau

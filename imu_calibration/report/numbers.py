@@ -33,13 +33,13 @@ def pair(value: float, sd: float) -> tuple[str, str]:
     return shown, spread
 
 
-def people(value: float, sd: float, unit: str) -> tuple[str, str, str]:
-    """Return (value, sd, unit) as text in people's units; dimensionless stays plain."""
-    factor, shown = for_people(unit)
+def people(value: float, sd: float, unit: str, *, quantity: str = '') -> tuple[str, str, str]:
+    """Return (value, sd, unit) as text in the units of `units.for_people`, '' for the unit of a ratio."""
+    factor, shown = for_people(unit, quantity)
     return (*pair(value * factor, sd * factor), '' if shown == '1' else shown)
 
 
-def in_unit(value: float, unit: str, digits: int = 3) -> str:
-    """Return a value in people's units with its unit."""
-    factor, shown = for_people(unit)
+def in_unit(value: float, unit: str, digits: int = 3, *, quantity: str = '') -> str:
+    """Return a value with its unit of `units.for_people`."""
+    factor, shown = for_people(unit, quantity)
     return text(value * factor, digits) + ('' if shown == '1' else f' {shown}')

@@ -32,11 +32,13 @@ def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[s
 def _row(result, index, unit, component, needs):
     calibration = result.calibration
     value, sd, tolerance = calibration.values[index], calibration.sd[index], result.tolerances[index]
-    shown = people(value, sd, unit)
+    name = calibration.param_names[index]
+    shown = people(value, sd, unit, quantity=name)
     share = sd / tolerance
-    return {'name': calibration.param_names[index], 'component': component, 'value': shown[0], 'sd': shown[1], 'unit': shown[2],
-            'si': '' if unit == '1' else ' ± '.join(pair(value, sd)) + f' {printed(unit)}', 'tolerance': in_unit(tolerance, unit, 2),
-            'share': text(share, 2), 'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
+    return {'name': name, 'component': component, 'value': shown[0], 'sd': shown[1], 'unit': shown[2],
+            'si': '' if unit == '1' else ' ± '.join(pair(value, sd)) + f' {printed(unit)}',
+            'tolerance': in_unit(tolerance, unit, 2, quantity=name), 'share': text(share, 2),
+            'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
 
 
 def printed(unit: str) -> str:

@@ -91,7 +91,7 @@ def _groups(model, places, sd, tolerances):
     groups = []
     for effect in model.effects:
         names = [name for name in effect.param_names() if name in places]
-        factor, unit = for_people(effect.unit)
+        factor, unit = for_people(effect.unit_of(0), effect.sensor)
         rows = [{'name': name, 'component': name.split('.')[-1], 'sd': text(factor * sd[places[name]]),
                  'tolerance': text(factor * tolerances[places[name]]), 'share': text(sd[places[name]] / tolerances[places[name]], 2),
                  'bar': min(100, round(100 * float(sd[places[name]] / tolerances[places[name]]))),

@@ -7,10 +7,13 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.installation_angles import PAIRS, angles_of, derive, in_paper_units, split
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.constants import STANDARD_GRAVITY as G
+from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.term import term
 from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.report.numbers import people
 from imu_calibration.samples import NominalScaling
-from imu_calibration.units import decimals, for_people, significant, with_sd
+from imu_calibration.units import NOISE, decimals, for_people, significant, with_sd
 
 MODEL = SensorModel()
 DEG = np.pi / 180
@@ -90,3 +93,15 @@ def test_numbers_have_the_digits_that_their_sd_supports():
     factor, unit = for_people('rad')
     assert (factor * np.pi / 180, unit) == (pytest.approx(60.0), 'arcmin')
     assert for_people('1') == (1.0, '1')
+
+
+def test_the_unit_of_a_parameter_depends_on_its_sensor():
+    """The change of a gyroscope's scale factor with the force was printed in mg/g^2."""
+    factor, unit = for_people('(m/s^2)^-1', 'gyroscope.scale_by_force.x')
+    assert (factor, unit) == (pytest.approx(100 * G), '% per g')
+    assert for_people('(m/s^2)^-1', 'accelerometer.accel_quadratic.x') == (pytest.approx(1e3 * G), 'mg/g²')
+    assert for_people('rad/s', 'gyroscope')[1] == 'deg/s' and for_people('rad/s', NOISE)[1] == 'deg/h'
+    force = term('scale_by_force', sensor='gyroscope', column='w_x * f_x', unit='(m/s^2)^-1', tolerance=1e-5, text='Scale by force.')
+    for text in (sentence(force, {'gyroscope.scale_by_force.x': (1e-3, 1e-5, '(m/s^2)^-1')}, None),
+                 people(1e-3, 1e-5, '(m/s^2)^-1', quantity='gyroscope.scale_by_force.x')[2]):
+        assert '% per g' in text and 'mg' not in text

@@ -93,6 +93,15 @@ def test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused(tmp_p
     assert all(line in printed for line in found.lines) and main([*command, '--anyway']) == 0
 
 
+def test_the_loss_of_a_refused_sensor_is_its_whole_error():
+    """It was reported as none, because the full compensation of nominal parameters changes nothing."""
+    known = harmed('accelerometer')
+    whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
+    assert found.loss.left['accelerometer'] == pytest.approx(found.loss.raw['accelerometer'], rel=1e-9)
+    assert found.loss.raw['accelerometer'] == pytest.approx(whole.loss.raw['accelerometer'], rel=1e-9) and whole.loss.raw['accelerometer'] > 1e-3
+    assert found.loss.left['gyroscope'] == pytest.approx(whole.loss.left['gyroscope'], rel=1e-9) and not found.loss.nothing
+
+
 def test_what_the_refused_sensor_would_correct_goes_as_well():
     rich = random_calibration(2, ('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity', 'gyro_quadratic'))
     still, blind = (with_nominal(rich, [sensor]).model for sensor in SENSORS)

@@ -6,12 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from refusal import refused
 
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.errors import InputError
 from imu_calibration.preflight.axes import match_axes, signed_permutations
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.preflight.joint_checks import check_force
+from imu_calibration.preflight.value_checks import force_error
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import SampleBlock
 from imu_calibration.segmentation.block_cleaning import BlockCleaner
@@ -196,6 +200,11 @@ def not_finite(imu, joints, temperature):
     return replace(imu, force_s=force), joints, temperature
 
 
+def without_gravity(imu, joints, temperature):
+    length = np.linalg.norm(imu.force_s, axis=1, keepdims=True)
+    return replace(imu, force_s=imu.force_s * (1 - G / length)), joints, temperature
+
+
 def wrong_gravity(imu, joints, temperature):
     return replace(imu, force_s=imu.force_s * 1.05), joints, temperature
 
@@ -214,6 +223,7 @@ FAULTS = (
     (in_mg, 'force_unit', REFUSE, ('mg', 'accelerometer_scale 101.972')),
     (in_counts, 'force_unit', REFUSE, ('counts', 'nominal scaling')),
     (in_counts, 'rate_unit', REFUSE, ('counts', 'nominal scaling')),
+    (without_gravity, 'force_unit', REFUSE, ('m/s^2', 'gravity')),
     (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'look like deg/s', 'gyroscope_scale 57.29578')),
     (twice_converted, 'rate_unit', REFUSE, ('twice',)),
     (mirrored_gyroscope, 'handedness', REFUSE, ("the gyroscope's y is minus the accelerometer's y", 'left-handed')),
@@ -571,3 +581,20 @@ def test_arm_warns_of_clipping_and_refuses_other_units(capsys, recordings):
     assert capsys.readouterr().err.count('the gyroscope clips at 34.87 rad/s') == 2
     assert main(['arm', str(recordings / 'xsens_counts'), '--imu-topic', '/imu/data_raw', '--imu-topic', '/imu/data_raw']) == 1
     assert 'counts or volts' in capsys.readouterr().err
+
+
+def test_spikes_are_counted_once_among_the_samples(session):
+    """The total was that of the samples plus the spikes: 16 of 15985 samples in a recording of 15969."""
+    imu, joints, temperature = session.imu, session.joints, session.temperature
+    force = imu.force_s.copy()
+    force[1000::3000, 1] += 40.0
+    told = [found.text for found in findings((replace(imu, force_s=force), joints, temperature)) if found.check == 'stamps']
+    assert any(f'{len(force[1000::3000])} of {len(imu)} ' in text for text in told)
+
+
+def test_acceleration_without_gravity_is_no_question_of_units():
+    """The remedy is another topic; a scale or offset cannot add gravity."""
+    assert [force_error(length).code for length in (0.03, 0.5, 1.0, 2.0, 980.0, 5e4)] == ['without_gravity'] * 2 + ['force_unit'] * 4
+    assert force_error(0.03).key == 'imu_topic' and force_error(9.7) is None
+    with refused(InputError, 'without_gravity', '0.12'):
+        check_force(0.12)
