@@ -168,14 +168,14 @@ def write_text(path: str | PathLike[str], text: str) -> None:
 
 
 def hash_of(path: str | PathLike[str]) -> str:
-    """Return the SHA-256 of a bag: of its data files in order of name, 16 hexadecimal digits."""
+    """Return the SHA-256 of a file, or of the data files of a bag in order of name, as hexadecimal digits."""
     path, digest = Path(path), hashlib.sha256()
     files = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml') if path.is_dir() else [path]
     for file in files:
         with open(file, 'rb') as stream:
             while chunk := stream.read(1 << 20):
                 digest.update(chunk)
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()
 
 
 def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) -> None:

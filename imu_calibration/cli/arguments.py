@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from argparse import Namespace, _ArgumentGroup
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from imu_calibration.cli.parser import OneLineParser
@@ -41,6 +43,20 @@ def stand_of(options: Namespace) -> Stand | None:
     return Arm(options.urdf, options.imu_link, options.table, options.up, options.allow_xacro)
 
 
+def add_result_arguments(parser: OneLineParser) -> None:
+    """Add the options of the written result."""
+    parser.common.add_argument('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
+    parser.common.add_argument('--operator', metavar='TEXT', help='name of the operator, likewise')
+    parser.common.add_argument('--force', action='store_true', help='overwrite the result of another verb or other inputs')
+
+
+def require_place(options: Namespace, verb: str, bags: Sequence[str]) -> None:
+    """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
+    if not options.force and (Path(options.output) / 'calibration.yaml').exists():
+        from imu_calibration.use_cases.provenance import provenance_with, require_same_inputs
+        require_same_inputs(options.output, provenance_with(verb, bags, choices_of(options), stand=stand_of(options)))
+
+
 def add_model_arguments(parser: OneLineParser) -> _ArgumentGroup:
     """Add the options that choose the parameters to estimate; return their group."""
     group = parser.expert
@@ -60,7 +76,7 @@ def add_model_arguments(parser: OneLineParser) -> _ArgumentGroup:
 
 def add_effects_argument(group: _ArgumentGroup) -> None:
     """Add the option of effects in addition to the catalogue."""
-    group.add_argument('--effects', dest='catalogue', metavar='FILE', help='additional effects: YAML, or a calibration.yaml with some')
+    group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
 
 
 def choices_of(options: Namespace) -> Choices:

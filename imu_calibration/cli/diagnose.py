@@ -2,7 +2,16 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
+from imu_calibration.cli.arguments import (
+    BAG,
+    add_model_arguments,
+    add_result_arguments,
+    add_stand_arguments,
+    add_topic_arguments,
+    choices_of,
+    require_place,
+    stand_of,
+)
 from imu_calibration.cli.parser import OneLineParser, VerbResult
 
 EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --output finding')
@@ -16,6 +25,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
     add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     add_topic_arguments(parser)
+    add_result_arguments(parser)
     add_model_arguments(parser)
 
 
@@ -24,6 +34,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration import files
     from imu_calibration.cli.show import console, warn
     from imu_calibration.use_cases.diagnose import diagnose
+    require_place(options, 'diagnose', [options.bag])
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, stand_of(options), **choices_of(options))
         warn(found.calibration.statistics['preflight'])

@@ -34,7 +34,7 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     found = find_units(options.folder, options.output)
     table = _table(options, [path for _, paths in found for path in paths])
-    units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names) for name, paths in found]
+    units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names, stand=stand_of(options)) for name, paths in found]
     folder = files.make_folder(options.output)
     advance = counter('units', len(units))
     mapper = _mapper(options, len(units), lambda result: advance(1))

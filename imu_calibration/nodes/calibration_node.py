@@ -47,6 +47,7 @@ from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.settings import setting
+from imu_calibration.use_cases.provenance import provenance_with
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.live import LiveGatherer
 
@@ -54,6 +55,8 @@ INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
 MOST_WAITING = 200_000
 """Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
+DOCUMENTED = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'serial', 'operator')
+"""Parameters that the document names with their values."""
 PATIENCE = 3.0
 """Seconds after the start from which a silent topic is worth a word."""
 
@@ -96,6 +99,10 @@ class CalibrationNodeSettings:
                              'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, '
                              'with ~/save alone',
                              symptom='the node says at its start that the place is not writable', session=True, path=True)
+    serial: str = setting('', '', 'serial number of the IMU, for the calibration', session=True,
+                          symptom='calibrations of several units look alike')
+    operator: str = setting('', '', 'name of the operator, for the calibration', session=True,
+                            symptom='a calibration does not name its operator')
     resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
                            symptom='old motion of another IMU enters the calibration', session=True)
     autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
@@ -126,7 +133,7 @@ class CalibrationNode(Node):
         self._view = CalibrationView(self, view)
         listeners = Listeners(self._publish_document, self._publish_residuals, self._publish_coverage, self._view.take_solution)
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
-                                        listeners=listeners, hints=HINTS['calibration_node'])
+                                        listeners=listeners, hints=HINTS['calibration_node'], provenance=self._provenance(robot))
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
@@ -159,6 +166,13 @@ class CalibrationNode(Node):
                                   files.read_tolerances(place, catalogue), windows, catalogue=catalogue,
                                   noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None,
                                   as_asked=settings.model_as_asked)
+
+    def _provenance(self, robot: RobotSettings) -> dict[str, Any]:
+        choices: dict[str, Any] = {name: getattr(self.settings, name) for name in DOCUMENTED}
+        paths = {'tolerances': self.settings.tolerances_file, 'catalogue': self.settings.effects_file, 'noise': self.settings.noise_file}
+        choices |= {name: files.user_path(path) for name, path in paths.items() if path}
+        stand = robot.urdf_file or self.settings.table_file
+        return provenance_with('calibration_node', (), choices, stand=None if stand in NO_TABLE else files.user_path(stand))
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
         return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)

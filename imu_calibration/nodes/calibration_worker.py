@@ -52,15 +52,18 @@ class CalibrationWorker(threading.Thread):
     listeners : Listeners
     hints : dict, optional
         As for `errors.with_hint`.
+    provenance : dict, optional
+        Options and files, for the document.
 
     """
 
     def __init__(self, gatherer: LiveGatherer, live: LiveSession, make_live: Callable[[], LiveSession], *, place: SessionFiles,
-                 autosave_period: float, listeners: Listeners, hints: dict[str, str] | None = None):
+                 autosave_period: float, listeners: Listeners, hints: dict[str, str] | None = None,
+                 provenance: dict | None = None):
         super().__init__(name='calibration', daemon=True)
         self.gatherer, self.live, self.make_live = gatherer, live, make_live
         self.place, self.autosave_period, self.listeners = place, autosave_period, listeners
-        self.hints = hints or {}
+        self.hints, self._provenance = hints or {}, provenance or {}
         self._pacer, self._watch = SolvePacer(live.settings.solve_share), StreamWatch(live.needs_joints, live.needs_temperature)
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
         self._diagnosed = 0
@@ -199,7 +202,7 @@ class CalibrationWorker(threading.Thread):
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
         start = time.monotonic()
-        result = self.live.solve(pending, {'mode': 'live', 'solution': self._n_solutions + 1})
+        result = self.live.solve(pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1})
         self._n_solutions += 1
         self._trouble, self._new_windows, self._closed = '', False, pending
         self._note_fault('solution', '')

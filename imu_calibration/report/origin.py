@@ -18,6 +18,7 @@ def recording_facts(result: CalibrationResult) -> list[tuple[str, str]]:
              ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
              ('length', _duration(conditions.get('duration_s'))), ('frame', calibration.frame_id or 'not named'),
              ('reference', result.reference)]
+    facts += [(name, str(calibration.provenance[name])) for name in ('serial', 'operator') if calibration.provenance.get(name)]
     if conditions.get('largest_rate'):
         facts.append(('fastest turn', in_unit(conditions['largest_rate'], 'rad/s')))
     if conditions.get('temperature_range_c'):

@@ -18,10 +18,11 @@ from imu_calibration.calibration.verdict import Verdict, judged
 from imu_calibration.errors import InputError
 from imu_calibration.progress import counter, report
 from imu_calibration.samples import SampleBlock
-from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
+from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.pool import jobs_for, process_mapper
-from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
+from imu_calibration.use_cases.provenance import provenance_with
+from imu_calibration.use_cases.recordings import name_of, open_bag, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
 
@@ -105,12 +106,13 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     """
     check_names(choices)
     options, topics = calibration_options(choices), topics_of(choices)
+    given = {**choices, 'earlier': earlier}
     earlier = files.read_calibration(earlier) if isinstance(earlier, (str, PathLike)) else earlier
     if earlier is not None and table is None:
         raise InputError('an earlier calibration must be compared on a table, none came; give its description', key='table',
                          code='table_missing')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    table = None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))
+    stand, table = table, None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))
     joints = None if table is None else table.joint_names
     for path in recordings:
         if not isinstance(path, SampleBlock):
@@ -118,7 +120,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     jobs = jobs_for(jobs, len(recordings))
     sources = [source_of(item, topics, joints) for item in recordings]
     with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
-        provenance = hashing.submit(provenance_of, recordings, kept(choices))
+        provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=stand)
         if table is None:
             result = calibrate_without_table(sources, options)
         else:

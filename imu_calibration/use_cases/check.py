@@ -10,6 +10,7 @@ from imu_calibration.calibration.check import CheckResult, check_on_table
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
+from imu_calibration.use_cases.provenance import made_from
 from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
@@ -92,6 +93,5 @@ def _gravity(options, calibration):
 
 def _notes(recording, calibration):
     """Return a note when the calibration was made from this very recording."""
-    made_from = {bag.get('sha256') for bag in calibration.provenance.get('bags') or () if isinstance(bag, dict)}
-    here = provenance_of([recording], {})['bags'][0]['sha256']
-    return ('it was made from this very recording: what helps here need not help elsewhere',) if here in made_from else ()
+    same = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
+    return ('it was calibrated from this recording: the result can differ on others',) if same else ()

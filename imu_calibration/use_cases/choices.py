@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any, TypedDict
 
 from imu_calibration import files
@@ -47,11 +46,10 @@ class Choices(TypedDict, total=False):
     """The effects that there are, or what adds to them: a file with `effects`, or {name: definition}; default the package's own."""
     setting: Sequence[str] | Mapping[str, float]
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
-
-
-IN_DOCUMENT = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'imu_topic', 'joint_topic',
-               'temperature_topic', 'setting')
-"""Choices that a document names where they were made."""
+    serial: str | None
+    """Serial number of the IMU, for the document."""
+    operator: str | None
+    """Who recorded and calibrated, for the document."""
 
 
 def check_names(choices: Mapping[str, Any]) -> None:
@@ -85,16 +83,6 @@ def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalog
     if isinstance(chosen, (str, PathLike)):
         return files.read_effects(chosen)
     return CATALOGUE.with_definitions(dict(chosen or {}))
-
-
-def kept(choices: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the choices that a document names, in order of name."""
-    made = {name: choices[name] for name in sorted(IN_DOCUMENT) if choices.get(name)}
-    if isinstance(made.get('setting'), Mapping):
-        made['setting'] = [f'{name}={value}' for name, value in made['setting'].items()]
-    if isinstance(choices.get('noise'), (str, PathLike)):
-        made['noise'] = Path(choices['noise']).name
-    return made
 
 
 def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettings:

@@ -12,9 +12,10 @@ from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
 from imu_calibration.progress import counter, report
 from imu_calibration.samples import SampleBlock
-from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, kept, topics_of
+from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.drawing import Drawing
-from imu_calibration.use_cases.recordings import provenance_of, source_of
+from imu_calibration.use_cases.provenance import provenance_with
+from imu_calibration.use_cases.recordings import source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
 
@@ -105,9 +106,9 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     check_names(choices)
     options = calibration_options(choices)
     topics = topics_of(choices)
+    provenance = provenance_with('diagnose', [recording], choices, stand=table)
     table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
     source = source_of(recording, topics, None if table is None else table.joint_names)
-    provenance = provenance_of([recording], kept(choices))
     advance = counter('diagnosing', 100)
     if table is None:
         return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))

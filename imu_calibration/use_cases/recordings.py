@@ -89,7 +89,7 @@ def _hash_of(recording):
     if not isinstance(recording, SampleBlock):
         return files.hash_of(recording)
     imu = recording.imu
-    return sha256(imu.stamp_ns.tobytes() + imu.force_s.tobytes() + imu.rate_s.tobytes()).hexdigest()[:16]
+    return sha256(imu.stamp_ns.tobytes() + imu.force_s.tobytes() + imu.rate_s.tobytes()).hexdigest()
 
 
 def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | None:

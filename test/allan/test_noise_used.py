@@ -124,7 +124,7 @@ def test_calibrate_takes_the_measured_noise_and_says_so(calibrated, noise_file):
     document = yaml.safe_load((calibrated / 'calibration.yaml').read_text())
     walk = 2e-5 * np.sqrt(3600.0 / 2)   # what counts within an hour
     assert document['statistics']['accelerometer']['wander_sd'] == pytest.approx(walk, rel=1e-6)
-    assert document['provenance']['options']['noise'] == 'noise.yaml'
+    assert document['provenance']['options']['noise']['name'] == 'noise.yaml'
 
 
 def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise_file):
