@@ -2,16 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import (
-    BAG,
-    add_model_arguments,
-    add_result_arguments,
-    add_stand_arguments,
-    add_topic_arguments,
-    choices_of,
-    require_place,
-    stand_of,
-)
+from imu_calibration.cli import arguments
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
 
@@ -21,16 +12,16 @@ EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gra
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
-    parser.add_argument('bags', nargs='+', metavar='BAG', help=BAG)
+    parser.add_argument('bags', nargs='+', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
     expert('--earlier', metavar='FILE', help='calibration.yaml from before, proven on the same recordings (with a table)')
     common('--no-report', action='store_true', help='write calibration.yaml only')
     expert('--jobs', type=int, help='recordings read at a time, default one per core')
-    add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
-    add_topic_arguments(parser)
-    add_result_arguments(parser)
-    add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
+    arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
+    arguments.add_topic_arguments(parser)
+    arguments.add_result_arguments(parser)
+    arguments.add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
                                              help='add no effect to the requested model')
 
 
@@ -40,9 +31,10 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.calibration.document import to_mapping
     from imu_calibration.cli.show import show_calibration, warn
     from imu_calibration.use_cases.calibrate import calibrate
-    require_place(options, 'calibrate', options.bags)
+    arguments.require_place(options, 'calibrate', options.bags)
     with files.output_folder(options.output) as folder:
-        found = calibrate(options.bags, stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices_of(options))
+        choices = arguments.choices_of(options)
+        found = calibrate(options.bags, arguments.stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices)
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, hints_of(options), report=not options.no_report)

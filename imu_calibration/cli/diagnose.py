@@ -2,16 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import (
-    BAG,
-    add_model_arguments,
-    add_result_arguments,
-    add_stand_arguments,
-    add_topic_arguments,
-    choices_of,
-    require_place,
-    stand_of,
-)
+from imu_calibration.cli import arguments
 from imu_calibration.cli.parser import OneLineParser, VerbResult
 
 EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --output finding')
@@ -20,13 +11,13 @@ EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --ou
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common = parser.common.add_argument
-    parser.add_argument('bag', metavar='BAG', help=BAG)
+    parser.add_argument('bag', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
-    add_topic_arguments(parser)
-    add_result_arguments(parser)
-    add_model_arguments(parser)
+    arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
+    arguments.add_topic_arguments(parser)
+    arguments.add_result_arguments(parser)
+    arguments.add_model_arguments(parser)
 
 
 def run(options: Namespace) -> VerbResult:
@@ -34,9 +25,9 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration import files
     from imu_calibration.cli.show import console, warn
     from imu_calibration.use_cases.diagnose import diagnose
-    require_place(options, 'diagnose', [options.bag])
+    arguments.require_place(options, 'diagnose', [options.bag])
     with files.output_folder(options.output) as folder:
-        found = diagnose(options.bag, stand_of(options), **choices_of(options))
+        found = diagnose(options.bag, arguments.stand_of(options), **arguments.choices_of(options))
         warn(found.calibration.statistics['preflight'])
         found.save(folder)
         out = console()
