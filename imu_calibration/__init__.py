@@ -21,7 +21,7 @@ from the reference point to the sensitive point: ``f_point = f_ref + alpha x r +
 
 Units and time
 --------------
-SI and radians inside; other units only in names that say so (``temperature_c``, ``bias_deg_h``). ``stamp_ns`` is an
+SI and radians inside; different units only with the unit in the name (``temperature_c``, ``bias_deg_h``). ``stamp_ns`` is an
 integer header stamp; ``time`` is float seconds since the session's first sample. Ranges are half open.
 
 Shapes
@@ -35,37 +35,37 @@ In a notebook
     import imu_calibration as imu
     found = imu.calibrate('session.bag', 'table.yaml')      # without a table: by hand
 
-`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` are all that is needed; what they return prints, draws and
+`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` suffice; their results print, draw and
 saves itself.
 
 Contents
 --------
-From the ground up; each package imports only what stands above it. The words are explained in docs/glossary.md.
+From the lowest layer; each package imports only packages above it in this list. docs/glossary.md explains the terms.
 
 ================  ======================================================================================================
-`samples`         arrays of samples as they come from a bag or a topic; beside them constants, units, settings, errors
+`samples`         arrays of samples from a bag or a topic; also constants, units, settings, errors
 `reference`       where the IMU truly was: table and joints become attitude, rate, angular acceleration, specific force
-`navigation`      strapdown integration: what errors become in use
+`navigation`      strapdown integration: effect of calibration errors in use
 `segmentation`    a stream becomes windows: static poses, spins, dynamic stretches
-`effects`         the catalogue of what makes a sensor's output, and the sensor model made of it
+`effects`         the catalogue of physical effects, and the sensor model made of it
 `estimation`      windows become a solution: noise, likelihood, least squares, observability
-`preflight`       what looks wrong with a recording before anything is estimated
+`preflight`       checks of a recording before estimation
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
 `allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
-`selection`       which effects the evidence of a recording asks for, proven on windows that are held out
-`beyond`          what no effect of the catalogue explains: how much, where, and the formula that it follows
+`selection`       choice of the effects that the data support, tested on held-out windows
+`beyond`          residuals that no effect of the catalogue explains: size, place and formula
 `calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
 `papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
-`planning`        which motion next: the gain of motions per second, and the least time that any plan takes
-`driving`         motions one after the other, safely: what to send, whether the joints follow, when to stop and why
+`planning`        choice of motions: gain per second, and a lower bound on the time of all plans
+`driving`         execution of motions: trajectories, monitoring of the joints, stops with their reason
 `by_hand`         calibration without a table; the arm between two IMUs
-`exports`         a calibration in the words of other programs, and back; what each of them loses
-`diagnosis`       what the model gets wrong, and why
-`report`          pages that people look at
-`files`           files written whole or not at all; `resources` finds those that are installed
-`use_cases`       from files to files: what the command line and notebooks call
-`cli`, `nodes`    the command line and the ROS 2 nodes; `msg_adapters` beside this package knows messages and bags
+`exports`         conversion of a calibration to and from formats of other programs, with the loss of each
+`diagnosis`       errors of the model and their causes
+`report`          HTML reports
+`files`           atomic writing of files; `resources` finds installed files
+`use_cases`       from files to files: functions of the command line and of notebooks
+`cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters` handles messages and bags
 `ros2`            the verbs under ``ros2 imu``, and the checks of ``ros2 doctor``
 ================  ======================================================================================================
 """

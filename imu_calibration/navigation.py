@@ -1,7 +1,7 @@
 """
-Strapdown dead reckoning near one place: what calibration errors become after some seconds of navigation.
+Strapdown dead reckoning near one place: effect of calibration errors after some seconds of navigation.
 
-Attitude, velocity and position in the level frame ``n``; the table stands still, so Coriolis terms and the change of gravity with
+Attitude, velocity and position in the level frame ``n``; the table is at rest, so Coriolis terms and the change of gravity with
 position are left out: over 50 s they are below 1e-3 of the errors that are compared. All sums over samples are array operations.
 """
 
@@ -95,7 +95,7 @@ def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[
 def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, gravity: float, mat_ns0: np.ndarray | None = None,
               earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
     """
-    Navigate by accelerometers and gyroscopes alone from rest at the origin.
+    Navigate by accelerometers and gyroscopes only, from rest at the origin.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def error_growth(time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray
     Return velocity and position errors that a specific-force error causes, attitude being known, each of shape (n, 3).
 
     With ``mat_ns=None`` the components are summed in the turning body frame, which is no navigation: an error that turns with the body
-    then looks like a steady drift (the reading behind Zhang's "3 m/s and 150 m").
+    then appears as a steady drift (the reading behind Zhang's "3 m/s and 150 m").
 
     """
     force_error = np.asarray(force_error_s, float)
@@ -174,7 +174,7 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
     edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
     if len(edges) < 2:
         length = reference.time[-1] - reference.time[0]
-        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; ask for less', code='too_short')
+        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; request less', code='too_short')
     ends = []
     for first, last in zip(edges[:-1], edges[1:] + 1):
         cut = slice(first, last)

@@ -1,4 +1,4 @@
-"""Arrays of samples as they come from a bag or a topic; nothing here knows messages or files."""
+"""Arrays of samples from a bag or a topic, independent of messages and files."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -35,7 +35,7 @@ class _Columns:
 
     @classmethod
     def concatenate(cls, parts):
-        """Join `parts` in order; fields that are not arrays come from the first part."""
+        """Join `parts` in order; fields that are not arrays are those of the first part."""
         parts = list(parts)
         return cls(**{f.name: _join([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
@@ -93,12 +93,12 @@ class TemperatureSamples(_Columns):
     temperature_c: np.ndarray
     """Temperature, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
-    """Which way it came (`reference.thermal_branch`), in [-1, 1], shape (n,); None where nobody asked."""
+    """Thermal branch (`reference.thermal_branch`), in [-1, 1], shape (n,); None if not computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampleBlock:
-    """A stretch of a recording, or what arrived on the topics since the last call."""
+    """A stretch of a recording, or the messages received since the last call."""
 
     imu: ImuSamples | None = None
     """IMU samples, or None when the block has none."""
@@ -109,7 +109,7 @@ class SampleBlock:
     dropped: dict | None = None
     """Messages that could not be turned into samples: reason -> count."""
     notes: dict | None = None
-    """Messages that were used in another way than they came, such as those without a stamp: reason -> count."""
+    """Messages that were changed before use, such as messages without a stamp: reason -> count."""
 
     @classmethod
     def from_arrays(cls, time: ArrayLike, force: ArrayLike, rate: ArrayLike, *, joints: dict[str, ArrayLike] | None = None,

@@ -39,7 +39,7 @@ class CausalDerivative:
 
 def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: float, largest_delay: float = 0.02) -> CausalDerivative:
     """
-    Return the shortest window whose noise, through the arm, stays below a third of the accelerometer's own noise.
+    Return the shortest window whose noise, through the arm, is below a third of the accelerometer's noise.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
     rate_sd, force_sd : float
         Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the largest delay.
     arm : float
-        Longest lever arm that the correction takes out, m.
+        Longest corrected lever arm, m.
     largest_delay : float
         The window does not grow beyond this delay, s.
 
@@ -64,11 +64,11 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
 
 
 RESET_NS = 1_000_000_000
-"""A larger step back is a new setting of the clock, a smaller one a sample that came late."""
+"""A larger step back is a reset of the clock, a smaller one a late sample."""
 
 
 REFRESH = 1000
-"""The running sums are formed anew after so many samples, so that rounding does not add up."""
+"""The running sums are recomputed after this many samples, so that rounding does not accumulate."""
 
 
 EARLY, LATE = 0.5, 1.5
@@ -76,7 +76,7 @@ EARLY, LATE = 0.5, 1.5
 
 
 WHOLE, MANY = 0.25, 3.5
-"""A longer step is a hole where it is within this share of a whole number of periods, or longer than so many of them."""
+"""A longer step is a gap if it is within this share of a whole number of periods, or longer than this many of them."""
 
 
 WARM_UP = 16
@@ -87,10 +87,10 @@ class StampedDerivative:
     """
     Slope of a straight line through the last samples of a vector, updated one sample or one block at a time.
 
-    The samples count as equally spaced, as those of a sensor with a clock of its own are, whatever the jitter of their stamps; the
-    stamps say where some are missing: where a step is about a whole number of periods, else a stamp was late. A hole shorter than the
-    window is bridged by a straight line; after a longer one, or when the clock is set back by more than a second, the window starts anew.
-    A sample that is doubled or came late does not enter the window and gets the derivative of the newest one. While the window is less
+    The samples count as equally spaced, as from a sensor with its own clock, independent of the jitter of their stamps; the
+    stamps show missing samples: a step of about a whole number of periods; otherwise a stamp was late. A gap shorter than the
+    window is bridged by a straight line; after a longer one, or when the clock is set back by more than a second, the window restarts.
+    A duplicate or late sample does not enter the window and gets the derivative of the newest one. While the window is less
     than half full the derivative is zero.
 
     Parameters
@@ -168,11 +168,11 @@ class StampedDerivative:
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
 
     def rebase(self, stamp_ns: int) -> None:
-        """Count the newest sample as taken at another time."""
+        """Change the time of the newest sample."""
         self._newest = stamp_ns
 
     def seed(self, other: 'StampedDerivative') -> None:
-        """Take over the past of another derivative of the same stream, as far as this window reaches."""
+        """Copy the past of another derivative of the same stream, within the length of this window."""
         self._newest = other._newest
         for x, y, z in list(other._window)[-self.taps:]:
             self._add(x, y, z)
@@ -195,7 +195,7 @@ class StampedDerivative:
 
     def _regular(self, stamp_ns, values, start, end, out):
         """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
-        from scipy.signal import lfilter  # here, because scipy.signal takes a second to import
+        from scipy.signal import lfilter  # here, because the import of scipy.signal is slow
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
         stretch = values[start - taps + 1:end]
@@ -253,7 +253,7 @@ class TimedDerivative:
         return self.alpha
 
     def seed(self, other: 'TimedDerivative') -> None:
-        """Take over the past of another derivative of the same stream."""
+        """Copy the past of another derivative of the same stream."""
         self._stamps, self._values, self.alpha = other._stamps.copy(), other._values.copy(), other.alpha
 
 

@@ -1,4 +1,4 @@
-"""Compensation of whole arrays at once: for notebooks and other programs."""
+"""Compensation of whole arrays, for notebooks and programs."""
 
 from collections.abc import Sequence
 from typing import overload
@@ -36,7 +36,7 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
                         time: Sequence[float] | np.ndarray | None = None,
                         temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
     """
-    Return readings with the calibrated errors taken out.
+    Return readings without the calibrated errors.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
     samples : ImuSamples, or array_like, shape (n, 3)
         Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
     rate_s : array_like, shape (n, 3), optional
-        Measured angular rate beside the specific force, rad/s.
+        Measured angular rate at the samples of specific force, rad/s.
     time : array_like, shape (n,), optional
-        When the arrays were measured, s: angular acceleration is taken from the rates as they come, by a causal filter.
+        Times of the arrays, s: a causal filter of the rates gives the angular acceleration.
     temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
         Needed when the calibration has thermal effects, degrees Celsius.
 
@@ -70,14 +70,14 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
 
 
 def _as_samples(calibration, force_s, rate_s, time):
-    """Return arrays as ImuSamples; where no arm asks for angular acceleration, times may be missing."""
+    """Return arrays as ImuSamples; times may be missing if no arm needs angular acceleration."""
     force, rate = (_vectors(values, name) for values, name in ((force_s, 'specific force'), (rate_s, 'angular rate')))
     if len(force) != len(rate):
         raise InputError(f'specific force and angular rate must be of the same instants, got {len(force)} and {len(rate)}; give both',
                          code='lengths_differ')
     if time is None:
         if np.any(arms_of(calibration)):
-            raise InputError('the calibration has lever arms and needs the time of each reading, none came; give `time` in seconds',
+            raise InputError('the calibration has lever arms and needs the time of each reading, none was given; give `time` in seconds',
                              code='time_missing')
         time = np.arange(len(force)) * 0.01
     seconds = np.asarray(time, float)

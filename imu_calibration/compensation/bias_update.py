@@ -1,27 +1,27 @@
-"""The bias of a gyroscope followed from stop to stop: what rest shows, trusted less the longer ago it is."""
+"""The bias of a gyroscope tracked from stop to stop, with an uncertainty that grows after each stop."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 EARTH_RATE = 7.292e-5
-"""rad/s; a gyroscope that stands still reads it about axes that nobody knows here."""
+"""rad/s; a gyroscope at rest measures it about axes that are unknown here."""
 MOST_MOVED = 0.02
 """rad/s, 1.1 deg/s: a calibrated bias that has moved farther is a slow turn, or a broken sensor."""
 
 
 class GyroBiasUpdate:
     """
-    The bias that is left after compensation, as a Gauss-Markov process that every stop measures.
+    The residual bias after compensation, a Gauss-Markov process that every stop measures.
 
     Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at a stop the Kalman update with the mean
-    of the corrected rate. Without stops the update fades away and its uncertainty returns to S: the calibration's own, or what the stops
-    have shown if that is more.
+    of the corrected rate. Without stops the update decays and its uncertainty returns to S: that of the calibration, or that of the stops
+    if it is larger.
 
     Parameters
     ----------
     prior_sd : ndarray, shape (3,)
-        How far the bias may be off by what the calibration knows of itself, rad/s.
+        Standard deviation of the bias in the calibration, rad/s.
     time : float
         Seconds in which an update loses its meaning.
 
@@ -38,21 +38,21 @@ class GyroBiasUpdate:
 
     def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> bool:
         """
-        Take the mean of the corrected rate over a stop until now; as the stop grows, the longer mean takes the place of the shorter.
+        Process the mean of the corrected rate over a stop until now; as the stop grows, the longer mean replaces the shorter one.
 
         Parameters
         ----------
         start, now : float
-            When the stop began, which tells it from others, and the end of the mean, s.
+            Start of the stop, which identifies it, and the end of the mean, s.
         rate : ndarray, shape (3,)
-            Without any update taken off, rad/s.
+            Without any update, rad/s.
         variance : ndarray, shape (3,)
             Of that mean; the Earth's rate is added here.
 
         Returns
         -------
         bool
-            Whether it was taken: what is larger than any bias moves is a slow turn.
+            Whether it was accepted: a mean beyond any change of bias is a slow rotation.
 
         """
         if np.linalg.norm(rate) > MOST_MOVED:
@@ -76,7 +76,7 @@ class _State:
     stationary: np.ndarray
     """Variance without stops."""
     seen: np.ndarray
-    """Sum of squares of what stops have shown, the older the less."""
+    """Sum of squares of the updates, with decreasing weight of older stops."""
     weight: float = 0.0
     at: float = 0.0
 

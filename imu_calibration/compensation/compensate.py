@@ -18,9 +18,9 @@ ITERATIONS = 12
 """Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
 CONVERGED = 1e-2
 """
-Samples whose last step is larger (m/s^2, rad/s) lie where the non-linear effects cannot be undone; they become NaN.
+Samples whose last step is larger (m/s^2, rad/s) lie outside the range in which the non-linear effects can be inverted; they become NaN.
 
-Close to zero input, where the asymmetry's sign is open, the steps go back and forth by up to 1e-3 and that is no failure.
+Close to zero input, where the sign of the asymmetry is open, the steps alternate by up to 1e-3, which is no failure.
 """
 
 
@@ -35,7 +35,7 @@ class Corrected:
     flagged: np.ndarray
     """True where the output cannot be trusted: the input was saturated, or too large for the inversion, shape (n,)."""
     marks: np.ndarray
-    """Variance of saturated (force, rate): the square of the range, since the true value is not known better; else 0. Shape (n, 2)."""
+    """Variance of saturated (force, rate): the square of the range, the only information on the true value; otherwise 0. Shape (n, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Transfer:
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
 
     def turned_quaternion(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros stay zeros."""
+        """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros remain zeros."""
         px, py, pz, pw = quaternion
         qx, qy, qz, qw = self._quaternion_st
         return (pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
@@ -113,7 +113,7 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     Parameters
     ----------
     calibration : Calibration
-        What to undo; effects of the table and of the session are left alone.
+        Effects to invert; effects of the table and of the session are ignored.
     force_s, rate_s : ndarray, shape (n, 3)
         Measured specific force (m/s^2) and rate (rad/s) in the sensor frame.
     alpha_s : ndarray, shape (n, 3)
@@ -121,7 +121,7 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     temperature_c : ndarray, shape (n,), optional
         Needed when the calibration has thermal effects.
     thermal_branch : ndarray, shape (n,), optional
-        Which way the temperature came (`reference.thermal_branch`); zero where not given.
+        Thermal branch (`reference.thermal_branch`); zero if not given.
     vibration : ndarray, shape (n, 3), optional
         How much it vibrates (`reference.vibration`), (m/s^2)^2; zero where not given.
     transfer : Transfer, optional
@@ -130,7 +130,7 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     """
     model, values = invertible_values(calibration)
     if temperature_c is None and model.needs_temperature:
-        raise InputError('the calibration has thermal effects and needs temperatures, none came; provide imu/temperature',
+        raise InputError('the calibration has thermal effects and needs temperatures, none were received; provide imu/temperature',
                          code='temperature_missing')
     with np.errstate(over='ignore', invalid='ignore'):
         true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration))
@@ -175,7 +175,7 @@ def saturation_level(calibration: FittedErrors, sensor: str) -> float:
 
 
 def saturation_marks(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray) -> np.ndarray:
-    """Return the square of the saturation level where a component of (force, rate) reaches it, else 0; shape (n, 2)."""
+    """Return the square of the saturation level where a component of (force, rate) reaches it, otherwise 0; shape (n, 2)."""
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
         level = saturation_level(calibration, sensor)
@@ -185,14 +185,14 @@ def saturation_marks(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.
 
 
 def arms_of(calibration: FittedErrors) -> np.ndarray:
-    """Return the arms that the correction takes out, shape (3, 3), zero without a size effect."""
+    """Return the corrected arms, shape (3, 3), zero without a size effect."""
     arms = calibration.of('accelerometer', Role.ARMS)
     return np.zeros((3, 3)) if arms is None else arms
 
 
 def outside_conditions(calibration: FittedErrors, rate_s: np.ndarray,
                        temperature_c: Sequence[float] | np.ndarray | None = None) -> list[str]:
-    """Return lines that say where samples leave the range of the calibration (rate, temperature)."""
+    """Return lines on samples outside the range of the calibration (rate, temperature)."""
     lines = []
     largest = calibration.conditions.get('largest_rate')
     fastest = float(np.max(np.linalg.norm(rate_s, axis=1), initial=0.0))

@@ -1,4 +1,4 @@
-"""Uncertainty of corrected samples: what noise and parameters do to them, to first order."""
+"""Uncertainty of corrected samples from noise and parameters, to first order."""
 
 from dataclasses import dataclass
 
@@ -19,11 +19,11 @@ STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 
 
 LARGEST = 1e30
-"""Covariances from here on say nothing; below it no arithmetic overflows."""
+"""Covariances from this value on contain no information; below it no arithmetic overflows."""
 
 
 def is_known(covariance: np.ndarray) -> bool:
-    """Return whether a covariance from a message says something: neither NaN nor huge, variances not negative, not all zero."""
+    """Return whether a covariance from a message is usable: neither NaN nor huge, variances not negative, not all zero."""
     return bool(np.all(np.abs(covariance) < LARGEST) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
 
 
@@ -45,7 +45,7 @@ class Sensitivity:
     earlier: float
     """Sum of the squared weights of the earlier readings, 1/s^2."""
     slope_error: SlopeError
-    """How far the derivative is off at the present motion."""
+    """Error of the derivative in the present motion."""
 
     def covariances(self, force_cov: np.ndarray, rate_cov: np.ndarray, with_parameters: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -73,9 +73,9 @@ class Uncertainty:
     calibration : Calibration
     transfer : compensation.Transfer, optional
     derivative : differentiation.CausalDerivative, optional
-        Where the angular acceleration comes from; None: it is not used.
+        Source of the angular acceleration; None: it is not used.
     period : float, optional
-        Time between samples, s, for a calibration that knows the density of its noise.
+        Time between samples, s, for a calibration with a noise density.
 
     """
 
@@ -92,7 +92,7 @@ class Uncertainty:
         self.use(derivative, period)
 
     def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
-        """Take the angular acceleration from another CausalDerivative, or from none, and the noise of samples `period` s apart."""
+        """Use the angular acceleration of another CausalDerivative, or of none, and the noise of samples `period` s apart."""
         self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
         weights = np.zeros(1) if derivative is None else derivative.weights
         self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
@@ -116,11 +116,11 @@ class Uncertainty:
         dt : float
             Temperature above the calibration's reference temperature, K.
         branch : float
-            Which way it came (`reference.thermal_branch`).
+            Thermal branch (`reference.thermal_branch`).
         vibration : tuple of 3 floats
             How much it vibrates (`reference.vibration`), (m/s^2)^2.
         slope_error : rate_slope.SlopeError, optional
-            How far the derivative is off; None: only by the noise.
+            Error of the derivative; None: noise only.
 
         """
         sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)

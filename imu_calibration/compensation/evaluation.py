@@ -19,7 +19,7 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 @dataclass(frozen=True, eq=False)
 class SessionTruth:
-    """Measured samples beside what the table says they should be."""
+    """Measured samples with their reference from the table."""
 
     imu: ImuSamples
     """Samples with a reference."""
@@ -42,7 +42,7 @@ class ErrorFigures:
 
 
 def session_truth(blocks: Iterable[SampleBlock], table: Table, settings: WindowSettings = WindowSettings()) -> SessionTruth:
-    """Return the samples of a session with their reference, as far as joints and IMU are both there."""
+    """Return the samples of a session with their reference, where joints and IMU are both present."""
     windows = MotionGatherer(table, settings, keep_unused=True).all_of(blocks)
     references = [_reference(window, table) for window in windows]
     stamp_ns, force_s, rate_s = (np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s'))
@@ -52,7 +52,7 @@ def session_truth(blocks: Iterable[SampleBlock], table: Table, settings: WindowS
 
 
 def _reference(window, table):
-    """Return the reference at every sample; a static window's motion is one row that stands for all."""
+    """Return the reference at every sample; the motion of a static window is one row for all samples."""
     motion = window.motion
     if len(motion) != len(window.time):
         motion = motion.select(np.zeros(len(window.time), int))
@@ -64,7 +64,7 @@ def error_figures(truth: SessionTruth, force_s: np.ndarray, rate_s: np.ndarray, 
     """
     Return the ErrorFigures of a version of the samples.
 
-    Noise averages out over one second, so that the figures show what calibration can change.
+    Noise averages out over one second, so that the figures show the effect of calibration.
     """
     reference = truth.reference
     period = float(np.median(np.diff(reference.time)))

@@ -1,4 +1,4 @@
-"""What compensation needs to know of a calibration; `calibration.document.Calibration` is one."""
+"""Interface of a calibration for compensation; `calibration.document.Calibration` implements it."""
 
 from typing import Any, Protocol
 
@@ -29,7 +29,7 @@ class FittedErrors(Protocol):
 
     @property
     def uncertainty_known(self) -> bool:
-        """Whether somebody knows how certain the values are."""
+        """Whether the values have a covariance."""
 
     @property
     def knows_density(self) -> bool:
@@ -41,7 +41,7 @@ class FittedErrors(Protocol):
 
     @property
     def conditions(self) -> dict[str, Any]:
-        """What the recording was like: the range of temperature, the largest rate."""
+        """Conditions of the recording: the range of temperature, the largest rate."""
 
     def of(self, sensor: str, role: Role) -> Any:
         """Return the value of the effect that plays a role for a sensor, or None."""

@@ -1,4 +1,4 @@
-"""Does the calibration still hold? At every stop the rate must be zero and specific force as long as gravity, within what is known."""
+"""Test of a calibration at every stop: the rate must be zero and the norm of specific force equal to gravity, within their sds."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,7 +15,7 @@ from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.units import unit_of_rest
 
 LIMIT = 4.0
-"""Standard deviations; three axes pass it by chance once in five thousand calibrations."""
+"""Standard deviations; three axes exceed it by chance once in five thousand calibrations."""
 LEAST = 2.0
 """Shortest stop that is tested, s."""
 PLACE = 0.005
@@ -33,7 +33,7 @@ class HealthWord(StrEnum):
     MOVED = 'moved'
     """Something has moved by more than its standard deviation allows."""
     FOLLOWED = 'followed'
-    """The bias of the gyroscope has moved, and an update takes it off."""
+    """The bias of the gyroscope has moved, and an update corrects it."""
     HARMS = 'harms'
     """At rest, readings are farther from the truth with the calibration than without."""
     UNIT = 'unit'
@@ -45,22 +45,22 @@ WAITING, HOLDS, MOVED, FOLLOWED, HARMS, UNIT = HealthWord
 
 @dataclass(frozen=True)
 class HealthState:
-    """What the last stop said."""
+    """Result of the last stop."""
 
     word: HealthWord
     """Whether the calibration holds."""
     message: str
-    """One line for people."""
+    """One line of text."""
     values: dict = field(default_factory=dict)
     """Figures by name, with units."""
 
 
 @dataclass(frozen=True)
 class HealthOptions:
-    """What is known of where the robot drives, and what is allowed."""
+    """Site of the robot, and permitted corrections."""
 
     gravity: float = 0.0
-    """Local gravity, m/s^2; 0: that of the calibration, within what places differ by."""
+    """Local gravity, m/s^2; 0: that of the calibration, within the variation between sites."""
     update: bool = False
     """Whether the bias of the gyroscope follows the stops."""
     bias_time: float = 600.0
@@ -68,14 +68,14 @@ class HealthOptions:
 
 
 class _Judged(NamedTuple):
-    """A stop with what was known at its end; replaced as a whole, so that another thread may read it."""
+    """A stop with the state at its end; replaced as a whole, so that another thread may read it."""
 
     stop: Stop
     of_mean: np.ndarray
     """Variance of its mean, shape (6,)."""
     n_stops: int
     bias_update: tuple[np.ndarray, np.ndarray] | None
-    """Bias that is taken off, and its variance, each shape (3,)."""
+    """Corrected bias, and its variance, each shape (3,)."""
 
 
 class CalibrationHealth:
@@ -108,7 +108,7 @@ class CalibrationHealth:
 
     def judge(self, stop: Stop) -> None:
         """
-        Take a stop as it grows.
+        Process a growing stop.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ class CalibrationHealth:
 
     @property
     def state(self) -> HealthState:
-        """What the last stop said, worked out when somebody asks."""
+        """Result of the last stop, computed on request."""
         return HealthState(WAITING, 'no stop of two seconds yet') if self._last is None else self._told(*self._last)
 
     def _told(self, stop, of_mean, n_stops, bias_update):
@@ -167,5 +167,5 @@ class CalibrationHealth:
             return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
                                values)
         if bias_update is not None and force_off <= LIMIT:
-            return HealthState(FOLLOWED, '; '.join(lines) + ': taken off as long as stops show it', values)
+            return HealthState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
         return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)

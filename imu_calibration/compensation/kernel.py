@@ -20,19 +20,19 @@ from imu_calibration.effects.regressors import LEVER
 from imu_calibration.errors import InputError
 
 SETTLED = 1e-13
-"""Sum of the changes in one fixed-point step (m/s^2, rad/s) after which there is nothing left to gain."""
+"""Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged."""
 LONGEST = 200_000
-"""Characters of a kernel at most; compiling so many takes about a second and 100 MB."""
+"""Largest number of characters of a kernel; compiling it needs about a second and 100 MB."""
 BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
-"""What is known of a sample before either sensor is corrected."""
+"""Quantities of a sample that are available before the correction of either sensor."""
 
 
 def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> Callable:
     """
     Return the function that compensates one sample.
 
-    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy, wz)`` takes the measured specific
-    force (m/s^2) and rate (rad/s), the derivative of the *measured* rate (rad/s^2; it goes through the inverse gyroscope matrix here),
+    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy, wz)`` reads the measured specific
+    force (m/s^2) and rate (rad/s), the derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here),
     and the temperature above the calibration's reference temperature (K). Where they are left out, which way that came
     (`reference.thermal_branch`) and how much it vibrates (`reference.vibration`, (m/s^2)^2) are 0.
     Where the non-linear effects cannot be undone it returns NaN.
@@ -46,7 +46,7 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     Raises
     ------
     InputError
-        When an effect that is to be undone has columns that a single sample does not tell.
+        If an effect to be inverted has columns that a single sample does not determine.
 
     """
     namespace = dict(SCALAR_FUNCTIONS)
@@ -69,7 +69,7 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     slope = _turned(gyro.inverse, _vector('a'))
     lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):']
     if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends_with('g'):
-        # Nothing has to be solved: the rate follows from what was measured, and what disturbs the force follows from the rate.
+        # No iteration is needed: the rate follows from the readings, and the disturbance of the force follows from the rate.
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
         force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
     else:
@@ -105,7 +105,7 @@ class _Part:
 
 
 def _known(temperature_ref_c):
-    """Return name in a column -> the sum of products that stands for it in the function."""
+    """Return name in a column -> the sum of products that replaces it in the function."""
     letters = {'f': 'u', 'w': 'v', 'alpha': 'g', 'vibration': 's'}
     vectors = {f'{name}_{k}': {(f'{variable}{k}',): 1.0} for name, variable in letters.items() for k in AXES}
     return vectors | {'temperature_c': {('dt',): 1.0, (): temperature_ref_c}, 'temperature_ref_c': {(): temperature_ref_c},
@@ -113,8 +113,8 @@ def _known(temperature_ref_c):
 
 
 def _iteration(accel, gyro):
-    """Return the lines that leave the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
-    # ax, ay, az have gone into gx, gy, gz by now: a is the force, b the rate, that matrix and bias alone would give.
+    """Return the lines that compute the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
+    # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
     lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
     lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({ITERATIONS}):',
               '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']

@@ -10,27 +10,27 @@ from imu_calibration.compensation.angular_acceleration import EARLY, LATE, RESET
 from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
 
 BLOCK = LAG
-"""The stamps are looked at again after so many samples."""
+"""The stamps are classified again after this many samples."""
 HISTORY = 4 * LAG + 1
-"""Stamps from which counted and irregular ones are told apart."""
+"""Stamps needed to separate counted from irregular stamps."""
 CHANGED = {REGULAR: 0.02, COUNTED: 0.05, IRREGULAR: 0.25}
 """A period that differs by more than this share is a new one; the scatter of the stamps limits the resolution of the latter two."""
 FASTEST_NS = 10_000.0
-"""Irregular stamps with a shorter mean step stand still: they contain no time for a derivative."""
+"""Irregular stamps with a shorter mean step are frozen: they contain no time for a derivative."""
 AGREE = 4
 """Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps only."""
 RECENT = 1.0, 64, 2048
-"""Seconds, least and most samples from whose motion the error of the derivative is taken."""
+"""Seconds, smallest and largest number of samples from which the error of the derivative is estimated."""
 ROUGH = 0.02
 """Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
 NO_SLOPE = (0.0, 0.0, 0.0)
 WITHOUT = ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes its size'
-"""Consequence of stamps that stand still."""
+"""Consequence of frozen stamps."""
 
 
 @dataclass(frozen=True, eq=False)
 class SlopeError:
-    """How far the derivative in use is off the true one at the present motion, beside the noise that it passes on."""
+    """Error of the derivative in the present motion, in addition to its noise."""
 
     moment: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     """Mean of error times error, noise of the rate included, (rad/s^2)^2, shape (3, 3)."""
@@ -48,7 +48,7 @@ class RateSlope:
     Derivative of the rate of a stream, one sample or one block at a time; the outcome does not depend on how the stream is cut.
 
     Regular stamps show where samples are missing. Where stamps scatter about a clock (packets, times of arrival, jitter, in any order) the
-    samples are counted: `_count_on`. Irregular stamps are used as they are: least squares over the stamped times. Where stamps stand still
+    samples are counted: `_count_on`. Irregular stamps are used as they are: least squares over the stamped times. Where stamps are frozen
     the derivative is zero and `error` returns its size. The kind of the stamps is reviewed every `BLOCK` samples.
 
     Parameters
@@ -63,9 +63,9 @@ class RateSlope:
     def __init__(self, choose: Callable[[float], CausalDerivative], changed: Callable[[], None] = lambda: None):
         self._choose, self._changed = choose, changed
         self.line: StampLine | None = None
-        """How the stamps are; None while they are too few to tell."""
+        """Class of the stamps; None while they are too few."""
         self.derivative: CausalDerivative | None = None
-        """What is in use; None: nothing."""
+        """The derivative in use, or None."""
         self._tracker: StampedDerivative | TimedDerivative | None = None
         self._stamps: deque[int] = deque(maxlen=HISTORY)
         self._due = LEAST + 1
@@ -78,11 +78,11 @@ class RateSlope:
         self._recent: deque[tuple] = deque(maxlen=RECENT[1])
         self._all_of_it: SlopeError | None = None
         self.n_without = 0
-        """Samples without a derivative because their stamps stand still."""
+        """Samples without a derivative because their stamps are frozen."""
 
     @property
     def period(self) -> float | None:
-        """Time between samples, s; None while the stamps are too few to tell."""
+        """Time between samples, s; None while the stamps are too few."""
         return None if self.line is None else 1e-9 * self.line.period_ns
 
     @property
@@ -156,7 +156,7 @@ class RateSlope:
             self._recent.extend(list(before._recent))
 
     def follow(self, before: 'RateSlope') -> None:
-        """Go on where another one stops, after `prepare`."""
+        """Continue from another one, after `prepare`."""
         self._stamps, self._due, self._count = before._stamps, before._due, before._count
         self._newest, self._reading = before._newest, before._reading
         self._agreeing, self._ahead_ns, self._doubtful = before._agreeing, before._ahead_ns, before._doubtful
@@ -165,11 +165,11 @@ class RateSlope:
 
     def error(self) -> SlopeError:
         """
-        Return how far the derivative has lately been off.
+        Return the recent error of the derivative.
 
-        A derivative that is `delay` late is off by what the true one changed in that time, which the estimates tell a delay later:
-        ``alpha(t + delay) - alpha(t)``. Without one it is off by all of it: the rate over `ROUGH` seconds tells how much. Behind a change
-        of the stamps, until there is new motion, it counts as off by all of it too.
+        The error of a delayed derivative is the change of the true one in that time, estimated a delay later:
+        ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative, from the rate over `ROUGH` seconds; also after a
+        change of the stamps, until there is new motion.
         """
         recent = np.array(list(self._recent)).reshape(-1, 3)
         if len(recent) < LEAST and self._all_of_it is not None:
@@ -185,7 +185,7 @@ class RateSlope:
         return SlopeError(share * _moment(recent[lag:] - recent[:-lag]), share * float(apart @ apart))
 
     def _size_of_all(self, rates: np.ndarray) -> SlopeError:
-        """Return how large the derivative is, from rates, or from what a derivative in use has given."""
+        """Return the size of the derivative, from rates, or from the derivative in use."""
         if self.derivative is not None and len(rates):
             return SlopeError(_moment(rates), float(self.derivative.weights @ self.derivative.weights))
         period = _mean_step(list(self._stamps)[-len(rates):])
@@ -198,7 +198,7 @@ class RateSlope:
         """
         Return the derivative after a sample that is counted.
 
-        Behind a step longer than the scatter of the stamps samples may be lost, or one stamp was late. The derivative is kept until a later
+        After a step longer than the scatter of the stamps samples may be lost, or one stamp was late. The derivative is kept until a later
         stamp decides; the window is restarted when half a window of samples has not decided, or at once where the step exceeds a window.
         """
         self._ahead_ns = step_ns + (self._ahead_ns if self._doubtful else 0)
@@ -217,7 +217,7 @@ class RateSlope:
         return slope
 
     def _review(self) -> None:
-        """Classify the latest stamps again; after the first block behind a change, update the error of the derivative."""
+        """Classify the latest stamps again; after the first block following a change, update the error of the derivative."""
         if self.line is not None and self._young:
             self._young = False
             self._changed()
@@ -229,15 +229,15 @@ class RateSlope:
             self._due = BLOCK
             if self.line.word == REGULAR and _usual(stamps[-BLOCK - 1:], self.line.period_ns):
                 return
-            # Counted stamps may look regular for a while; regular ones are seen at once.
+            # Counted stamps may appear regular for some time; regular ones are identified at once.
             line = None if self.line.word == COUNTED else describe_stamps(stamps[-BLOCK - 1:])
             line = line or (describe_stamps(stamps) if len(stamps) == HISTORY else None)
         if line is None:
             if self.line is None:
-                self._changed()   # so that what is left out meanwhile is known
+                self._changed()   # so that the omitted part is known
             return
         if self.line is not None and (self.line.word, line.word) == (IRREGULAR, COUNTED) and self._tracker is not None:
-            self._agreeing += 1   # independent steps look counted in one of four reviews
+            self._agreeing += 1   # independent steps appear counted in one of four reviews
             if self._agreeing < AGREE:
                 return
         self._agreeing = 0
@@ -246,13 +246,13 @@ class RateSlope:
         self._due = BLOCK
 
     def _usual_until(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
-        """Return up to which sample of a block nothing but the window has to move: no message came twice, the stamps are as they were."""
+        """Return the number of samples of a block for which only the window moves: no duplicate message, the same class of stamps."""
         if self.line is None or self.line.word != REGULAR:
             return start
         before = np.array(self._stamps, np.int64)[-BLOCK:]
         stamps = np.concatenate([before, stamp_ns[start:]])
         step = np.diff(stamps)
-        again = np.flatnonzero(step[max(len(before) - 1, 0):] == 0)   # who counts them looks at their readings
+        again = np.flatnonzero(step[max(len(before) - 1, 0):] == 0)   # the counting branch compares their readings
         stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
         due = np.arange(self._due - 1, stop, BLOCK)
         first = due + len(before) - BLOCK
@@ -261,7 +261,7 @@ class RateSlope:
         return start + (int(due[unusual][0]) if unusual.any() else stop)
 
     def _note(self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray) -> None:
-        """Remember what a block leaves behind that was worked off as a whole."""
+        """Store the state after a block that was processed as a whole."""
         self._stamps.extend(stamp_ns[-HISTORY:].tolist())
         self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
         self._due = (self._due - len(stamp_ns) - 1) % BLOCK + 1
@@ -273,7 +273,7 @@ def _stand_still(line: StampLine) -> bool:
 
 
 def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
-    """Return whether stamps, shape (..., n), are those of a clock of that period, none missing."""
+    """Return whether stamps, shape (..., n), are from a clock of that period, without a missing one."""
     step = np.diff(stamps, axis=-1)
     within = np.all((step > EARLY * period_ns) & (step <= LATE * period_ns), axis=-1)
     return within & (np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1) <= CHANGED[REGULAR])

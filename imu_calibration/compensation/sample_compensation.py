@@ -19,7 +19,7 @@ from imu_calibration.reference.vibration import BandVariance
 
 class SampleCompensation:
     """
-    Corrects sample after sample; knows no messages.
+    Corrects sample by sample, independent of messages.
 
     Parameters
     ----------
@@ -41,17 +41,17 @@ class SampleCompensation:
         self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
-        self._follows = self.needs_slope or self._shakes or calibration.knows_density   # the stamps say how large the noise of a sample is
+        self._follows = self.needs_slope or self._shakes or calibration.knows_density   # the stamps determine the noise of a sample
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer), self._take_derivative)
         self._kernel = make_kernel(calibration, transfer)
         self.last: tuple[Any, ...] = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0, 0.0, NO_SLOPE)
         self.revision = 0
-        """Counts how often the covariances were taken anew."""
+        """Number of updates of the covariances."""
         self._uncertainty = Uncertainty(calibration, transfer)
         self.refresh()
 
     def set_temperature(self, temperature_c: float) -> None:
-        """Tell the temperature near the sensor, degrees Celsius."""
+        """Set the temperature near the sensor, degrees Celsius."""
         if temperature_c - temperature_c != 0.0:
             return
         self.branch.push(temperature_c)
@@ -59,7 +59,7 @@ class SampleCompensation:
             self.dt = temperature_c - self.calibration.model.temperature_ref_c
 
     def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...] | None:
-        """Return corrected rate and specific force, six floats, or None when there is nothing to publish; `counts` says why."""
+        """Return corrected rate and specific force, six floats, or None if no sample can be published; `counts` has the reason."""
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
             self.refuse('no temperature yet' if dt is None else 'not finite')
@@ -69,7 +69,7 @@ class SampleCompensation:
         ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
-            self.refuse('beyond what can be undone')
+            self.refuse('outside the invertible range')
             return None
         self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now, vibration)
         if squared > self.fastest_squared:
@@ -83,28 +83,28 @@ class SampleCompensation:
 
     def covariances(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the covariances of corrected (force, rate), each (3, 3), at the sample at which they were taken last.
+        Return the covariances of corrected (force, rate), each (3, 3), at the sample of their last update.
 
-        Those of the measured ones, (3, 3), may be zero or no covariances at all: the calibration's noise is taken; or None: not measured.
+        Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is used; or None: not measured.
         """
         force, rate = (np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
                        for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise))
         return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
-        """Take the covariances of the corrected readings anew at the latest sample."""
+        """Update the covariances of the corrected readings at the latest sample."""
         self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3], branch=self.last[4], vibration=self.last[5],
                                                  slope_error=self.slope.error() if self.needs_slope else None)
         self.revision += 1
 
     def prepare(self, before: 'SampleCompensation') -> None:
-        """Do beforehand what takes long when this takes over from `before`: period and covariances at its latest sample."""
+        """Prepare the replacement of `before`: compute period and covariances at its latest sample, which is slow."""
         self.slope.prepare(before.slope)
         self.last = before.last
         self.refresh()
 
     def follow(self, before: 'SampleCompensation') -> None:
-        """Go on where another compensation stops: same past of the rate, same temperature, same counts."""
+        """Continue from another compensation: same past of the rate, same temperature, same counts."""
         self.counts, self.corrected, self.fastest_squared = before.counts, before.corrected, before.fastest_squared
         if before.dt is not None and before.needs_temperature and self.dt is None:
             self.dt = before.dt + before.calibration.model.temperature_ref_c - self.calibration.model.temperature_ref_c

@@ -1,4 +1,4 @@
-"""The tap in a stream of corrected samples: keeps them for a quarter of a second, looks for stops, and takes off what they showed."""
+"""Detection of stops in a stream of corrected samples, in blocks of a quarter of a second, and correction of the bias by them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,24 +10,24 @@ from imu_calibration.compensation.stops import BLOCK, StopDetector
 
 SIX = tuple[float, ...]
 AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
-"""Columns of a sample in the order in which stops are looked for: time, force, rate, measured force, measured rate."""
+"""Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate."""
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectedStretch:
-    """The samples between two looks."""
+    """The samples between two evaluations."""
 
     first_ns: int
     """Where the times of the samples begin, ns."""
     samples: np.ndarray
     """Time in ns, corrected and measured (rate x, y, z, force x, y, z), the corrected ones before any update of the bias, shape (n, 13)."""
     offset: tuple[float, float, float]
-    """What was taken off the corrected rate, rad/s."""
+    """Correction subtracted from the corrected rate, rad/s."""
 
 
 class StopWatch:
     """
-    Follows a `CalibrationHealth` sample by sample; between two looks it costs an append.
+    Follows a `CalibrationHealth` sample by sample; between two evaluations it costs an append.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class StopWatch:
         self._offset: tuple[float, float, float] | None = None
 
     def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
-        """Take a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one less the update of the bias."""
+        """Process a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one minus the bias update."""
         since = stamp_ns - self._first_ns
         self._waiting.append((since, *corrected, *measured))
         if since >= self._look or since < 0:
@@ -56,7 +56,7 @@ class StopWatch:
 
     @property
     def rate_cov(self) -> np.ndarray:
-        """Covariance of what is taken off the rate, shape (3, 3)."""
+        """Covariance of the correction of the rate, shape (3, 3)."""
         if self._offset is None or self.health.update is None:
             return np.zeros((3, 3))
         return np.diag(self.health.update.predict(self._look * 1e-9)[1])

@@ -1,4 +1,4 @@
-"""When an IMU on a robot stands still: short blocks whose means stay where they are, in a stream of any length."""
+"""Detection of rest of an IMU on a robot: short blocks with constant means, in a stream of any length."""
 
 from dataclasses import dataclass
 
@@ -9,20 +9,20 @@ BLOCK = 0.25
 N_BLOCKS = 4
 """Blocks in a row that must agree, one second."""
 MOST_RATE = 0.1
-"""rad/s; no gyroscope that is worth a calibration reads more at rest, and who turns faster does not stand."""
+"""rad/s; larger than the rest reading of any gyroscope that is calibrated, so that a faster rotation is no rest."""
 MOST_SHAKE = np.array([0.6] * 3 + [0.06] * 3)
-"""Standard deviation within a block, m/s^2 and rad/s: an idling engine stays below, driving over a floor does not."""
+"""Standard deviation within a block, m/s^2 and rad/s: above that of an idling engine, below that of driving over a floor."""
 STEADY = np.array([0.05] * 3 + [3e-3] * 3)
-"""How far means of blocks may be apart beyond what noise explains, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2 degrees per second."""
+"""Largest difference of block means in addition to noise, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2 degrees per second."""
 LONGEST = 30.0
-"""s; a longer stand counts as several, so that a bias that drifts while the robot is parked is followed."""
+"""s; a longer rest counts as several, so that a bias that drifts while the robot is parked is tracked."""
 TIMES_NOISE = 6.0
 """Range of four means of noise, in their standard deviations: exceeded once in ten thousand times by three axes of two sensors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A stand of the IMU until now."""
+    """A rest of the IMU until now."""
 
     start: float
     """When it began, s."""
@@ -47,9 +47,9 @@ class Stop:
 
 class StopDetector:
     """
-    Takes readings in any pieces; how they are cut does not matter.
+    Processes readings in pieces of any length; the result does not depend on the division.
 
-    A robot that turns steadily at less than `MOST_RATE` about the vertical looks the same and cannot be told from one that stands.
+    A robot that rotates steadily at less than `MOST_RATE` about the vertical is not separable from one at rest.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class StopDetector:
 
     def push(self, rows: np.ndarray) -> Stop | None:
         """
-        Take samples; return the stop that goes on at their end, or None while the IMU moves.
+        Process samples; return the stop that continues at their end, or None while the IMU moves.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class StopDetector:
         return self._stop
 
     def _take(self, rows):
-        """Take one block, or start anew after a gap."""
+        """Process one block, or restart after a gap."""
         if self._blocks and rows[0, 0] - self._blocks[-1][1] > BLOCK:
             self._blocks, self._stand = [], []
         block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
@@ -110,7 +110,7 @@ class StopDetector:
         shake = np.sqrt(np.max([variance for *_, variance in self._blocks], axis=0))
         least = min(n for _, _, n, _, _ in self._blocks)
         apart = np.ptp(means, axis=0)
-        # What shakes the robot is noise for the means as well.
+        # Vibration of the robot is noise for the means as well.
         allowed = STEADY + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
         return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
 

@@ -1,4 +1,4 @@
-"""Compensation of a stream of blocks: the state that has to go from one block to the next, and what is noticed on the way."""
+"""Compensation of a stream of blocks: the state between blocks, and the warnings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from imu_calibration.samples import ImuSamples, TemperatureSamples
 from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
-"""A topic that ends like this is refused: nobody should correct twice."""
+"""A topic with this ending is refused, because a second correction would be wrong."""
 
 
 class CompensationStream:
@@ -56,7 +56,7 @@ class CompensationStream:
         """
         Return `Corrected` for the next block of ImuSamples.
 
-        What is NaN, absent in the message or broken, stays NaN and leaves its neighbours and the other sensor alone.
+        A reading that is NaN, absent or broken remains NaN and does not affect its neighbours or the other sensor.
         """
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
@@ -89,7 +89,7 @@ class CompensationStream:
                           'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist())}
 
     def _vibration_of(self, imu):
-        """Return how much it vibrates at the samples of a block, as far as they are finite; None where nobody asks."""
+        """Return the variance of vibration at the finite samples of a block; None if it is not needed."""
         if self._vibration is None:
             return None
         finite = np.isfinite(imu.force_s).all(axis=1)
@@ -98,7 +98,7 @@ class CompensationStream:
         return vibration
 
     def _warmth_at(self, stamp_ns):
-        """Return (temperatures, thermal branches) at stamps; None where there are none or nobody asks for them."""
+        """Return (temperatures, thermal branches) at stamps; None if they are absent or not needed."""
         if self.temperature is None or not len(self.temperature):
             return None, None
         origin = self.temperature.stamp_ns[0]
@@ -116,7 +116,7 @@ class CompensationStream:
         Parameters
         ----------
         force_cov, rate_cov : ndarray or None
-            Those of the measured ones, shape (3, 3); zero, no covariances at all or None: the calibration's noise is taken.
+            Covariances of the readings, shape (3, 3); zero, invalid or None: the noise of the calibration is used.
 
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
@@ -124,14 +124,14 @@ class CompensationStream:
         return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(force, rate)
 
     def warnings(self) -> list[str]:
-        """Return lines about what was outside the calibration's conditions or could not be corrected."""
+        """Return lines on samples outside the conditions of the calibration, or without correction."""
         fastest = np.array([[self._fastest, 0.0, 0.0]])
         lines = outside_conditions(self.calibration, fastest, self._temperatures or None)
         if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
             lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
                          'make sure that it is the same sensor')
         if self.slope.n_without and uses_slope(self.calibration, self.transfer):
-            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples stand still{WITHOUT}')
+            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples are frozen{WITHOUT}')
         if self.flagged:
             lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
         return lines
@@ -147,7 +147,7 @@ def derivative_for(calibration: FittedErrors, period: float, transfer: Transfer 
 
 
 def uses_slope(calibration: FittedErrors, transfer: Transfer | None = None) -> bool:
-    """Return whether the angular acceleration enters what is corrected: there is a lever arm."""
+    """Return whether the correction uses the angular acceleration: there is a lever arm."""
     return bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
 
 
@@ -158,7 +158,7 @@ def refuse_corrected(topic: str) -> None:
     Raises
     ------
     InputError
-        When the topic's name says so.
+        If the name of the topic has the ending of corrected topics.
 
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
@@ -168,23 +168,23 @@ def refuse_corrected(topic: str) -> None:
 
 def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]) -> Transfer | None:
     """
-    Return the Transfer that options or parameters ask for, None without a target frame.
+    Return the Transfer of options or parameters, None without a target frame.
 
     Raises
     ------
     InputError
-        When a pose comes without the name of its frame.
+        If a pose is given without the name of its frame.
 
     """
     if frame_id:
         return Transfer.from_pose(frame_id, xyz, rpy)
     if any(xyz) or any(rpy):
-        raise InputError('a pose in the target frame needs the name of that frame, none came; give the target frame as well',
+        raise InputError('a pose in the target frame needs the name of that frame, none was given; give the target frame as well',
                          key='target_frame', code='frame_name_missing')
     return None
 
 
 def late_ns(calibration: FittedErrors, wanted: bool = True) -> int:
-    """Return by how much stamps are to be moved back, ns: the calibration's time_offset when that is `wanted`, else 0."""
+    """Return the correction of stamps, ns, positive backwards: the time_offset of the calibration if `wanted`, otherwise 0."""
     late = calibration.of('reference', Role.DELAY) if wanted else None
     return 0 if late is None else round(float(late) * 1e9)
