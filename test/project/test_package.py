@@ -31,6 +31,7 @@ ROSDEP_KEYS = {
 NOBLE = {
     'python3-numpy': 'python3-numpy', 'python3-scipy': 'python3-scipy', 'python3-yaml': 'python3-yaml', 'python3-jinja2': 'python3-jinja2',
     'python3-matplotlib': 'python3-matplotlib', 'python3-rich': 'python3-rich', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
+    'python3-jsonschema': 'python3-jsonschema',
     'python3-pytest': 'python3-pytest', 'python3-pytest-xdist': 'python3-pytest-xdist', 'urdfdom_py': 'ros-jazzy-urdfdom-py', 'xacro': 'ros-jazzy-xacro',
     'ament_index_python': 'ros-jazzy-ament-index-python', 'launch': 'ros-jazzy-launch', 'launch_ros': 'ros-jazzy-launch-ros', 'rclpy': 'ros-jazzy-rclpy',
     'ros2cli': 'ros-jazzy-ros2cli', 'ros2doctor': 'ros-jazzy-ros2doctor', 'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
