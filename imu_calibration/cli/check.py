@@ -20,23 +20,20 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 where each sensor helps, else 3."""
-    from rich.table import Table
-
-    from imu_calibration.cli.show import console, warn
+    from imu_calibration.cli.show import console, show_table, warn
     from imu_calibration.preflight.checks import warnings
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])
-    out, table = console(), Table(box=None, pad_edge=False)
-    for heading in ('sensor', 'motion', 'seconds', 'before', 'after', 'unit', 'after / before', '95 %'):
-        table.add_column(heading, justify='left' if heading in ('sensor', 'motion', 'unit') else 'right')
+    out, numbers = console(), ('seconds', 'before', 'after', 'after / before', '95 %')
+    rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
             low, high = part['ci95']
-            table.add_row(sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}',
+            rows.append((sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}',
                           part.get('unit', entry['unit']),
-                          f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}')
-    out.print(table)
+                          f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}'))
+    show_table(out, ('sensor', 'motion', *numbers[:3], 'unit', *numbers[3:]), rows, numbers=numbers)
     for line in str(found).splitlines():
         out.print(line, soft_wrap=True, markup=False)
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -15,23 +15,20 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Compare and print."""
-    from rich.table import Table
-
     from imu_calibration import files
     from imu_calibration.calibration import comparison
-    from imu_calibration.cli.show import console
+    from imu_calibration.cli.show import console, show_table
     from imu_calibration.units import for_people, with_sd
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
     out = console()
-    table = Table(box=None, pad_edge=False)
-    for heading in ('parameter', 'A', 'B', 'B - A', 'combined sd', 'unit', 'in sd'):
-        table.add_column(heading, justify='left' if heading in ('parameter', 'unit') else 'right')
+    numbers = ('A', 'B', 'B - A', 'combined sd', 'in sd')
+    shown = []
     for row in result.rows:
         factor, unit = for_people(row.unit, row.name)
         difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
-        table.add_row(row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
-                      '-' if row.ratio is None else f'{row.ratio:.1f}')
-    out.print(table)
+        shown.append((row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
+                      '-' if row.ratio is None else f'{row.ratio:.1f}'))
+    show_table(out, ('parameter', *numbers[:-1], 'unit', 'in sd'), shown, numbers=numbers)
     for line in result.lines:
         out.print(line, soft_wrap=True)
     rows = [{'name': row.name, 'first': row.first, 'second': row.second, 'sd': row.sd, 'unit': row.unit, 'ratio': row.ratio}

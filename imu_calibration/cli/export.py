@@ -46,17 +46,10 @@ def run(options: Namespace) -> VerbResult:
 
 
 def _show_targets():
-    from rich.table import Table
-
-    from imu_calibration.cli.show import console
+    from imu_calibration.cli.show import console, show_table
     from imu_calibration.exports.export import holds_in_words
     from imu_calibration.exports.registry import all_targets
-    table = Table(box=None, pad_edge=False)
-    for heading in ('name', 'file', 'of the calibration it holds', 'noise', 'import'):
-        table.add_column(heading, no_wrap=heading == 'name', overflow='fold')
     rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
             for target in all_targets().values() if target.write is not None]
-    for row in rows:
-        table.add_row(*row)
-    console().print(table)
+    show_table(console(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
     return [dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows]

@@ -15,7 +15,7 @@ from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.parser import VerbResult
-from imu_calibration.cli.show import console, warn
+from imu_calibration.cli.show import console, show_table, warn
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, with_hint
 from imu_calibration.progress import counter
@@ -116,13 +116,8 @@ COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', '
 
 def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
-    from rich.table import Table
-    out, table = console(), Table(box=None, pad_edge=False)
-    for heading in COLUMNS:
-        table.add_column(heading, justify='left' if heading in (COLUMNS[0], COLUMNS[4], COLUMNS[6]) else 'right')
-    for spread in spreads:
-        table.add_row(*shown(spread))
-    out.print(table)
+    out = console()
+    show_table(out, COLUMNS, map(shown, spreads), numbers=[COLUMNS[k] for k in (1, 2, 3, 5)])
     for result in results:
         out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}', soft_wrap=True, markup=False)
         if result.calibration is not None:

@@ -68,21 +68,20 @@ def _document(look):
 
 def _show_topics(out, looks):
     """Print the topics; for the topics that are read also rate, gaps and step of the stamps."""
-    from rich.table import Table
+    from imu_calibration.cli.show import show_table
     used = {getattr(look.recording, attribute): look.streams.get(name) for look in looks for attribute, name in TOPICS
             if getattr(look.recording, attribute)}
-    table = Table(box=None, pad_edge=False, header_style='dim')
-    for heading in ('topic', 'type', 'messages', 'Hz', 'seconds', 'gaps', 'stamp step', ''):
-        table.add_column(heading, justify='right' if heading in ('messages', 'Hz', 'seconds', 'gaps', 'stamp step') else 'left')
+    numbers = ('messages', 'Hz', 'seconds', 'gaps', 'stamp step')
+    rows = []
     for topic in sorted(looks[0].recording.topics, key=lambda topic: topic.name not in used):
         found = used.get(topic.name)
         if found is None or not found.count:
-            table.add_row(topic.name, topic.type, str(topic.count), style='dim')
+            rows.append((topic.name, topic.type, str(topic.count), *[''] * 5))
         else:
             gaps = f'{found.n_gaps} ({found.gap_total:.2f} s)' if found.n_gaps else 'none'
-            table.add_row(topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps,
-                          _step(found.stamp_step_ns), 'read')
-    out.print(table)
+            rows.append((topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps,
+                         _step(found.stamp_step_ns), 'read'))
+    show_table(out, ('topic', 'type', *numbers, ''), rows, numbers=numbers, dimmed=True)
 
 
 def _show_unread(out, recording, hints):

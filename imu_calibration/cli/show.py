@@ -1,6 +1,6 @@
 """Short tables that the verbs print on standard output."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,32 @@ def console() -> Any:
 
     from rich.console import Console
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
+
+
+def show_table(out: Any, headings: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[str] = (),
+               dimmed: bool = False) -> None:
+    """
+    Print a table without lines, `numbers` flush right; where it is wider than the terminal, lines break between words only.
+
+    Rich would shrink the widest columns first, whatever their longest word. `dimmed`: rows with an empty last cell are dim.
+    """
+    from rich.table import Table
+    rows = [tuple(row) for row in rows]
+    most = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
+    narrow = sum(most) + 2 * (len(most) - 1) > out.width
+    if narrow:   # dotted names may break at a dot
+        rows = [(row[0].replace('.', ' '), *row[1:]) for row in rows]
+    least = [max(len(word) for cell in column for word in [*cell.split(), '']) for column in zip(headings, *rows, strict=True)]
+    widths, room = list(least), out.width - sum(least) - (len(least) - 1)
+    for k in sorted(range(len(widths)), key=lambda k: headings[k] not in numbers):   # numbers first
+        widths[k] += max(0, min(room, most[k] - least[k]))
+        room -= widths[k] - least[k]
+    table = Table(box=None, pad_edge=False, collapse_padding=narrow)
+    for heading, width in zip(headings, widths, strict=True):
+        table.add_column(heading, justify='right' if heading in numbers else 'left', width=width if narrow else None)
+    for row in rows:
+        table.add_row(*row, style='dim' if dimmed and not row[-1] else None)
+    out.print(table)
 
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
@@ -45,13 +71,8 @@ def show_findings(out: Any, findings: tuple[CheckFinding, ...], hints: dict[str,
 
 def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
     """Print the parameters of a `Calibrated`, the decisions and where the files are."""
-    from rich.table import Table
-    out, table = console(), Table(title=None, box=None, pad_edge=False)
-    for heading in HEADINGS:
-        table.add_column(heading, justify='right' if heading in NUMBERS else 'left')
-    for row in parameter_rows(found.calibration):
-        table.add_row(*row)
-    out.print(table)
+    out = console()
+    show_table(out, HEADINGS, parameter_rows(found.calibration), numbers=NUMBERS)
     for line in summary(found.result, hints)[1]:
         out.print(line, soft_wrap=True)
     files = 'calibration.yaml' + (' and report.html' if report else '')

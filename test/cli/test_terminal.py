@@ -1,0 +1,113 @@
+"""What verbs print on a terminal: no line ends within a word at 80 columns, colour only where wanted, an early interruption in one line."""
+
+import fcntl
+import io
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+
+import pytest
+from rich.console import Console
+
+from imu_calibration.cli import parser, show
+from imu_calibration.cli.main import main
+
+ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
+SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
+PRINTING = {
+    'inspect': [SESSION], 'compare': [TRUTH, TRUTH], 'effects': [], 'export': ['--list'], 'plan': ['--by-hand', '--no-report', '--output', 'plan'],
+    'check': [SESSION, '--table', TABLE, '--calibration', TRUTH], 'noise': [SESSION, '--output', 'noise'],
+}
+
+
+def shown(monkeypatch, capsys, width, run):
+    """Return the words that are printed on a terminal of a width; dotted names may break at a dot."""
+    monkeypatch.setenv('COLUMNS', str(width))
+    out = io.StringIO()
+    monkeypatch.setattr(show, 'console', lambda: Console(file=out, width=width, highlight=False, markup=False))
+    run()
+    return (capsys.readouterr().out + out.getvalue()).replace('.', ' ').split()
+
+
+@pytest.mark.parametrize('verb', parser.VERBS)
+def test_no_word_of_a_help_is_broken(verb, monkeypatch, capsys):
+    def run():
+        with pytest.raises(SystemExit):
+            main([verb, '--help'])
+    wide, narrow = (shown(monkeypatch, capsys, width, run) for width in (400, 80))
+    assert set(narrow) <= set(wide)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('verb', PRINTING)
+def test_no_word_of_a_result_is_broken(verb, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    wide, narrow = (shown(monkeypatch, capsys, width, lambda folder=folder: main([verb, *(folder if word in ('plan', 'noise') else word for word in PRINTING[verb])]))
+                    for width, folder in ((400, 'first'), (80, 'other')))
+    assert {*narrow} - {'other'} <= set(wide) and len(narrow) > 10
+
+
+def test_a_table_that_is_too_wide_breaks_between_words():
+    """Rich shrinks the widest column first: of 'acceleration' and 'accelerometer' it showed parts."""
+    out = io.StringIO()
+    rows = [('accelerometer.accel_size_effect.xx', 'angular acceleration', '0.0463', ''), ('gyroscope.bias.x', 'turns at 30 to 120 deg/s', '12345.678', 'read')]
+    show.show_table(Console(file=out, width=48, highlight=False), ('parameter', 'motion', 'value', ''), rows, numbers=('value',))
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 48
+    assert set(out.getvalue().split()) == {'parameter', 'motion', 'value', *' '.join(cell.replace('.', ' ') if row.index(cell) == 0 else cell for row in rows for cell in row).split()}
+
+
+@pytest.mark.parametrize(('width', 'name'), [(120, 'accelerometer.bias.x'), (24, 'accelerometer bias x')])
+def test_names_keep_their_dots_where_the_table_fits(width, name):
+    out = io.StringIO()
+    show.show_table(Console(file=out, width=width, highlight=False), ('parameter', 'value', ''), [('accelerometer.bias.x', '1.0', '')])
+    assert name.split()[-1] in out.getvalue() and ('accelerometer.bias.x' in out.getvalue()) == (width == 120)
+
+
+def on_terminal(arguments, **environment):
+    """Return what a verb writes on a terminal of 80 columns."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 50, 80, 0, 0))
+    kept = {name: value for name, value in os.environ.items() if name not in ('COLUMNS', 'NO_COLOR', 'FORCE_COLOR')}
+    process = subprocess.Popen([sys.executable, '-m', 'imu_calibration', *arguments], cwd=ROOT, stdout=theirs, stderr=subprocess.DEVNULL,
+                               env=kept | {'TERM': 'xterm', **environment})
+    os.close(theirs)
+    found = b''
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:   # the other end is closed
+            part = b''
+        if not part:
+            break
+        found += part
+    os.close(ours)
+    assert process.wait() == 0
+    return found
+
+
+@pytest.mark.live
+def test_colour_is_for_terminals_and_not_with_no_color():
+    assert b'\x1b[32m' in on_terminal(['inspect', SESSION])
+    assert b'\x1b[3' not in on_terminal(['inspect', SESSION], NO_COLOR='1')
+    plain = subprocess.run([sys.executable, '-m', 'imu_calibration', 'inspect', SESSION], cwd=ROOT, capture_output=True, check=True)
+    assert b'\x1b' not in plain.stdout + plain.stderr
+
+
+@pytest.mark.live
+@pytest.mark.parametrize('moment', ['the first import', 'the verb'])
+def test_an_early_interruption_ends_with_130_in_one_line(moment, tmp_path):
+    """The signal comes as soon as the module is there: before or after numpy is imported."""
+    watched = 'imu_calibration.cli.parser' if moment == 'the first import' else 'numpy'
+    program = ('import os, signal, sys\n'
+               f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {watched!r}:\n'
+               '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
+               'sys.meta_path.insert(0, Watch())\n'
+               'from imu_calibration.__main__ import main\nsys.exit(main())\n')
+    done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 130 and done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr, done.stderr
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
