@@ -20,7 +20,6 @@ from validation.recordings import VARIABLE, data_folder  # noqa: E402
 from validation.section import Section, claims_table, text  # noqa: E402
 
 SECTIONS = ('cross', 'decisions', 'misfit', 'shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'peers', 'held_out', 'noise', 'inspecting', 'diagnosing')
-HEADING = '## How good is it\n'
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
 
@@ -67,23 +66,19 @@ def document(sections):
     return '\n\n'.join(parts + [section.markdown() for section in sections]) + '\n'
 
 
-def update_evidence(sections, evidence=ROOT / 'docs' / 'evidence.md'):
-    """Write the section of docs/evidence.md with the headlines of this run."""
+def claims(sections):
+    """Return docs/claims.md: the headlines of this run."""
     rows = [row for section in sections for row in section.rows]
     judged = [row for row in rows if row.holds is not None]
     table = claims_table([row for row in rows if row.headline])
-    new = text('evidence', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table)
-    page = evidence.read_text()
-    before, _, rest = page.partition(HEADING)
-    _, mark, after = rest.partition('\n## ')
-    evidence.write_text(before + new + '\n' + mark + after)
+    return text('claims', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table) + '\n'
 
 
 def main():
     """Run, write, say where."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--only', action='append', choices=SECTIONS, help='run only this section and print it; may be repeated')
-    parser.add_argument('--output', type=Path, default=ROOT / 'docs', help='folder for validation.md and validation/, default docs')
+    parser.add_argument('--output', type=Path, default=ROOT / 'docs', help='folder for validation.md, claims.md and validation/, default docs')
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
@@ -98,8 +93,7 @@ def main():
         print('\n\n'.join(section.markdown() for section in sections))
     else:
         (options.output / 'validation.md').write_text(document(sections))
-        if options.output == ROOT / 'docs':
-            update_evidence(sections)
+        (options.output / 'claims.md').write_text(claims(sections))
         print(f'written: {options.output / "validation.md"}')
     return 0 if all(whole for _, whole in results) else 1
 

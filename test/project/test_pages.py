@@ -12,6 +12,27 @@ plain = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(plain)
 MOST_WORDS = {'README.md': 900, 'docs/turntable.md': 900, 'docs/planning.md': 900, **{path.relative_to(ROOT).as_posix(): 250 for path in (ROOT / 'docs/decisions').glob('*.md')}}
 MOST_MARKERS = 10
+MOST_IN_ALL = 22_000
+WRITTEN = re.compile(r'<!-- \w+: begin -->.*?<!-- \w+: end -->', re.S)
+"""What a program writes into a page."""
+WRITTEN_WHOLE = {'docs/claims.md', 'docs/validation.md', 'docs/exports.md'}
+"""Pages whose tables and code a program writes; in docs/answers it is the code."""
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md'), ROOT / 'CHANGELOG.rst'))
+
+
+def own_words(page):
+    """Return the words of a page that no program writes."""
+    text = WRITTEN.sub('', (ROOT / page).read_text())
+    if page in WRITTEN_WHOLE or page.startswith('docs/answers'):
+        text = re.sub(r'^```.*?^```', '', text, flags=re.S | re.M)
+    if page in WRITTEN_WHOLE:
+        text = re.sub(r'^\|.*', '', text, flags=re.M)
+    return text.split()
+
+
+def test_all_pages_together_are_short():
+    words = {page: len(own_words(page)) for page in PAGES}
+    assert len(words) > 40 and sum(words.values()) <= MOST_IN_ALL, words
 
 
 def marker_words(path):
