@@ -1,5 +1,6 @@
 """From windows to findings: the one function that asks every effect, and puts into words what was found."""
 
+from dataclasses import replace
 from typing import Callable, Sequence
 
 import numpy as np
@@ -59,21 +60,24 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, pro
         When there are too few windows to hold any out.
 
     """
-    result = told(windows, table, inquire(windows, table, model, progress=progress, bias_processes=bias_processes))
+    result = told(table, inquire(windows, table, model, progress=progress, bias_processes=bias_processes))
+    result = replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
     if progress:
         progress(1.0)
     return result
 
 
-def told(windows: Sequence[Window], table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
+def told(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
     """
-    Return what an investigation found as a Diagnosis.
+    Return the result of an investigation as a Diagnosis, without traces.
 
-    windows, table
-        As in `diagnose`; residuals are drawn over all of these windows.
+    Parameters
+    ----------
+    table : Table
+        The reference.
     found : Investigation
     calibrated : Solution, optional
-        Of a model with everything that was found, whose parameters are told; that of the investigation where not given.
+        Solution of a model with all findings, whose parameters are reported; default: the solution of the investigation.
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
@@ -107,9 +111,7 @@ def told(windows: Sequence[Window], table: Table, found: Investigation, *, calib
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
                      tuple(found.not_testable),
-                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors),
-                     residual_traces(windows, table, baseline, after=solution),
-                     len(found.used), int(np.sum(attempt.locked)))
+                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)))
 
 
 def _rivals(found, question):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.diagnosis.result import Diagnosis
+from imu_calibration.diagnosis.result import Diagnosis, formula_gain
 from imu_calibration.effects.base import SENSORS, UNIT
 
 FORMAT = 'imu_calibration/diagnosis/1'
@@ -18,7 +18,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,
-        'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor]) for sensor in SENSORS},
+        'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked) for sensor in SENSORS},
         'not_testable': list(diagnosis.not_testable),
         'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
         'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
@@ -52,12 +52,12 @@ def _gain(gain):
             'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
 
 
-def _rest(sensor, rest):
+def _rest(sensor, rest, locked):
     unit = rest.unit or UNIT[sensor]
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
             'share': rest.share, 'where': rest.where, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
             'tones': [tone.to_mapping() for tone in rest.tones],
-            'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping()]}
+            'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}
 
 
 def _plain(value):

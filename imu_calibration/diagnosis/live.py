@@ -79,7 +79,7 @@ class DiagnosisQuestion:
             if evidence.found is None:
                 raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
             calibrated = None if evidence.demand.changes.lacking else evidence.solution
-            return Answer(describe(told(evidence.found.used, self.snapshot.table, evidence.found, calibrated=calibrated)), evidence.demand)
+            return Answer(describe(told(self.snapshot.table, evidence.found, calibrated=calibrated)), evidence.demand)
         except ImuCalibrationError as error:
             return Answer(DiagnosisState(WAITING, str(error)))
 

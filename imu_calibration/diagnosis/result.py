@@ -1,10 +1,11 @@
-"""What a diagnosis hands back."""
+"""Result of a diagnosis: findings, candidates, solutions, residuals."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.beyond.unexplained import Unexplained
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
@@ -12,7 +13,7 @@ from imu_calibration.selection.gain import Gain
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """One effect that the model lacked."""
+    """One effect that is missing in the model."""
 
     effect: str
     """Published name."""
@@ -23,26 +24,25 @@ class Finding:
     parameters: dict
     """Parameter name -> (value, sd, unit), SI, from all windows."""
     p_value: float
-    """Chance of such a fall of the misfit by noise, times the number of effects asked about."""
+    """Probability of such a decrease of the misfit from noise, times the number of effects under test."""
     heldout_gain: float
     """Gain of log likelihood on held-out windows, nats."""
     share: float
-    """Share of what was unexplained that it removes from held-out windows."""
+    """Share of the unexplained residual that it removes from held-out windows."""
     gain: Gain
-    """`gain.Gain` on windows that took no part in choosing, of this finding on top of those before it."""
+    """`gain.Gain` on windows held out from the choice, of this finding in addition to the earlier ones."""
     indistinguishable_from: tuple
-    """Effects that this recording cannot tell apart from it, at most two."""
+    """Effects that are collinear with it in this recording, at most two."""
     separating_motion: str
-    """Which motion would tell them apart; empty when there is nothing to tell apart."""
+    """Motion that separates them; empty without such an effect."""
     against: tuple = ()
-    """What its residual is drawn against, as in ``Effect.against``."""
+    """Variables of its residual plot, as in ``Effect.against``."""
     sizes_of_mates: dict = field(default_factory=dict)
     """
-    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: how large this recording would have it in the place of the
-    finding.
+    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: its estimate in the place of the finding.
     """
     implausible: bool = False
-    """Whether its size is beyond what is known of any instrument: it is in no model then."""
+    """Whether its size exceeds the known range of such sensors; it is then in no model."""
 
     @property
     def title(self) -> str:
@@ -52,53 +52,65 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One effect that was asked about."""
+    """One effect under test."""
 
     effect: str
     """Published name."""
     sensor: str
     """'accelerometer', 'gyroscope' or 'reference'."""
     gain_alone: float
-    """Gain of held-out log likelihood on top of the baseline, nats."""
+    """Held-out gain of log likelihood in addition to the baseline, nats."""
     p_value_alone: float
-    """Its p-value there, times the number of effects asked about."""
+    """Its p-value there, times the number of effects under test."""
     gain_beside: float | None
-    """The same on top of the findings; None for a finding."""
+    """The same in addition to the findings; None for a finding."""
     p_value_beside: float | None
     """Its p-value there."""
     verdict: str
-    """'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or why it was refused."""
+    """'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or the reason of a refusal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Everything that a report, a document and a node need."""
+    """Result of a diagnosis for reports, documents and nodes."""
 
     findings: tuple
-    """Findings as found, the strongest first."""
+    """Findings in order of strength."""
     unexplained: dict
-    """Sensor -> `unexplained.Unexplained` beside the findings."""
+    """Sensor -> `unexplained.Unexplained`, in addition to the findings."""
     candidates: tuple
-    """Every effect that was asked about, strongest first (Candidate)."""
+    """Every effect under test (Candidate), in order of strength."""
     not_testable: tuple
-    """{'effect', 'why', 'needs'} of the effects that could not be asked about."""
+    """{'effect', 'why', 'needs'} of the effects without a test."""
     baseline: Solution
-    """Solution of the model that was diagnosed."""
+    """Solution of the baseline model."""
     solution: Any
-    """Solution of the extended model on all windows; the baseline's when nothing was found."""
+    """Solution of the extended model on all windows; the baseline's without findings."""
     gain: Gain | None
-    """`gain.Gain` of all findings together on windows that took no part in choosing; None where by hand nothing was found."""
-    traces: Any
-    """`gain.Traces`: residuals before and after, for plots."""
+    """`gain.Gain` of all findings together on windows held out from the choice; None by hand without findings."""
     windows: int
     """Windows used."""
     locked: int
-    """Windows that took no part in choosing."""
+    """Windows held out from the choice of effects."""
+    traces: Any = None
+    """`traces.Traces`: residuals before and after, for plots; None during a live session."""
 
     @property
     def model(self) -> SensorModel:
         """The extended SensorModel, linearised at the solution."""
         return self.solution.model.at(self.solution.values)
+
+
+def formula_gain(rest: Unexplained, windows: int = 0) -> Gain:
+    """
+    Return the gain of the formula that is proposed for an unexplained residual, in the unit of the sensor.
+
+    ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and `share` the part of its power that the
+    formula removes from the held-out windows, `windows` in number; the interval is that of the share.
+    """
+    low, high = (float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95)
+    after = rest.rms * (1.0 - rest.proposal.reduction)
+    return Gain(rest.proposal.sensor, 'rms beyond noise', rest.rms, after, (low, high), windows)
 
 
 def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, tuple[float, float, str]]:

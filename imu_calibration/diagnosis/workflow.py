@@ -1,4 +1,4 @@
-"""Use cases of diagnosis as plain functions: on a table and by hand; what they find in lines for people."""
+"""Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,8 +18,9 @@ from imu_calibration.calibration.verdict_notes import unsteady
 from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.document import to_mapping
-from imu_calibration.diagnosis.result import Diagnosis
+from imu_calibration.diagnosis.result import Diagnosis, formula_gain
 from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
+from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.lags import total_lags
 from imu_calibration.effects.named_models import BARE
@@ -29,31 +30,31 @@ from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.units import for_people, significant
 
 MUCH = 100.0
-"""Gain of held-out log likelihood from which an effect that is refused is worth a word, nats."""
-WHY_NOT = {LEAVES_MOST: 'leaves most of the rest, so that something else may be the cause of both',
-           DISAGREED: 'the windows do not agree on it: a few carry it, or some speak against it; '
-           'more windows of the same motions would settle it'}
-"""Verdict on what explains much -> why it is not named."""
+"""Held-out gain of log likelihood from which a refused effect is reported, nats."""
+WHY_NOT = {LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
+           DISAGREED: 'the windows do not agree on it: the evidence comes from few windows, or some contradict it; '
+           'record more windows of the same motions'}
+"""Verdict on an effect with a large gain -> reason why it is no finding."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisResult:
-    """A diagnosis with everything that is written and shown."""
+    """A diagnosis with the content of its files and its report."""
 
     diagnosis: Diagnosis
-    """What was found."""
+    """Findings, candidates and unexplained residuals."""
     calibration: Calibration
-    """The extended calibration; the baseline's when nothing was found."""
+    """The extended calibration; that of the baseline without findings."""
     tolerances: np.ndarray
     """Tolerance of each parameter of the extended model."""
     needed: dict[str, tuple[str, float]]
     """As in `CalibrationResult`."""
     observations: str
-    """What the data consist of: 'windows' or 'poses'."""
+    """Unit of the data: 'windows' or 'poses'."""
     options: CalibrationOptions
-    """What was asked for."""
+    """The requested models and settings."""
     proposed: Calibration | None = None
-    """The calibration with the formulas that are proposed for what stays unexplained, where there are any."""
+    """The calibration with the formulas proposed for the unexplained residual; None without a formula."""
 
     @property
     def document(self) -> dict[str, Any]:
@@ -63,21 +64,21 @@ class DiagnosisResult:
 
     @property
     def lines(self) -> list[str]:
-        """What was found, in lines for people."""
+        """The result as lines of text."""
         words = [f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms' for sensor, (value, sd) in self.lags.items()]
-        lag = [f'lag in all, however it is told: {", ".join(words)}'] * bool(words)
+        lag = [f'total lag: {", ".join(words)}'] * bool(words)
         return [*diagnosis_lines(self.diagnosis), *(f'note: {note}' for note in self.notes), *lag]
 
     @property
     def notes(self) -> list[str]:
-        """What is neither a finding nor a rest: a bias that steps, or wanders, on every axis passes for the noise of its sensor."""
+        """Biases that step or wander on every axis: they count as noise of the sensor, not as unexplained residual."""
         quiet = {sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant}
-        return [f'{reason.what}; no effect of the catalogue says why: it steps or wanders'
+        return [f'{reason.what}; no effect of the catalogue explains this step or wander'
                 for reason in unsteady(self.calibration, self.tolerances) if quiet.issuperset(reason.sensors)]
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:
-        """Sensor -> (what its output lags by in all, standard deviation), s: where halves share it out otherwise this repeats."""
+        """Sensor -> (total lag of its output, standard deviation), s; independent of how collinear lag effects share it."""
         found = self.calibration
         return total_lags(found.param_names, found.values, found.covariance)
 
@@ -85,18 +86,18 @@ class DiagnosisResult:
 def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
                        provenance: dict[str, Any] | None = None, progress: Callable | None = None) -> DiagnosisResult:
     """
-    Calibrate a recording, say what the model gets wrong and why, and extend it.
+    Calibrate a recording, identify the errors of the model and their causes, and extend it.
 
     Parameters
     ----------
     source : callable
-        Returns an iterator of SampleBlock, each time anew.
+        Returns a new iterator of SampleBlock at each call.
     table : Table
     options : CalibrationOptions
-        The model to start from; where nothing is asked for, bias and matrix alone, so that everything else has to prove itself.
+        The initial model; default bias and matrix, so that every other effect is tested.
     provenance : dict, optional
     progress : callable, optional
-        Called with the percent done since the last call.
+        Called with the progress since the last call, percent.
 
     Returns
     -------
@@ -112,8 +113,10 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, asking=report, mapper=read)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
-    result, diagnosis = calibrated.result, told(windows, table, calibrated.found, calibrated=calibrated.result.solution)
+    result, diagnosis = calibrated.result, told(table, calibrated.found, calibrated=calibrated.result.solution)
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
+    traces = residual_traces(windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
+    diagnosis = replace(diagnosis, traces=traces)
     if report:
         report(1.0)
     return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
@@ -121,7 +124,7 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
 
 
 def _with_proposals(source, table, options, result, diagnosis, provenance):
-    """Return the calibration of the model that was found with the proposed formulas in it, or None where there are none."""
+    """Return the calibration of the extended model with the proposed formulas, or None without a formula."""
     effects = proposed_effects(diagnosis)
     if not effects:
         return None
@@ -132,7 +135,7 @@ def _with_proposals(source, table, options, result, diagnosis, provenance):
     chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
                      reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
     solution, gathered, gathered_model = solve_recordings([source], table, chosen)
-    # A formula says how the output changes, not where what it stands for is nothing.
+    # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
     unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
     return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
 
@@ -141,14 +144,14 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
                            *,
                            progress: Callable | None = None) -> DiagnosisResult:
     """
-    Calibrate a recording by hand, say what the model gets wrong and why, and extend it (see `diagnosis.by_hand`).
+    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `diagnosis.by_hand`).
 
     Parameters
     ----------
     source : callable
         Returns an iterator of SampleBlock.
     options : CalibrationOptions
-        The model to start from; where nothing is asked for, bias and matrix alone.
+        The initial model; default bias and matrix.
     provenance, progress : optional
         As in `diagnose_recording`.
 
@@ -172,7 +175,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
 
 
 def _percent(advance):
-    """Return a function of the share done that calls `advance` with what was added, in percent."""
+    """Return a function of the share done that calls `advance` with the increment in percent."""
     done = [0.0]
 
     def report(share):
@@ -182,44 +185,53 @@ def _percent(advance):
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return findings, what stays unexplained and what could not be tested, as lines."""
+    """Return the findings, the unexplained residual of each sensor and the effects without a test, as lines."""
     lines = []
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
-            lines.append(f'   this recording cannot tell it from {", ".join(finding.indistinguishable_from)}; '
+            lines.append(f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
                          f'to separate them: {finding.separating_motion}')
-    if not diagnosis.findings:
+    if not diagnosis.findings and not proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
-            with_what = f'; it goes with {rest.correlates_with}' if rest.correlates_with else ''
+            with_what = f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
             lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
                          + (f'; {rest.where}' if rest.where else ''))
-        lines += [f'   {line}' if rest.significant else line for line in beyond_lines(sensor, rest)]
+        lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *formula_lines(sensor, rest))]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
 
 
 def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
-    """Return where a rest sits and what formula it follows, as lines."""
+    """Return the axes, conditions and tones of an unexplained residual, as lines."""
     lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
     lines += [f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)' for regime in rest.regimes]
-    lines += [f'spectrum: {tone.text}' for tone in rest.tones]
-    return lines + ([f'formula: {rest.proposal.sentence}'] if rest.proposal is not None else [])
+    return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
+
+
+def formula_lines(sensor: str, rest: Unexplained) -> list[str]:
+    """Return the formula that an unexplained residual follows and its gain, as lines."""
+    if rest.proposal is None:
+        return []
+    gain = formula_gain(rest)
+    before, low, high = (in_words(gain.heldout_rms_before * factor, sensor) for factor in (1.0, 1.0 - gain.ci95[1], 1.0 - gain.ci95[0]))
+    return [f'formula: {rest.proposal.sentence}', f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
+            'after (95 %)']
 
 
 def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
-    """Return the formulas that a diagnosis proposes, as effects."""
+    """Return the formulas of a diagnosis as effects."""
     return [effect for rest in diagnosis.unexplained.values() if rest.proposal is not None for effect in rest.proposal.effects]
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:
-    """Return why nothing was named: nothing explains more than noise, or what explains much is not sure to be the cause."""
+    """Return the reason for a diagnosis without findings: no effect exceeds noise, or the best one is refused."""
     much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
     if not much:
-        return 'nothing found: no effect of the catalogue explains more than noise does'
+        return 'nothing found: no effect of the catalogue explains more than noise'
     return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
             f'but {WHY_NOT[much[0].verdict]}')
 

@@ -1,14 +1,14 @@
-"""The report of a diagnosis: the finding as a sentence, the plot that convinces, and the evidence on everything that was asked."""
+"""The report of a diagnosis: each finding as a sentence with its figure, and the evidence on every candidate effect."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.diagnosis.result import Diagnosis, Finding
+from imu_calibration.diagnosis.result import Diagnosis, Finding, formula_gain
 from imu_calibration.diagnosis.traces import Traces
-from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines, proposed_effects
-from imu_calibration.effects.base import SENSORS, UNIT
+from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines
+from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
 from imu_calibration.report.page import render
@@ -36,13 +36,15 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     """
     diagnosis = result.diagnosis
     rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
-    word = 'bad' if rests else 'weak' if diagnosis.findings else 'good'
+    word = 'bad' if any(rest.proposal is None for _, rest in rests) else 'weak' if rests or diagnosis.findings else 'good'
     return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests),
                   lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
+                  formulas=[_formula(diagnosis, rest) for rest in diagnosis.unexplained.values() if rest.proposal is not None],
                   traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
                   rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
-                  beyond=[*_beyond(diagnosis), *(f'{_capital(note)}.' for note in result.notes)],
+                  beyond=[f'{_capital(line)}.'
+                          for line in (*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes)],
                   spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
                   not_testable=list(diagnosis.not_testable),
                   groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
@@ -53,32 +55,29 @@ def _capital(line):
     return line[0].upper() + line[1:]
 
 
-def _beyond(diagnosis):
-    """Return where rests sit and what formulas they follow, and what may be done with these."""
-    lines = [_capital(line) + '.' for sensor, rest in diagnosis.unexplained.items() for line in beyond_lines(sensor, rest)]
-    if proposed_effects(diagnosis):
-        lines.append('extended.yaml holds the model with the formula in it; take it where another recording confirms it: check it '
-                     'there, or give it to another diagnosis as the file of effects.')
-    return lines
-
-
 def _headline(diagnosis, rests):
-    count = len(diagnosis.findings)
-    if count == 0:
-        return 'Something is wrong that no effect explains' if rests else 'The model is adequate'
-    found = 'One cause found' if count == 1 else f'{count} causes found'
-    return found + (', and something stays unexplained' if rests else '')
+    count, formulas = len(diagnosis.findings), [rest.proposal for _, rest in rests if rest.proposal is not None]
+    unexplained = 'an unexplained residual remains' if len(formulas) < len(rests) else ''
+    if count == 0 and not formulas:
+        return 'No effect of the catalogue explains the residual' if rests else 'The model is adequate'
+    found = [f'{count} cause{"s" * (count > 1)} found'] * bool(count)
+    found += [f'a formula explains {100 * formula.share:.0f} % of the {formula.sensor} residual' for formula in formulas]
+    return _capital(', and '.join([*found, *[unexplained] * bool(unexplained)]))
 
 
 def _reasons(diagnosis, rests):
     lines = [(in_type(finding.explanation), _next_step(finding)) for finding in diagnosis.findings]
     if not lines and not rests:
-        lines = [(f'No effect of the {len(diagnosis.candidates)} that were asked about explains more than noise does.', '')]
+        lines = [(f'None of the {len(diagnosis.candidates)} effects under test explains more than noise.', '')]
     for sensor, rest in rests:
-        more = f', and it goes with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{in_unit(rest.rms, rest.unit or UNIT[sensor])} rms of the {sensor} are unexplained{more}'
-                      + (f'; {rest.where}' if rest.where else '') + '.',
-                      'look there: a knock, a slip in the fixture, or a cause that the catalogue does not know'))
+        rms = in_unit(rest.rms, rest.unit or UNIT[sensor])
+        if rest.proposal is not None:
+            lines.append((f'{rms} rms of the {sensor} residual match no effect of the catalogue; they follow '
+                          f'{" and ".join(rest.proposal.columns)}.', f'to confirm the formula: {rest.proposal.motion}'))
+            continue
+        more = f', correlated with {rest.correlates_with}' if rest.correlates_with else ''
+        lines.append((f'{rms} rms of the {sensor} residual are unexplained{more}' + (f'; {rest.where}' if rest.where else '') + '.',
+                      'check the mount and the joints for a knock or slip, and causes outside the catalogue'))
     return lines
 
 
@@ -115,18 +114,33 @@ def _reduction(gain):
 def _finding(diagnosis, finding, number):
     rows = [{'name': name, 'cells': people(value, sd, unit, quantity=name), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
             for name, (value, sd, unit) in finding.parameters.items()]
-    gain = finding.gain
     return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows,
-            'p': chance(finding.p_value), 'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]),
-            'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]), 'reduction': _reduction(gain), 'sensor': gain.sensor,
-            'measure': gain.measure, 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
+            'p': chance(finding.p_value), **_gained(finding.gain), 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
             'motion': finding.separating_motion, 'implausible': finding.implausible, 'figure': draw_finding(diagnosis, finding, number)}
+
+
+def _gained(gain):
+    return {'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]),
+            'reduction': _reduction(gain), 'sensor': gain.sensor, 'measure': gain.measure}
+
+
+def _formula(diagnosis, rest):
+    """Return the formula of an unexplained residual with its gain, curve, values and recommended motion."""
+    proposal = rest.proposal
+    rows = [{'name': f'{effect.name}.{axis}', 'cells': people(value, sd, effect.unit_of(k)), 'sigma': text(abs(value) / sd, 2)}
+            for effect, values, sds in zip(proposal.effects, proposal.values, proposal.sds)
+            for k, (axis, value, sd) in enumerate(zip(AXES, values, sds))]
+    against = tuple(kind for effect in proposal.effects for kind in effect.against)
+    return {'title': ' and '.join(proposal.columns), 'sentence': f'{_capital(in_type(proposal.sentence))}.', 'rows': rows,
+            'p': chance(proposal.p_value), **_gained(formula_gain(rest)), 'motion': proposal.motion,
+            'figure': draw(f'formula-{proposal.sensor}', (8.6, 3.1), _AgainstCause(diagnosis, proposal.sensor, against),
+                           label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')}
 
 
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> str:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis, finding), label=label)
+    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis, finding.gain.sensor, finding.against), label=label)
 
 
 def draw_over_time(result: DiagnosisResult) -> str:
@@ -158,30 +172,30 @@ def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
     return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
 
 
-def cause_of(diagnosis: Diagnosis, finding: Finding) -> tuple[str, int, str, np.ndarray | None]:
-    """Return (sensor, axis, label, values): what the residual of a finding is drawn against, and for which component."""
-    sensor, traces = finding.gain.sensor, diagnosis.traces
+def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple[int, str, np.ndarray]:
+    """Return (axis, label, values): the axis of a sensor that changes most, and the variable of some kinds that its change follows."""
+    traces = diagnosis.traces
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
-    kinds = finding.against if len(signal) >= FEW else ()  # a mean over bins of few poses says nothing
+    kinds = against if len(signal) >= FEW else ()   # bins of few poses have no useful means
     best = max(((explained_share(values, signal[:, axis]), label, values)
                 for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
-    if best[0] < CLEAR:
+    if best[2] is None or best[0] < CLEAR:
         factor, unit = for_people(UNIT[sensor])
-        return sensor, axis, f'what the effect predicts, {unit}', signal[:, axis] * factor
-    return sensor, axis, best[1], best[2]
+        return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor
+    return axis, best[1], best[2]
 
 
 class _AgainstCause:
     """Two panels with one scale: before with the fitted curve, and after."""
 
-    def __init__(self, diagnosis, finding):
-        self.diagnosis, self.finding = diagnosis, finding
+    def __init__(self, diagnosis, sensor, against):
+        self.diagnosis, self.sensor, self.against = diagnosis, sensor, against
 
     def __call__(self, figure):
-        traces = self.diagnosis.traces
-        sensor, axis, label, values = cause_of(self.diagnosis, self.finding)
+        traces, sensor = self.diagnosis.traces, self.sensor
+        axis, label, values = cause_of(self.diagnosis, sensor, self.against)
         factor, unit = for_people(UNIT[sensor])
         before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
         left, right = figure.subplots(1, 2, sharey=True)

@@ -268,7 +268,7 @@ def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
 
 def test_what_stays_unexplained_is_said(station):
     evidence = station.live.last.evidence()
-    diagnosis = told(evidence.found.used, station.live.table, evidence.found)
+    diagnosis = told(station.live.table, evidence.found)
     rest = {sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3) for sensor, found in diagnosis.unexplained.items()}
     state = describe(replace(diagnosis, findings=(), unexplained=rest))
     assert state.word == 'unexplained' and state.message.startswith('unexplained: ') and 'gyroscope' in state.message

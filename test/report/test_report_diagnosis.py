@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.beyond.proposals import Proposal
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.term import term
 from imu_calibration.reference.table import Table
 from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, explained_share, variables
 from imu_calibration.samples import SampleBlock
@@ -52,8 +54,8 @@ def test_the_finding_is_told_drawn_and_measured(result):
 
 def test_it_is_drawn_against_its_cause(result):
     finding = result.diagnosis.findings[0]
-    sensor, _, label, _ = cause_of(result.diagnosis, finding)
-    assert sensor == 'gyroscope' and label.startswith('specific force')
+    assert finding.gain.sensor == 'gyroscope'
+    assert cause_of(result.diagnosis, finding.gain.sensor, finding.against)[1].startswith('specific force')
 
 
 def test_a_joint_goes_by_its_name(result):
@@ -81,3 +83,30 @@ def test_the_share_that_a_variable_explains_is_one_for_its_function_and_none_for
 def test_chances_that_underflow_are_not_printed_as_nothing():
     assert chance(0.0) == 'below 10⁻⁹⁹'
     assert chance(0.02) == '0.020'
+
+
+@pytest.fixture(scope='module')
+def of_formula(result):
+    """The same result with an unexplained residual of gyroscope y that follows a formula, and no finding."""
+    effect = term('gyro_proposed_1', sensor='gyroscope', column='w_z ** 3', unit='rad/s/(rad/s)^3', tolerance=1e-5, text='A formula.')
+    proposal = Proposal('gyroscope', (effect,), (np.array([0.0, 2e-4, 0.0]),), (np.full(3, 3e-6),), frozenset({'rate'}), ('y',), 0.96,
+                        (0.91, 0.99), 0.8, 1e-30, ('w_z',), ('gyro_quadratic', 0.4), 'turn about two axes')
+    diagnosis = result.diagnosis
+    rest = replace(diagnosis.unexplained['gyroscope'], significant=True, rms=5e-4, axes=('y',), proposal=proposal)
+    return replace(result, diagnosis=replace(diagnosis, findings=(), unexplained={**diagnosis.unexplained, 'gyroscope': rest}))
+
+
+def test_the_headline_of_a_formula_states_its_share(of_formula):
+    page = diagnosis_report(of_formula)
+    assert '<p class="word">A formula explains 96 % of the gyroscope residual</p>' in page
+    assert 'section id="formulas"' in page and 'Recommended motion: turn about two axes.' in page
+    assert not any('nothing found' in line for line in of_formula.lines)
+
+
+def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
+    """``after = before sqrt(1 - share)``, and the interval of the reduction from that of the share."""
+    gain = of_formula.document['unexplained']['gyroscope']['proposals'][0]['gain']
+    assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(5e-4 * 0.2, rel=1e-12)
+    assert gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12) and gain['windows'] == of_formula.diagnosis.locked
+    line = next(line for line in of_formula.lines if 'gain of the formula' in line)
+    assert '0.0286 deg/s before, 0.00286 deg/s to 0.00859 deg/s after' in line

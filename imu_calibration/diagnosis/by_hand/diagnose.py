@@ -56,4 +56,4 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     count = len(found.baseline.poses.start)
     return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},
                      candidates_of(inquiry.search, named),
-                     tuple(found.not_testable), before, after, gain, traces_of(found.baseline, hand), count, count if named else 0)
+                     tuple(found.not_testable), before, after, gain, count, count if named else 0, traces_of(found.baseline, hand))
