@@ -1,13 +1,15 @@
-"""``imu_calibration simulate``: a bag of a simulated session, with the true parameters."""
+"""``imu_calibration simulate``: a bag of a simulated session or of a replayed recording, with the true parameters."""
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
+from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 
-EXAMPLES = ('--output session --seed 1', '--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session')
+EXAMPLES = ('--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session',
+            '--replay recording --calibration result/calibration.yaml --table table.yaml --output simulated')
 NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
          'stamp_jitter_us', 'temperature', 'catalogue')
 """Options that are arguments of `simulate` by the same name."""
@@ -18,6 +20,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common, expert = parser.common.add_argument, parser.expert.add_argument
     common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
     common('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
+    common('--replay', metavar='BAG', help='simulate the IMU of --calibration on the joints, stamps, temperature and noise of a recording')
     common('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
     expert('--size', type=float, default=0.3,
            help='size of added effects as a share of the largest plausible one, default 0.3')
@@ -34,17 +37,26 @@ def add_arguments(parser: OneLineParser) -> None:
            help='standard deviation of the IMU stamps, microseconds, default none')
     expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
     add_stand_arguments(parser, 'default a three-axis table')
+    add_topic_arguments(parser)
     expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
     expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
 def run(options: Namespace) -> VerbResult:
     """Simulate and write."""
-    from imu_calibration.use_cases.simulate import simulate
-    made = simulate(options.profile, effects=options.effect, table=stand_of(options), **{name: getattr(options, name) for name in NAMES})
+    from imu_calibration.use_cases.simulate import replay, simulate
+    if options.replay is None:
+        made = simulate(options.profile, effects=options.effect, table=stand_of(options),
+                        **{name: getattr(options, name) for name in NAMES})
+    else:
+        if options.calibration is None:
+            raise InputError('--replay requires the IMU to simulate, no calibration was given; add --calibration FILE', key='calibration',
+                             code='replay_without_calibration')
+        made = replay(options.replay, options.calibration, stand_of(options), seed=options.seed,
+                      **{name: getattr(options, name) for name in ('imu_topic', 'joint_topic', 'temperature_topic')})
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
     print(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, {len(samples.joints or ())} JointState), '
-          'with truth.yaml and table.yaml')
+          'with truth.yaml and table.yaml' + f'; {made.lost} samples without known joints left out' * bool(made.lost))
     return VerbResult(0, {'output': str(options.output), 'seconds': made.duration, 'imu': len(samples.imu or ()),
-                       'joints': len(samples.joints or ())})
+                       'joints': len(samples.joints or ()), 'lost': made.lost})

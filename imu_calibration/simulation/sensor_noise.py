@@ -88,7 +88,7 @@ def realistic(grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG
     return replace(GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter)
 
 
-def gauss_markov(standard_deviation: float, correlation_time: float, step: float, *, shape: tuple[int, ...],
+def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float, step: float, *, shape: tuple[int, ...],
                  rng: np.random.Generator) -> np.ndarray:
     """
     Return a stationary first-order Gauss-Markov process along the first axis of `shape`.

@@ -1,11 +1,11 @@
-"""From a profile of motions to a session of a simulated IMU: in memory, or as a bag with the truth beside its data."""
+"""Sessions of a simulated IMU on a motion profile or on the motion of a recording, in memory or as a bag with the true parameters."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import cast
+from typing import Unpack, cast
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from imu_calibration import documents, files
 from imu_calibration.calibration.decision import BY_DEFINITION
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
@@ -21,10 +22,13 @@ from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.replay import BIAS_TIME, ReplayNoise
+from imu_calibration.simulation.replay import replay as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
 from imu_calibration.simulation.session import simulate as run_session
-from imu_calibration.use_cases.choices import catalogue_of
+from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
+from imu_calibration.use_cases.recordings import name_of, source_of
 from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 
@@ -33,13 +37,15 @@ class Simulated:
     """A session of a simulated IMU on a table."""
 
     samples: SampleBlock
-    """What an IMU, the joints and perhaps a thermometer gave: can be calibrated, compensated and diagnosed as it is."""
+    """Samples of the IMU, the joints and, with thermal effects, the temperature."""
     table: Table
-    """The table as its description says."""
+    """The table as described."""
     truth: Calibration
     """The true parameters."""
     duration: float
     """Length, s."""
+    lost: int = 0
+    """Samples of a replayed recording without known motion, which are left out."""
 
     def save(self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none') -> None:
         """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
@@ -107,6 +113,48 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
                         {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
                         provenance={'simulated': {'seed': seed, 'profile': profile}}, **BY_DEFINITION)
     return Simulated(samples, mover, truth, motion.duration)
+
+
+def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike | Calibration, table: Stand | None, *, seed: int = 0,
+           **choices: Unpack[Choices]) -> Simulated:
+    """
+    Simulate a calibrated IMU on the motion of a recording: its joints, stamps, rates, temperature and identified noise.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+        Provides joints, stamps and temperature.
+    calibration : path-like or Calibration
+        The simulated IMU and its noise; without noise in it, the noise at rest of the recording.
+    table : path-like, Table or Arm
+        The reference.
+    seed : int
+        Of the noise.
+    choices
+        See `Choices`; those of the topics and the gravity count.
+
+    Raises
+    ------
+    InputError
+        When the table is missing or is not that of the calibration, or no sample has a known motion.
+
+    """
+    check_names(choices)
+    if table is None:
+        raise InputError('a replay requires the motion of the IMU, no table or arm was given; give --table or --urdf (by hand, turns are '
+                         'known from the gyroscope alone)', key='table', code='replay_by_hand')
+    topics = topics_of(choices)
+    given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
+    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    model, values = _truth(given, known, '', seed, None)
+    noise = None
+    if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
+        noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
+                 for sensor in SENSORS}
+    samples, lost = run_replay(source_of(recording, topics, given.joint_names)(), given, model, values=values, noise=noise, seed=seed)
+    truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
+    stamps = cast(ImuSamples, samples.imu).stamp_ns
+    return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)
 
 
 def _truth(table, calibration, grade, seed, catalogue):
