@@ -99,7 +99,7 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
     frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
     joints, temperature = (_joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature'))
     lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
-    return SampleBlock(ImuSamples(stamps, *readings, frame), joints, temperature), lost
+    return SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature), lost
 
 
 def _joined(parts):
