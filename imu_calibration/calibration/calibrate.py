@@ -163,5 +163,5 @@ def _by_default(model, options):
 
 
 def _size_effect_unseen(solution):
-    part = solution.model.part('accelerometer', Role.ARMS)
-    return part.stop > part.start and bool(solution.held[part].all())
+    arms, arm = (solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM))
+    return len(arms) > 0 and bool(arms.all() and arm.all())   # an arm that is seen would bias the bias if left out

@@ -15,6 +15,7 @@ AT_REST = 0.7
 """An error at rest of this share of the whole comes from the bias."""
 DELAY_SHARE = 0.1
 """A delay is named as a cause where it explains this share of the residual."""
+ONE_ATTITUDE = '; unproven for other attitudes, because all held-out windows have the same attitude'
 NO_PROOF = 'its error on held-out data was not measured'
 
 
@@ -24,7 +25,7 @@ class SensorDecision(StrEnum):
     HELPS = 'helps'
     """The 95 % interval of error after / error before lies below 1."""
     UNPROVEN = 'unproven'
-    """The interval includes 1, or there is none."""
+    """The interval includes 1, there is none, or the held-out windows of the accelerometer have one attitude."""
     HARMS = 'harms'
     """The interval lies above 1."""
 
@@ -38,7 +39,7 @@ _CAUTION = (HELPS, UNPROVEN, HARMS)
 
 def decide(entry: Mapping | None) -> SensorDecision:
     """Return the decision on a sensor from its entry of a proof (`proof.prove`), or from None."""
-    if not entry or not entry['windows']:
+    if not entry or not entry['windows'] or entry.get('one_attitude'):
         return UNPROVEN
     low, high = entry['ci95']
     return HELPS if high < 1.0 else HARMS if low > 1.0 else UNPROVEN
@@ -61,7 +62,7 @@ def reason_of(entry: Mapping | None) -> str:
         return NO_PROOF
     earlier = entry.get('earlier')
     more = f', {_error(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
-    cause = '' if decide(entry) is HELPS else _cause(entry)
+    cause = ONE_ATTITUDE if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
     return (f'error {_error(entry["before"], entry["unit"])} to {_error(entry["after"], entry["unit"])} on held-out data '
             f'({entry["windows"]} windows, {_ratio(entry)}){more}{cause}')
 

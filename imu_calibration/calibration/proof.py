@@ -17,6 +17,7 @@ from imu_calibration.effects.applied import Centre, applied_values
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.attitudes import one_attitude
 from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
@@ -65,7 +66,10 @@ def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: Sensor
     nominal = nominal_values(model)
     folds = [applied_values(model, values, centre) for values in dealt.values_without(solution)]
     described = [_with_reference(model, values, nominal) for values in folds]
-    return prove(model, before=(dealt, ([nominal], [_with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
+    proof = prove(model, before=(dealt, ([nominal], [_with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
+    if proof and one_attitude([block.accumulator for block in dealt.blocks], model):
+        proof['accelerometer']['one_attitude'] = True
+    return proof
 
 
 def prove_readings(before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray) -> dict:

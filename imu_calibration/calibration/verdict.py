@@ -123,8 +123,9 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
 
 
 def _decided(calibration, sensor, word):
-    step = '' if word is HELPS else ("run 'imu_calibration diagnose' to find the cause" if calibration.proof.get(sensor)
-                                     else 'record more windows, or hold it still in more attitudes')
+    entry = calibration.proof.get(sensor) or {'one_attitude': True}
+    step = '' if word is HELPS else ('record more windows, or hold it still in more attitudes' if entry.get('one_attitude')
+                                     else "run 'imu_calibration diagnose' to find the cause")
     return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, sensors=(sensor,))
 
 

@@ -4,9 +4,10 @@ import numpy as np
 
 from imu_calibration.calibration.decision import worse_regimes
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet
+from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet, rested
 from imu_calibration.calibration.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS, UNIT, Role
+from imu_calibration.segmentation.window import UnusedReason
 from imu_calibration.units import for_people, significant
 
 LOST_SHARE = 0.05
@@ -16,13 +17,26 @@ LOST_SHARE = 0.05
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return the notes; arguments as in `verdict.judge`."""
     remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    return (_worse(calibration) + remaining + _adopted(calibration) + _loose(calibration) + unsteady(calibration, tolerances)
-            + _left_out(calibration) + _lost(calibration))
+    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration) + _loose(calibration)
+            + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
 
 
 def _worse(calibration):
     return [Reason(WARNING, f'{sensor}: {line}', "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
             for sensor, entry in calibration.proof.items() for line in worse_regimes(entry)]
+
+
+def _unused_rests(calibration):
+    """Return a warning about rests without any static window: noise and sds are then estimated from motion alone."""
+    counts = calibration.statistics.get('stream') or {}
+    unused = {reason: counts.get(reason, 0) for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)}
+    total, used = sum(unused.values()), sum((calibration.statistics.get('samples_used') or {}).values())
+    if rested(calibration) or total <= LOST_SHARE * used:
+        return []
+    return [Reason(WARNING, f'the recording has {total} samples at rest, but no static window is used '
+                   f'({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}): noise and bias changes '
+                   'come from motion alone, and the standard deviations of the biases may be too small',
+                   'reduce static_minimum, or increase quiet_ratio', key='setting')]
 
 
 def _adopted(calibration):

@@ -8,6 +8,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.attitudes import not_separable
 from imu_calibration.estimation.contradicted import contradicted
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
 from imu_calibration.estimation.model_error import model_error
@@ -77,7 +78,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
             values, noises = _with_noise(system, values, smaller, free)
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
-    held = _undetermined(system, values, factors, free)
+    held = _undetermined(system, values, factors, free) | not_separable(accumulator, model)
     _refuse(held | ~free, held, model, allow_holding)
     not_believed: dict[str, float] = {}
     while True:

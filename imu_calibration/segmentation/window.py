@@ -31,6 +31,7 @@ class UnusedReason(StrEnum):
     NOT_QUIET = 'not quiet'
     TURN_ON = 'turn-on'
     TOO_SHORT = 'too short'
+    REST_TOO_SHORT = 'rest too short'
 
 
 @dataclass(frozen=True, eq=False)

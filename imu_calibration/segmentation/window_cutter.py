@@ -10,7 +10,7 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 _KINDS, _REASONS = tuple(WindowKind), tuple(UnusedReason)
 UNUSED, STATIC, SPIN, DYNAMIC = range(len(_KINDS))
-_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT = range(1, len(_REASONS))
+_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(1, len(_REASONS))
 _LEAST_SAMPLES = 5
 
 
@@ -154,7 +154,7 @@ class WindowCutter:
         n = len(samples)
         length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
         if length < self._least(kind) or (kind != UNUSED and n < _LEAST_SAMPLES):
-            kind, reason = UNUSED, _TOO_SHORT
+            kind, reason = UNUSED, _REST_TOO_SHORT if kind == STATIC else _TOO_SHORT
         key = _REASONS[reason] if kind == UNUSED else _KINDS[kind]
         self.counts[key] = self.counts.get(key, 0) + n
         if kind == UNUSED and not self._keep_unused:
@@ -180,7 +180,7 @@ def _between_motion(k, before, original, after_gap, stop):
 
 
 ACCEPTED = (*_KINDS[1:], *_REASONS[1:], 'edge of joints')
-"""Counts of samples that arrived whole; the last five are kept out of windows on purpose."""
+"""Counts of samples that arrived whole; the last six are excluded from windows on purpose."""
 
 
 def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int]:

@@ -59,7 +59,8 @@ class MotionGatherer:
         """
         Return reason -> number of samples.
 
-        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short': accepted, but in no window.
+        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short', 'rest too short': accepted, but in
+        no window.
         'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
         'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What blocks report as dropped is not in here.
         """

@@ -9,7 +9,7 @@ import imu_calibration as imu
 from imu_calibration import files
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.decision import HARMS as HARMFUL
-from imu_calibration.calibration.decision import HELPS
+from imu_calibration.calibration.decision import HELPS, UNPROVEN
 from imu_calibration.calibration.document import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.cli.main import main
@@ -131,7 +131,7 @@ def test_check_says_which_sensor_it_helps(yaw, block):
 
 @pytest.mark.real_data
 def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
-    """A vertical shaft: the accelerometer's values would be worse than none, those of the gyroscope halve its error, and all that is used helps."""
+    """A vertical shaft: the accelerometer, unproven at other attitudes, doubled its error with a free matrix and reduces it with a fixed one."""
     folder = recordings / 'shaft_yaw_slow_later'
     table = files.read_table(folder / 'table.yaml')
     with open_recording(folder) as recording:
@@ -141,10 +141,10 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     middle = int(whole[0].stamp_ns[len(whole[0]) // 2])
     first, second = (SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole)) for early in (True, False))
     found = imu.calibrate(first, table)
-    assert found.calibration.decisions['gyroscope'] is HELPS and found.calibration.decisions['accelerometer'] is not HELPS and found.exit_code == 3
+    assert found.calibration.decisions['gyroscope'] is HELPS and found.calibration.decisions['accelerometer'] is UNPROVEN and found.exit_code == 3
     used = trust.usable(replace(found.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}))
     here = imu.check(second, found.calibration, table)
-    assert list(here.result.helped) == ['gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+    assert list(here.result.helped) == ['accelerometer', 'gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
     left = imu.check(second, used.calibration, table).proof
     assert left['accelerometer']['after'] == pytest.approx(left['accelerometer']['before'], rel=0.02)
     assert left['gyroscope']['after'] == pytest.approx(here.proof['gyroscope']['after'], rel=0.02)

@@ -45,7 +45,7 @@ def used(document):
     """Return how many samples came through."""
     return sum(document['statistics']['samples_used'].values()) + sum(
         count for reason,
-        count in document['statistics']['stream'].items() if reason in ('settling', 'not quiet', 'too short', 'edge of joints'))
+        count in document['statistics']['stream'].items() if reason in ('settling', 'not quiet', 'too short', 'rest too short', 'edge of joints'))
 
 
 def errors(document):

@@ -115,7 +115,7 @@ def test_every_kind_is_found_where_it_is(name):
     dynamic = of_kind(windows, 'dynamic')
     for low, high in moving:
         assert covered(dynamic, low, high) > high - low - 0.5 - 2 * edge
-    assert set(counts) <= {'static', 'spin', 'dynamic', 'settling', 'not quiet', 'too short'}
+    assert set(counts) <= {'static', 'spin', 'dynamic', 'settling', 'not quiet', 'too short', 'rest too short'}
     check_motion(windows, profile, *limits)
 
 
