@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from imu_calibration.by_hand.outliers import possible_turns, without_outliers
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.by_hand.solver import first_state, solve_joint
 from imu_calibration.by_hand.turns import collect_turns, known_turn_data, sample_times
+from imu_calibration.calibration.linearisation import at_time_constants
 from imu_calibration.calibration.status import DETERMINED, HELD, statuses
-from imu_calibration.effects.base import Role
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
@@ -212,8 +213,14 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
     left = {'contradicted by gravity': contradicted} if contradicted else {}
+    solved = partial(solve_joint, gravity_sd=options.gravity_sd, fallback=fallback)
+    for effect in model.extras:
+        if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
+            trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
+            scatter = [solved(trial, poses, turns).scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
+            model = trials[int(np.argmin(scatter))]
     for _ in range(PASSES):
-        found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
+        found = solved(model, poses, turns)
         settled, model = _settled(model, found), model.at(found.state.values)
         poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
         left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
@@ -222,7 +229,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     movements = bias_movements(model, found.state.values, poses)
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
-        found = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd, fallback=fallback)
+        found = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # as they are: what was left out, or moved, is for everybody to see
     goals = model.tolerances(options.tolerances)

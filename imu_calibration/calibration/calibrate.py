@@ -9,7 +9,7 @@ from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.from_solution import document, motions_needed, with_gravity_uncertainty, with_weak_replaced
 from imu_calibration.calibration.gathered import Gathered, join
-from imu_calibration.calibration.linearisation import PASSES, linearise_again
+from imu_calibration.calibration.linearisation import PASSES, at_time_constants, linearise_again
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.calibration.proof import prove_solution
@@ -78,18 +78,35 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
     model = choose_model(options, table)
     if model.needs_temperature:
         model = model.with_reference_temperature(_first_temperature(sources))
-    again, judged_from = model, 0.0
-    for _ in range(PASSES):
-        model = again
+
+    def solved(model, judged_from):
         step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress, judged_from)
         gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
         report('solving')
-        solution = solve_gathered(gathered, model, options)
+        return solve_gathered(gathered, model, options), gathered
+
+    again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
+    for _ in range(PASSES):
+        model = again
+        solution, gathered = solved(model, judged_from)
         again, last_third = linearise_again(model, solution), judged_from_of(solution.model, gathered)
         if again is None and judged_from == last_third:
             break
         again, judged_from = again or model, last_third
     return solution, gathered, model
+
+
+def _at_time_constants(model, options, solved):
+    """
+    Return the model with the columns of requested warm-ups at the time constant with the smallest residuals of window means.
+
+    The iteration from the prior does not converge to a time constant that is several times shorter.
+    """
+    for effect in model.effects:
+        if effect.time_constant and effect.name not in options.point:
+            duration = end_of(solved(model)[1].accumulator)
+            model = min(at_time_constants(model, effect, duration), key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1])
+    return model
 
 
 def judged_from_of(model: SensorModel, gathered: Gathered) -> float:

@@ -1,7 +1,10 @@
 """Whether a solution lies too far from where its columns were taken, and where they should be taken instead."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 
@@ -9,6 +12,8 @@ PASSES = 6
 """Passes over a recording at most, when effects have to be linearised anew."""
 
 
+STARTS = 6
+"""Time constants from which the iteration starts, a factor of 2.3 apart: it converges from a start within this factor."""
 LINEAR_STEPS = 25
 """Steps of a numerical derivative (5 ms of a delay) over which a linearisation is believed in directions that are hardly seen."""
 
@@ -16,6 +21,12 @@ LINEAR_STEPS = 25
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
     """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
     return model.at(model.start_from(solution.model, _cautious(solution))) if _needs_another_pass(model, solution) else None
+
+
+def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
+    """Return the model with the columns of a warm-up at each of several time constants that a recording of `duration` s can show."""
+    return [replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
+            for constant in np.geomspace(max(duration / 30, 5.0), 2 * duration, STARTS)]
 
 
 def _cautious(solution):
