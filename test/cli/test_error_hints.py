@@ -37,8 +37,9 @@ def test_no_text_of_the_core_names_an_option_of_the_command_line():
 
 
 def test_every_key_is_known_and_every_known_one_is_used():
-    used = {node.value.value for _, tree in core() for node in ast.walk(tree)
-            if isinstance(node, ast.keyword) and node.arg == 'key' and isinstance(node.value, ast.Constant)}
+    used = {value.value for _, tree in core() for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == 'key'
+            for value in ([node.value.body, node.value.orelse] if isinstance(node.value, ast.IfExp) else [node.value])
+            if isinstance(value, ast.Constant) and value.value is not None}
     from msg_adapters.bag import KEYS as topics
     assert used | set(topics.values()) == set(KEYS)
 
