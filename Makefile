@@ -37,15 +37,15 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 3
 
-.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek clean
+.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, clean'
+	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
 
 setup: $(STAMP)
 
-$(STAMP): $(filter-out $(addprefix constraints/,validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
+$(STAMP): $(filter-out $(addprefix constraints/,docs.txt validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -133,6 +133,16 @@ fuzz: $(STAMP)
 hide-and-seek: $(STAMP)
 	@$(PY) test/worlds/hide_and_seek.py
 
+# The pages as a searchable site for a browser without a network; warnings and requests to other hosts are errors.
+docs: .venv-docs/.installed
+	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet
+	@echo 'written: site/index.html'
+
+.venv-docs/.installed: constraints/docs.txt
+	@$(PYTHON) -m venv .venv-docs
+	@.venv-docs/bin/python -m pip --disable-pip-version-check --no-input install --quiet --requirement $<
+	@touch $@
+
 clean:
-	rm -rf build install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info
+	rm -rf site build install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
