@@ -9,16 +9,15 @@ from imu_calibration.exports.target import Target
 HEAD = """\
 # Into other programs, and back
 
-Written by `make answers` from the records in `imu_calibration/exports/targets/`, one a program; why they are as they are stands in
-[decisions/exports.md](decisions/exports.md). `imu_calibration export` writes, `imu_calibration import` reads. N is the density of white
-noise, K that of the random walk, both in continuous time as in noise.yaml; `rate` is the rate at which the program gets the readings.
+`imu_calibration export` writes these formats, `imu_calibration import` reads them; `make answers` writes this page
+([decision](decisions/exports.md)). N is the density of white noise, K that of the random walk, in continuous time as in noise.yaml;
+`rate` is the sampling rate of the program.
 
-What a program cannot hold is lost: the effect, what it makes in the readings, and the error that remains once the program has used all
-it has, stand in each file and on the terminal. The error is measured with the formula below on the recording that is given, or on a
-standard motion. The tests apply the same formulas, written a second time from the sources named here, to random calibrations: they give
-our compensation to 1e-12 where nothing is lost and the announced error elsewhere.
+Effects that a program cannot hold are lost: file and terminal state each with its size in the readings and the remaining error, measured
+with the formula below on the given recording or a standard motion. Tests apply the same formulas, written again from the sources, to
+random calibrations.
 
-| name | what it is | of the calibration it holds | it estimates by itself | noise | can be read back |
+| name | format | held parts of the calibration | estimated by the program | noise | import |
 | --- | --- | --- | --- | --- | --- |
 """
 

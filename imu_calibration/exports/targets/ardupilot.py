@@ -110,4 +110,4 @@ TARGETS = (Target(
     source='ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp',
     holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers, corrected=corrected,
     write=write, read=read, imu=imu, back=forward_right_down, ignored=ignored,
-    hint='of the first IMU; the readings must be those before any calibration, in the axes of the vehicle'),)
+    hint='of the first IMU; the readings must be uncalibrated, in the axes of the vehicle'),)

@@ -111,4 +111,4 @@ TARGETS = (Target(
     holds=MATRICES + G_SENSITIVITY + ARMS, estimates=SLOW_OFFSETS, placement=accelerometer_lower_at_x, numbers=numbers, corrected=corrected,
     noise=noise, noise_is='continuous: N in m/s^2/sqrt(Hz), rad/s/sqrt(Hz), K in m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz)',
     write=write, read=read, imu=imu, back=at_the_mean, axes='accelerometer_lower_triangular',
-    hint='Kalibr reads the topic, the rate and the noise, and estimates the rest anew; its intrinsics stand here as it would write them'),)
+    hint='Kalibr reads the topic, the rate and the noise, and estimates all other values; its intrinsics have the format of its output'),)

@@ -108,4 +108,4 @@ TARGETS = (Target(
     holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers, corrected=corrected,
     write=write, read=read, imu=imu, back=forward_right_down, ignored=ignored,
     hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 takes no notice;'
-         ' the readings must be those before any calibration'),)
+         ' the readings must be uncalibrated'),)
