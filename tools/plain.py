@@ -15,7 +15,7 @@ import re
 import sys
 import tokenize
 
-MOST = 49.7
+MOST = 36.0
 """Markers per 1,000 words of the whole product; lower it whenever the rate has fallen, never raise it."""
 MARKERS = set("""
 what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone else others those
