@@ -11,7 +11,8 @@ from difflib import get_close_matches
 KEYS = {
     'allow_xacro': 'permission to run a .xacro file',
     'anyway': 'consent to use an unproven calibration', 'calibration': 'the calibration document',
-    'columns': 'the columns of a text log', 'force': 'consent to overwrite another result', 'gravity': 'the local gravity',
+    'columns': 'the columns of a text log', 'force': 'consent to overwrite another result', 'frame_id': 'the frame of the IMU',
+    'gravity': 'the local gravity',
     'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
     'setting': 'how windows are found', 'table': 'the description of the table', 'target_frame': 'the frame to move readings to',

@@ -9,7 +9,7 @@ from imu_calibration.errors import InputError, did_you_mean, shortened
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.csv_bag import CsvBag
 from msg_adapters.csv_log import SUFFIXES, is_csv
-from msg_adapters.decode import Decoder, JointDecoder, taken_counts
+from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, ImuDecoder, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
@@ -39,7 +39,7 @@ class Topic:
 
 def open_recording(path: str | PathLike[str], imu_topic: str | None = None, joint_topic: str | None = None, *,
                    temperature_topic: str | None = None, want_joints: bool | str = True,
-                   want_temperature: bool | str = True) -> 'Recording':
+                   want_temperature: bool | str = True, frame_id: str | None = None) -> 'Recording':
     """
     Open a bag and choose its topics: the one that is named, else the default name, else the only one of the type.
 
@@ -53,6 +53,8 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
         True: refuse a recording without JointState; 'optional': go on without where there is none, or no telling which.
     want_temperature : bool or 'optional'
         Whether to read temperatures when the recording has them; 'optional': go on without where there is no telling which.
+    frame_id : str, optional
+        Frame of the Imu messages that are read; needed for a topic with messages of several frames.
 
     Returns
     -------
@@ -77,18 +79,18 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
     except BaseException:
         source.close()
         raise
-    return Recording(path, source, topics, imu_topic=imu, joint_topic=joints, temperature_topic=temperature)
+    return Recording(path, source, topics, imu_topic=imu, joint_topic=joints, temperature_topic=temperature, frame_id=frame_id)
 
 
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 
     def __init__(self, path: Path, source: BagSource, topics: tuple[Topic, ...], *, imu_topic: str, joint_topic: str | None,
-                 temperature_topic: str | None):
+                 temperature_topic: str | None, frame_id: str | None = None):
         self.path = path
         self.topics = topics
         self.imu_topic, self.joint_topic, self.temperature_topic = imu_topic, joint_topic, temperature_topic
-        self.source = source
+        self.source, self.frame_id = source, frame_id
 
     @property
     def message_counts(self) -> dict[str, int]:
@@ -146,6 +148,7 @@ class Recording:
                 parts, n_samples = {}, 0
         if self.joint_topic:
             decoders[self.joint_topic].check()
+        decoders[self.imu_topic].choice.check()
         last = _block(parts, decoders)
         if parts or last.dropped:
             yield last
@@ -158,9 +161,21 @@ class Recording:
             deserialize = None if standard else self.deserializer(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
+            elif message_type == IMU_TYPE:
+                decoders[topic] = ImuDecoder(FrameChoice(topic, self.frame_id), deserialize)
             else:
                 decoders[topic] = Decoder(message_type, deserialize)
         return decoders
+
+    def frames(self) -> list[str]:
+        """Return the frames of the first stretch of the Imu topic, in order of name; [] without messages."""
+        decoder = self._decoders(None)[self.imu_topic]
+        decoder.choice.frame_id = ''   # several frames are no error here
+        for stretch in self.source.stretches([self.imu_topic]):
+            if self.imu_topic in stretch:
+                decoder.decode(*stretch[self.imu_topic])
+                break
+        return sorted(frame for frame, count in decoder.choice.counts.items() if count >= OTHER_FRAME)
 
     def deserializer(self, message_type: str) -> Callable:
         """Return a function from message bytes to a message object (raises InputError for a definition that cannot be used)."""

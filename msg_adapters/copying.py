@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.errors import InputError
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
-from msg_adapters.decode import in_order
+from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.encode import rows
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
@@ -21,7 +21,8 @@ from msg_adapters.stamps import MessageError, from_ns
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
                         correct: Callable, propagate: Callable | None = None, frame_id: str | None = None,
-                        mat_ts: np.ndarray | None = None, late_ns: int = 0, storage: str | None = None) -> dict[str, int]:
+                        mat_ts: np.ndarray | None = None, late_ns: int = 0, storage: str | None = None,
+                        source_frame_id: str | None = None) -> dict[str, int]:
     """
     Write a bag with all topics of another one and the corrected Imu messages behind the measured ones.
 
@@ -46,6 +47,8 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         Taken from the stamps of the corrected messages.
     storage : str, optional
         'sqlite3' or 'mcap'; default as the source.
+    source_frame_id : str, optional
+        Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
 
     Returns
     -------
@@ -62,13 +65,15 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         bag = recording.source
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]
-        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns)
+        choice = FrameChoice(recording.imu_topic, source_frame_id)
+        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice)
         with BagWriter(destination, storage or bag.storage) as writer:
             ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
             for raw in bag.raw_stretches(topics):
                 measured = np.flatnonzero(raw.topic == topics.index(recording.imu_topic))
                 _write(writer, ids[raw.topic], raw, measured, corrected_id, patch)
+        choice.check()
         return recording.lost | dict(patch.dropped)
 
 
@@ -102,8 +107,8 @@ def _write(writer, topic_ids, raw, measured, corrected_id, patch):
 class _Patch:
     """Makes corrected messages from measured ones."""
 
-    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns):
-        self.correct, self.propagate, self.late_ns = correct, propagate, late_ns
+    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns, choice):
+        self.correct, self.propagate, self.late_ns, self.choice = correct, propagate, late_ns, choice
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
 
@@ -115,6 +120,7 @@ class _Patch:
                 groups.append((find_imu_layout(packed.message(k)), np.array([k]), packed.select([k])))
             except MessageError:
                 self.dropped['Imu message that cannot be decoded'] += 1
+        groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
         if not groups:
             return np.zeros(0, dtype=int), []
         done = np.sort(np.concatenate([index for _, index, _ in groups]))

@@ -17,7 +17,9 @@ from msg_adapters.temperature import TEMPERATURE_TYPE, decode_temperature, find_
 JOINT_PATIENCE = 1000
 """So many JointState messages may pass before one fits the table."""
 KEPT_NAMES = 3
-"""Different lists of joint names that an error shows."""
+"""Different lists of joint names, or frames, that an error shows."""
+OTHER_FRAME = 20
+"""Smallest number of messages of a second IMU; fewer are attributed to damage."""
 
 
 class Decoder:
@@ -101,6 +103,59 @@ class Decoder:
     def _drop(self, error, n_messages):
         reason = str(error) if isinstance(error, UnusableMessage) else f'{self.name} message that cannot be decoded'
         self.dropped[reason] += n_messages
+
+
+class FrameChoice:
+    """
+    Selection of the Imu messages of one frame_id on a topic.
+
+    Parameters
+    ----------
+    topic : str
+        Its name for errors.
+    frame_id : str, optional
+        Frame of the messages to read; default: all messages; a second frame with OTHER_FRAME messages is refused.
+
+    """
+
+    def __init__(self, topic: str, frame_id: str | None = None):
+        self.topic, self.frame_id, self.counts = topic, frame_id, Counter()
+
+    def wants(self, frame_id: str, n_messages: int = 1) -> bool:
+        """Return whether messages of a frame are used; raises InputError if the choice is ambiguous."""
+        self.counts[frame_id] += n_messages
+        if self.frame_id is None and sum(count >= OTHER_FRAME for count in self.counts.values()) > 1:
+            raise InputError(f'{self.topic} must have messages of one frame_id, got {self._listed()}; choose one', key='frame_id',
+                             code='frame_ambiguous')
+        return self.frame_id is None or frame_id == self.frame_id
+
+    def check(self) -> None:
+        """Raise InputError if no message has the frame_id that was chosen."""
+        if self.frame_id is not None and self.counts and self.frame_id not in self.counts:
+            raise InputError(f"the frame_id must be one of {self.topic}, got '{self.frame_id}'; choose one of {self._listed()}",
+                             key='frame_id', code='frame_unknown')
+
+    def _listed(self):
+        return ', '.join(f"'{name}'" for name, _ in self.counts.most_common(KEPT_NAMES))
+
+
+class ImuDecoder(Decoder):
+    """
+    Decode Imu messages of the frame of a FrameChoice.
+
+    Parameters
+    ----------
+    choice : FrameChoice
+    deserialize : callable, optional
+        As for Decoder.
+
+    """
+
+    def __init__(self, choice: FrameChoice, deserialize: Callable | None = None):
+        super().__init__(IMU_TYPE, deserialize)
+        self.choice, decode, read = choice, self.decode_layout, self.read_row
+        self.decode_layout = lambda layout, packed: decode(layout, packed) if choice.wants(layout.names[0], len(packed)) else None
+        self.read_row = lambda message: read(message) if choice.wants(clean_name(message.header.frame_id)) else None
 
 
 class JointDecoder(Decoder):

@@ -20,6 +20,7 @@ def add_topic_arguments(parser: OneLineParser, *, joints: bool = True) -> None:
     """Add the options that choose topics."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
     common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
+    expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
     if joints:
         common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
     expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
@@ -32,7 +33,7 @@ def add_stand_arguments(parser: OneLineParser, without: str) -> None:
     common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
     common('--imu-link', metavar='LINK', help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
     expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
-    expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, else /tf_static, else z')
+    expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
 
 
 def stand_of(options: Namespace) -> Stand | None:

@@ -7,7 +7,7 @@ from imu_calibration.cli.parser import OneLineParser, VerbResult
 from imu_calibration.errors import InputError
 
 EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
-            'session --imu-topic /front/imu --imu-topic /rear/imu --json')
+            'session --imu-topic /imus --frame-id front --imu-topic /imus --frame-id rear')
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -15,6 +15,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=BAG)
     common('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
+    common('--frame-id', metavar='FRAME', action='append', default=[], help='frame_id of A, then of B; for a topic with several')
 
 
 def run(options: Namespace) -> VerbResult:
@@ -27,8 +28,15 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
     if len(options.imu_topic) != 2:
         raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
+    frames = options.frame_id or [None, None]
+    if len(frames) != 2:
+        raise InputError(f'--frame-id must be given twice, for A and B, or not at all, it came {len(frames)} time(s); name both frames')
+    topics = [Topics(imu=topic, frame=frame) for topic, frame in zip(options.imu_topic, frames)]
+    if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
+        raise InputError(f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a frame_id for each',
+                         key='frame_id', code='same_imu')
     imus = []
-    for topic in map(Topics, options.imu_topic):
+    for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
         blocks = source_of(options.bag, topic)()
         preflight = Preflight()

@@ -32,7 +32,7 @@ def run(options: Namespace) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
     names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'noise', 'correct_stamps', 'imu_topic',
-             'temperature_topic')
+             'temperature_topic', 'frame_id')
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:
         print(f'note: {line}')

@@ -36,7 +36,7 @@ def run(options: Namespace) -> VerbResult:
         raise InputError('a table or arm says how a recording moved and must come with --bag BAG, none came; give both')
     from imu_calibration.use_cases.exporting import export_calibration
     from imu_calibration.use_cases.recordings import Topics
-    topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic)
+    topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic, options.frame_id)
     found = export_calibration(options.document, options.to, output=options.output, noise=options.noise, rate=options.rate,
                                bag=options.bag, stand=stand, topics=topics, anyway=options.anyway)
     for line in found.lines:

@@ -30,7 +30,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.stand import table_of
     bag, choices, stand = existing(options.bag), choices_of(options), stand_of(options)
     topics = imu_topics_of(bag, topics_of(choices))
-    table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu))
+    table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     looks = inspect(bag, topics, table, options=calibration_options(choices))
     out = console()
     _show_topics(out, looks)
@@ -39,7 +39,8 @@ def run(options: Namespace) -> VerbResult:
     for look in looks:
         out.print()
         if len(looks) > 1:
-            out.print(f'{look.recording.imu_topic}', style='bold')
+            frame = look.recording.frame_id
+            out.print(look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold', markup=False)
         show_findings(out, look.findings, hints_of(options))
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
@@ -55,7 +56,8 @@ def run(options: Namespace) -> VerbResult:
 def _document(look):
     """Return the findings, streams and parameter statuses of one Imu topic as data."""
     found = look.calibrated if look.by_hand is None else look.by_hand
-    document = {'topic': look.recording.imu_topic, 'findings': [finding.to_mapping() for finding in look.findings], 'lost': look.lost,
+    document = {'topic': look.recording.imu_topic, 'frame_id': look.recording.frame_id,
+                'findings': [finding.to_mapping() for finding in look.findings], 'lost': look.lost,
                 'streams': {name: {'count': s.count, 'rate': s.rate, 'duration': s.duration, 'gaps': s.n_gaps, 'dropped': s.dropped}
                             for name, s in look.streams.items()}}
     if isinstance(found, ImuCalibrationError):

@@ -32,8 +32,8 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.noise import noise
     chosen = {} if options.horizon is None else {'horizon': options.horizon}
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, nominal=options.nominal,
-                      **chosen)
+        found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, frame_id=options.frame_id,
+                      nominal=options.nominal, **chosen)
         for warning in found.warnings:
             print(f'warning: {warning}', file=sys.stderr)
         found.save(folder, report=not options.no_report)

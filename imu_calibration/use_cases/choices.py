@@ -26,6 +26,8 @@ class Choices(TypedDict, total=False):
     """sensor_msgs/JointState; default /joint_states, else the only one."""
     temperature_topic: str | None
     """sensor_msgs/Temperature; default /imu/temperature, else the only one."""
+    frame_id: str | None
+    """frame_id of the Imu messages; required if a topic has messages of several."""
     accelerometer_model: str | None
     """A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the rotation shows it."""
     gyroscope_model: str | None
@@ -62,7 +64,7 @@ def check_names(choices: Mapping[str, Any]) -> None:
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:
     """Return the topics that were chosen."""
-    return Topics(*(choices.get(name) for name in ('imu_topic', 'joint_topic', 'temperature_topic')))
+    return Topics(*(choices.get(name) for name in ('imu_topic', 'joint_topic', 'temperature_topic', 'frame_id')))
 
 
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:

@@ -50,7 +50,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
                output: str | PathLike | None = None, corrected_topic: str = CORRECTED_TOPIC, target_frame: str = '',
                target_xyz: Sequence[float] = (0.0, 0.0, 0.0), target_rpy: Sequence[float] = (0.0, 0.0, 0.0), correct_stamps: bool = False,
                anyway: bool = False, noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
-               temperature_topic: str | None = None) -> Compensated:
+               temperature_topic: str | None = None, frame_id: str | None = None) -> Compensated:
     """
     Take the calibrated errors out of a recording.
 
@@ -75,6 +75,8 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         noise.yaml of this IMU: the covariances of the corrected readings follow from it where the messages bring none.
     imu_topic, temperature_topic : str, optional
         Topics to read.
+    frame_id : str, optional
+        frame_id of the Imu messages; required if the topic has messages of several.
 
     Raises
     ------
@@ -93,7 +95,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         return _in_memory(recording, calibration, transfer, late=late, used=used)
     if output is not None and Path(output).exists():
         raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it', code='exists_already')
-    topics = Topics(imu_topic, None, temperature_topic)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
@@ -109,7 +111,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         from msg_adapters.copying import copy_with_corrected
         lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic=corrected_topic, correct=correct,
                                    propagate=stream.propagate, frame_id=target_frame or None,
-                                   mat_ts=None if transfer is None else transfer.mat_ts, late_ns=late)
+                                   mat_ts=None if transfer is None else transfer.mat_ts, late_ns=late, source_frame_id=frame_id)
         return _outcome(None, stream, lost, used)
 
 

@@ -60,6 +60,7 @@ class IdentifiedNoise:
 
 
 def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = None, temperature_topic: str | None = None,
+          frame_id: str | None = None,
           nominal: str | PathLike | NominalScaling | None = None, horizon: float = HORIZON) -> IdentifiedNoise:
     """
     Identify the noise of an IMU from a recording that holds rest.
@@ -70,6 +71,8 @@ def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = No
         Bag, or samples in memory; it is read twice.
     imu_topic, temperature_topic : str, optional
         Default /imu/data_raw and /imu/temperature, else the only topics of their types.
+    frame_id : str, optional
+        frame_id of the Imu messages; required if the topic has messages of several.
     nominal : path-like or NominalScaling, optional
         For recordings in volts or counts.
     horizon : float
@@ -81,7 +84,8 @@ def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = No
         When the recording cannot be used, or nothing in it is at rest for long enough.
 
     """
-    topics = Topics(imu_topic, None, temperature_topic)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id)
     result = identify_noise(source_of(recording, topics), nominal_of(nominal))
-    options = {name: value for name, value in (('imu_topic', imu_topic), ('temperature_topic', temperature_topic)) if value}
+    options = {name: value for name, value in (('imu_topic', imu_topic), ('temperature_topic', temperature_topic), ('frame_id', frame_id))
+               if value}
     return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

@@ -6,7 +6,7 @@ from functools import partial
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from imu_calibration import files
 from imu_calibration.errors import InputError
@@ -28,10 +28,12 @@ class Topics(NamedTuple):
     """sensor_msgs/JointState, default /joint_states."""
     temperature: str | None = None
     """sensor_msgs/Temperature, default /imu/temperature."""
+    frame: str | None = None
+    """frame_id of the Imu messages; None: that of all."""
 
-    def chosen(self) -> dict[str, str | None]:
+    def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
-        return {f'{name}_topic'.replace('joints', 'joint'): topic for name, topic in self._asdict().items()}
+        return {'imu_topic': self.imu, 'joint_topic': self.joints, 'temperature_topic': self.temperature, 'frame_id': self.frame}
 
 
 def existing(path: str | PathLike) -> Path:

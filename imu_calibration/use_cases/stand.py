@@ -79,7 +79,7 @@ def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = 
         site['up'] = list(up_of(root_of(text), static_transforms(*bag)))
     if gravity is not None and site.get('gravity') is None:
         site['gravity'] = gravity
-    return table_from_urdf(text, stand.imu_link or _frame(recordings, bag), site)
+    return table_from_urdf(text, stand.imu_link or topics.frame or _frame(recordings, bag), site)
 
 
 def _description(arm, bag):

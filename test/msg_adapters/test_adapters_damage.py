@@ -220,7 +220,7 @@ def test_messages_in_overflow_pages_and_of_other_types(tmp_path, session):
 @pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 @pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE])
 def test_bags_of_another_writer(tmp_path, session, storage, mode):
-    """Compressed in every way; frame and joint order change, byte order too, and types are mixed in the middle."""
+    """Compressed in every way; a few frames and the joint order change, byte order too, and types are mixed in the middle."""
     if storage is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE:
         pytest.skip('sqlite3 has no compression of its own')
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -235,7 +235,7 @@ def test_bags_of_another_writer(tmp_path, session, storage, mode):
         topics = [writer.add_connection(name, kind, typestore=store) for name, kind in (
             ('/imu/data_raw', 'sensor_msgs/msg/Imu'), ('/joint_states', 'sensor_msgs/msg/JointState'), ('/other', 'sensor_msgs/msg/Imu'))]
         for k in range(600):
-            data = plain[k >= 250][k].tobytes()
+            data = plain[250 <= k < 265][k].tobytes()
             if 400 <= k < 420:
                 message = store.deserialize_cdr(data, 'sensor_msgs/msg/Imu')
                 data = bytes(store.serialize_cdr(message, 'sensor_msgs/msg/Imu', little_endian=False))

@@ -579,7 +579,7 @@ def test_counts_are_in_order_once_scaled(capsys, recordings, tmp_path):
 def test_arm_warns_of_clipping_and_refuses_other_units(capsys, recordings):
     assert main(['arm', str(recordings / 'array_2'), '--imu-topic', '/imu_1/data_raw', '--imu-topic', '/imu_7/data_raw']) == 0
     assert capsys.readouterr().err.count('the gyroscope clips at 34.87 rad/s') == 2
-    assert main(['arm', str(recordings / 'xsens_counts'), '--imu-topic', '/imu/data_raw', '--imu-topic', '/imu/data_raw']) == 1
+    assert main(['arm', str(recordings / 'xsens_counts'), '--imu-topic', '/imu/data_raw', '--imu-topic', '/imu/other']) == 1
     assert 'counts or volts' in capsys.readouterr().err
 
 
