@@ -12,11 +12,12 @@ HALF_WINDOW, PER_REST, MULTIPLIERS, LEAST_RESTS = 50, 100, range(2, 11), 12
 """imu_tk: half of the window of the variance, samples that are used of a rest, factors of the threshold, least number of rests."""
 
 
-def imu_tk(imu, ranges, gravity):
+def imu_tk(imu, ranges, gravity, without=None):
     """
     Return (accelerometer, gyroscope) as imu_tk (Tedaldi et al., ICRA 2014) does with the means of rests and the gyroscope's bias free.
 
-    The rest at the beginning, `ranges[0]`, sets the threshold of the variance; the others it finds itself. None: it finds too few.
+    The rest at the beginning, `ranges[0]`, sets the threshold of the variance; the others it finds itself. None: it finds too few. Turns
+    that overlap the slice `without` are not used.
     """
     first, time, best = ranges[0], 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), None
     variance, threshold = _variance(imu.force_s), np.linalg.norm(imu.force_s[first].var(axis=0, ddof=1))
@@ -33,17 +34,17 @@ def imu_tk(imu, ranges, gravity):
         return None
     _, sensor, pieces, force = best
     turns = [(np.diff(time[a.stop:b.start]), imu.rate_s[a.stop:b.start]) for a, b in zip(pieces, pieces[1:])]
-    return sensor, _gyroscope(turns, sensor.directions(force), imu.rate_s[first].mean(axis=0), loss='linear')
+    return sensor, _gyroscope(*_other_turns(turns, sensor.directions(force), pieces, without), imu.rate_s[first].mean(axis=0), loss='linear')
 
 
-def imu_calib(imu, ranges, gravity):
+def imu_calib(imu, ranges, gravity, without=None):
     """Return (accelerometer, gyroscope) as imu-calib (M. Mikov) does: a fixed threshold of the rate, even times, a soft loss."""
     first, rests = ranges[0], _resting(imu, ranges[0])
     step = 1e-9 * (imu.stamp_ns[-1] - imu.stamp_ns[0]) / (len(imu) - 1)
     samples = imu.force_s[np.concatenate([np.arange(rest.start, rest.stop) for rest in rests])]
     sensor = fit_norm(samples, gravity, loss='soft_l1')
     turns = [(np.full(b.start - a.stop + 9, step), imu.rate_s[a.stop - 5:b.start + 5]) for a, b in zip(rests, rests[1:])]
-    return sensor, _gyroscope(turns, sensor.directions(_means(imu, rests)), imu.rate_s[first].mean(axis=0), loss='soft_l1')
+    return sensor, _gyroscope(*_other_turns(turns, sensor.directions(_means(imu, rests)), rests, without), imu.rate_s[first].mean(axis=0), loss='soft_l1')
 
 
 def norm_fit(imu, ranges, gravity):
@@ -85,12 +86,19 @@ def _means(imu, rests):
     return np.array([imu.force_s[rest].mean(axis=0) for rest in rests])
 
 
-def _gyroscope(turns, up, bias, loss):
-    """Return the gyroscope, bias and matrix, that turns gravity from rest to rest."""
+def _other_turns(turns, up, rests, without):
+    """Return (turns, gravity before them, gravity after them) of the turns between rests that do not overlap the slice `without`."""
+    used = np.array([k for k, (a, b) in enumerate(zip(rests, rests[1:]))
+                     if without is None or b.start <= without.start or a.stop >= without.stop], int)
+    return [turns[k] for k in used], up[used], up[used + 1]
+
+
+def _gyroscope(turns, first, last, bias, loss):
+    """Return the gyroscope, bias and matrix, that turns gravity from rest to rest, directions `first` and `last` of each turn."""
     def misses(values):
         inverse = np.linalg.inv(values[3:].reshape(3, 3))
         return np.concatenate([turned((rate - values[:3]) @ inverse.T, step).T @ before - after
-                               for (step, rate), before, after in zip(turns, up, up[1:])])
+                               for (step, rate), before, after in zip(turns, first, last)])
 
     found = least_squares(misses, np.concatenate([bias, np.eye(3).ravel()]), x_scale='jac', loss=loss).x
     return Forward(found[:3], found[3:].reshape(3, 3))

@@ -1,14 +1,22 @@
-"""MPU-9150 by hand against published biases."""
+"""MPU-9150 by hand against published biases, and the angles of turns that were not used against two peers."""
+
+from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.calibrate import calibrate_by_hand, gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.segmentation.static_detector import find_still
-from validation.recordings import load, reference
+from validation.hand_peers import imu_calib, imu_tk, turned
+from validation.peers import WITHIN
+from validation.recordings import gravity_of, load, reference
+from validation.second_opinions import Forward, fit_norm
 from validation.section import Section, listed, text
 
 NAME = 'mpu9150_0'
+TURNS = ('mpu9150_0', 'mpu9150_3')
+"""Recordings whose left-out turns are compared."""
+
 
 
 def figures(folder):
@@ -18,12 +26,48 @@ def figures(folder):
     return found, found.accelerometer[0] - reference(folder, NAME)['published']['accelerometer_bias']
 
 
+def ours_without(imu, ranges, gravity, without):
+    """Return (accelerometer, gyroscope) of a calibration by hand without the turns that overlap the slice `without`."""
+    data = gather_by_hand(imu, ranges)
+    turns = [turn for turn in data.turns if data.poses.start[turn.last] <= without.start or data.poses.stop[turn.first] >= without.stop]
+    found = solve_by_hand(replace(data, turns=turns), HandOptions(gravity))
+    return Forward(*found.accelerometer), Forward(*found.gyroscope[:2])
+
+
+def left_out_turns(imu, gravity):
+    """
+    Return {method: rms angle in degrees} of all turns, each with the gyroscope from the other turns.
+
+    The angle is that between gravity after a turn and gravity before it, rotated by the corrected rates from the middle of one rest to
+    the middle of the next. The directions of gravity are the same for all methods: those of the norm fit to all poses.
+    """
+    ranges, squares = find_still(imu), {name: [] for name in METHODS}
+    force = np.array([imu.force_s[rest].mean(axis=0) for rest in ranges])
+    up, step = fit_norm(force, gravity).directions(force), 1e-9 * np.diff(imu.stamp_ns)
+    middle = [(rest.start + rest.stop) // 2 for rest in ranges]
+    for begin, end, before, after in zip(middle, middle[1:], up, up[1:]):
+        for name, method in METHODS.items():
+            gyroscope = method(imu, ranges, gravity, slice(begin, end))[1]
+            rotated = turned(gyroscope.compensated(imu.rate_s[begin:end + 1]), step[begin:end]).T @ before
+            squares[name].append(np.arctan2(np.linalg.norm(np.cross(rotated, after)), rotated @ after)**2)
+    return {name: float(np.degrees(np.sqrt(np.mean(found)))) for name, found in squares.items()}
+
+
+METHODS = {'ours': ours_without, 'imu_tk': imu_tk, 'imu-calib': imu_calib}
+
+
 def run(folder, plots):
     """Return the section."""
     section = Section('Published biases: MPU-9150 (mpu9150_0)')
     found, difference = figures(folder)
     section.claim('mpu9150_0: accelerometer biases against the published ones', 'within 10 mm/s²', f'{listed(1e3 * difference, 1)} mm/s²',
                   np.max(np.abs(difference)) < 0.010)
+    for name in TURNS:
+        angles = left_out_turns(load(folder, name), gravity_of(folder, name))
+        best = min(value for method, value in angles.items() if method != 'ours')
+        section.claim(f'{name}: angles of turns that were left out, first or within {WITHIN - 1:.0%} of the better peer',
+                      f'at most {WITHIN * best:.3f}°', ', '.join(f'{method} {value:.3f}°' for method, value in angles.items()),
+                      angles['ours'] <= WITHIN * best)
     statistics = found.statistics
     section.say(text('mpu9150', sds=', '.join(f'{1e3 * sd:.1f}' for sd in found.sd[:3]), poses=statistics['poses'],
                      turns=statistics['turns'], residual=1e3 * statistics['norm_residual_rms']))

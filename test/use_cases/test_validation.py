@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from validation import arm_live, ferraris, held_out, mpu9150, run, simulated_table, xsens  # noqa: E402
+from validation.hand_peers import _other_turns  # noqa: E402
 from validation.recordings import load, reference  # noqa: E402
 from validation.second_opinions import Forward, fit_norm  # noqa: E402
 from validation.section import Section  # noqa: E402
@@ -34,6 +35,16 @@ def test_the_plain_norm_fit_gives_the_sensor_back():
     np.testing.assert_allclose(found.bias, bias, atol=1e-8)
     np.testing.assert_allclose(found.matrix, matrix, atol=1e-9)
     np.testing.assert_allclose(found.norm_errors(force, G), 0, atol=1e-8)
+
+
+def test_a_turn_left_out_is_used_by_no_peer():
+    rests = [slice(0, 10), slice(20, 30), slice(40, 50), slice(60, 70)]
+    up = np.eye(4, 3)
+    for without, kept in ((None, [0, 1, 2]), (slice(25, 45), [0, 2]), (slice(5, 25), [1, 2]), (slice(15, 55), [])):
+        turns, first, last = _other_turns(['a', 'b', 'c'], up, rests, without)
+        assert turns == ['abc'[k] for k in kept]
+        np.testing.assert_array_equal(first, up[kept].reshape(-1, 3))
+        np.testing.assert_array_equal(last, up[np.add(kept, 1).astype(int)].reshape(-1, 3))
 
 
 def test_a_pose_left_out_leaves_nothing_behind():
