@@ -18,6 +18,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,
+        'simulation_distance': {sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()},
         'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked) for sensor in SENSORS},
         'not_testable': list(diagnosis.not_testable),
         'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],

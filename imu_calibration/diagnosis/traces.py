@@ -1,17 +1,19 @@
-"""Residuals before and after as a person looks at them: averaged over short blocks, and dead reckoning with both models."""
+"""Measurement against the simulation of two models: residuals over short blocks, segments, residual power and dead reckoning."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.diagnosis.distance import Distance, DistanceSums
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import INPUT_OF, warped_reference
-from imu_calibration.effects.forward_equations import predict
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window, all_samples, chunks
+from imu_calibration.simulation.replay import predict_windows
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""
@@ -19,11 +21,27 @@ BLOCK = 0.25
 
 DEAD_RECKONING = 50.0
 """Length of dead reckoning, s."""
+GAP = 0.1
+"""Longest step between samples of a stretch, s."""
+MOST_STRETCHES = 12
+"""Stretches of dead reckoning, evenly spread over a longer recording."""
+SEGMENT, POINTS = 10.0, 400
+"""Length of the segment with the largest difference, s, and its number of points in a plot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Measured and simulated signal of one axis."""
+
+    time: np.ndarray
+    """Seconds since the first sample, shape (n,)."""
+    signals: dict[str, np.ndarray]
+    """'measured', 'simulated before', 'simulated after': m/s^2 or rad/s, shape (n,); samples, or means of equal numbers of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Residuals averaged over short blocks, before and after, with what they may be drawn against."""
+    """Residuals averaged over short blocks, before and after, with the variables of their plots."""
 
     time: np.ndarray
     """Middle of each block, s, shape (n,)."""
@@ -46,67 +64,107 @@ class Traces:
     dead_reckoning: dict | None
     """{'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after', 'stretches'}: medians, m and m/s, or None when
     no stretch of the recording is long enough."""
+    segments: dict[str, list[Segment]] = field(default_factory=dict)
+    """Sensor -> for each axis the segment with the largest residual before."""
+    distances: dict[str, Distance] = field(default_factory=dict)
+    """Sensor -> residual power by band; empty by hand."""
 
 
-def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *, after: Solution) -> Traces:
+def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *, after: Solution | Calibration) -> Traces:
     """
-    Return the Traces of two solutions.
+    Return the Traces of two models on a recording.
+
+    Windows are predicted in chunks, so that memory does not grow with the number of samples.
 
     Parameters
     ----------
     windows : sequence of Window
-        May include those of kind 'unused', which make dead reckoning possible.
-    before, after : Solution
+        Those of kind 'unused' count for dead reckoning and segments only.
+    table : Table
+    before : Solution
+        Baseline, with the noise of both sensors.
+    after : Solution or Calibration
+        Extended model.
 
     """
-    solutions = before, after
-    warm = all(window.temperature_c is not None for window in windows)
-    parts = [_errors(group, table, solutions, warm) for group in chunks(windows)]
-    errors = [{s: np.concatenate([part[k][s] for part, _ in parts]) for s in SENSORS} for k in range(len(solutions))]
-    time = np.concatenate([w.time for w in windows])
-    navigation = _dead_reckoning(time, windows, table, solutions=solutions, errors=errors)
-    known = np.concatenate([np.full(len(w.time), w.kind != 'unused') for w in windows])
-    block, number = _blocks(windows)
+    models = before, after
+    sums, parts, counts, warmth = DistanceSums(), [], [], []
+    for group in chunks([window for window in windows if window.kind != 'unused']):
+        residuals, against = _errors(group, table, models)
+        ends = np.cumsum([len(window) for window in group])
+        for window, stop in zip(group, ends):
+            rows = slice(stop - len(window), stop)
+            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in residuals], before.noise)
+        block, number = _blocks(group)
+        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in residuals for s in SENSORS)]
+        parts.append([_block_mean(value, block, number) for value in values])
+        warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
+        counts.append((number, np.repeat([str(w.kind) for w in group], [_n_blocks(w) for w in group])))
+    known = [each for each in warmth if each is not None]
+    temperature = np.concatenate(known) if len(known) == len(warmth) else None
+    time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
+    old, new = (dict(zip(SENSORS, errors[k:k + 2])) for k in (0, 2))
+    segments = {sensor: [_segment(windows, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])) for axis in range(3)]
+                for sensor in SENSORS}
+    return Traces(time, np.concatenate([kind for _, kind in counts]), position, force_s, rate_s, temperature, old, new,
+                  np.concatenate([number for number, _ in counts]), _dead_reckoning(windows, table, models), segments, sums.distances())
 
-    def mean(values):
-        return _block_mean(np.asarray(values, float)[known], block, number)
-    position, force_s, rate_s = (mean(np.concatenate([beside[k] for _, beside in parts])) for k in range(3))
-    temperature = mean(np.concatenate([beside[3] for _, beside in parts])) if warm else None
-    kind = np.concatenate([np.full(len(w.time), w.kind) for w in windows])[known]
-    return Traces(mean(time), kind[np.searchsorted(block, np.arange(len(number)))], position, force_s, rate_s, temperature,
-                  {s: mean(errors[0][s]) for s in SENSORS}, {s: mean(errors[1][s]) for s in SENSORS}, number, navigation)
+
+def _largest(time, residual):
+    """Return start and end of the segment of `SEGMENT` seconds with the largest sum of squares of a residual."""
+    sums = np.concatenate([[0.0], np.cumsum(residual**2)])
+    stop = np.searchsorted(time, time + SEGMENT)
+    first = int(np.argmax(sums[stop] - sums[:-1]))
+    return time[first] - BLOCK, time[first] + SEGMENT
 
 
-def _errors(windows, table, solutions, warm):
-    """Return (measured minus predicted of each solution by sensor, (position, force, rate, temperature) to draw it against)."""
+def _segment(windows, table, models, sensor, axis, start, stop):
+    inside = [window for window in windows if window.time[-1] >= start and window.time[0] <= stop]
+    time = np.concatenate([window.time for window in inside])
+    measured = np.concatenate([_measured(window)[sensor][:, axis] for window in inside])
+    found = {'measured': measured}
+    for name, model in zip(('simulated before', 'simulated after'), models):
+        found[name] = predict_windows(inside, table, model.model, values=model.values)[sensor][:, axis]
+    rows = np.flatnonzero((time >= start) & (time <= stop))
+    size = max(1, len(rows) // POINTS)
+    rows = rows[:len(rows) // size * size].reshape(-1, size)
+    return Segment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
+
+
+def _measured(window):
+    return {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
+
+
+def _errors(windows, table, models):
+    """Return (measured minus predicted of each model by sensor, (position, force, rate, temperature) of the reference)."""
     motion, temperature, rows = all_samples(windows)
-    temperature = temperature if warm else None
-    outputs = {'accelerometer': np.concatenate([w.force_s for w in windows]), 'gyroscope': np.concatenate([w.rate_s for w in windows])}
     found = []
-    for solution in solutions:
-        predicted = predict(solution.model.at(solution.values), solution.values, table, motion=motion, temperature_c=temperature)
-        found.append({s: outputs[s] - predicted[k][rows] for k, s in enumerate(SENSORS)})
-    first = _references(solutions[0], table, motion, temperature)
+    for model in models:
+        predicted = predict_windows(windows, table, model.model, values=model.values)
+        found.append({s: np.concatenate([_measured(w)[s] for w in windows]) - predicted[s] for s in SENSORS})
+    first = _references(models[0], table, motion, temperature)
     return found, (motion.position[rows], first['accelerometer'].force_s[rows], first['gyroscope'].rate_s[rows],
                    None if temperature is None else temperature[rows])
 
 
-def _references(solution, table, motion, temperature):
-    """Return sensor -> the Reference of its samples at a solution."""
-    return {s: warped_reference(solution.model.at(solution.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
+def _references(model, table, motion, temperature):
+    """Return sensor -> the Reference of its samples at the values of a model."""
+    return {s: warped_reference(model.model.at(model.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
 
 
 def _blocks(windows):
-    """Return the block number of each known sample and the size of each block; blocks end with their window."""
-    numbers, last = [], 0
-    for window in windows:
-        if window.kind == 'unused':
-            continue
-        number = ((window.time - window.time[0]) / BLOCK).astype(int)
-        numbers.append(last + number)
-        last += int(number[-1]) + 1
-    unique, block = np.unique(np.concatenate(numbers), return_inverse=True)
-    return block, np.bincount(block, minlength=len(unique))
+    """Return the block of each sample and the number of samples of each block; blocks end with their window."""
+    first = np.cumsum([0, *(_n_blocks(window) for window in windows)])
+    block = np.concatenate([start + _place(window) for start, window in zip(first, windows)])
+    return block, np.bincount(block)
+
+
+def _place(window):
+    return np.unique(((window.time - window.time[0]) / BLOCK).astype(int), return_inverse=True)[1]
+
+
+def _n_blocks(window):
+    return int(_place(window)[-1]) + 1
 
 
 def _block_mean(values, block, number):
@@ -115,30 +173,35 @@ def _block_mean(values, block, number):
     return means[:, 0] if values.ndim == 1 else means
 
 
-def _dead_reckoning(time, windows, table, *, solutions, errors):
+def _dead_reckoning(windows, table, models):
     """Return medians over stretches of 50 s without gaps, or None."""
-    edges = np.flatnonzero(np.diff(time) > 0.1)
-    starts, stops = np.r_[0, edges + 1], np.r_[edges + 1, len(time)]
-    pieces = [slice(a, b) for a, b in zip(starts, stops) if time[b - 1] - time[a] >= DEAD_RECKONING and np.all(np.diff(time[a:b]) > 0)]
-    if not pieces:
+    stretches, run = [], []
+    for window in windows:
+        if run and not 0 < window.time[0] - run[-1].time[-1] <= GAP:
+            run = []
+        run.append(window)
+        if window.time[-1] - run[0].time[0] > DEAD_RECKONING:
+            stretches.append(run)
+            run = []
+    if not stretches:
         return None
+    chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
+    drifts = [_drifts(stretch, table, models) for stretch in chosen]
+    velocity, position = (np.median([[getattr(drift, name)[0] for drift in pair] for pair in drifts], axis=0) for name in
+                          ('velocity', 'position'))
+    return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[1]),
+            'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[1]), 'stretches': len(chosen)}
+
+
+def _drifts(windows, table, models):
+    """Return the Drift of each model over the first `DEAD_RECKONING` seconds of some windows."""
     motion, temperature, rows = all_samples(windows)
-    found = []
-    for solution, error in zip(solutions, errors):
-        references = _references(solution, table, motion, temperature)
-        ends = [_drifts(piece, time, solution, error, references, rows) for piece in pieces]
-        found.append((np.median(np.concatenate([e.position for e in ends])), np.median(np.concatenate([e.velocity for e in ends])),
-                      sum(len(e.position) for e in ends)))
-    return {'seconds': DEAD_RECKONING, 'position_before': float(found[0][0]), 'position_after': float(found[1][0]),
-            'velocity_before': float(found[0][1]), 'velocity_after': float(found[1][1]), 'stretches': int(found[0][2])}
-
-
-def _drifts(piece, time, solution, error, reference, rows):
-    at = rows[piece]
-    felt = {}
-    for sensor in SENSORS:
-        matrix = solution.model.value(sensor, Role.LINEAR, solution.values)
-        felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[at] + np.linalg.solve(matrix, error[sensor][piece].T).T
-    base = reference['accelerometer'].select(at)
-    true = replace(base, time=time[piece], rate_s=reference['gyroscope'].rate_s[at])
-    return drift_over(true, felt['accelerometer'], felt['gyroscope'], seconds=DEAD_RECKONING)
+    time, found = np.concatenate([window.time for window in windows]), []
+    for model, error in zip(models, _errors(windows, table, models)[0]):
+        reference, felt = _references(model, table, motion, temperature), {}
+        for sensor in SENSORS:
+            matrix = model.model.value(sensor, Role.LINEAR, model.values)
+            felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[rows] + np.linalg.solve(matrix, error[sensor].T).T
+        true = replace(reference['accelerometer'].select(rows), time=time, rate_s=reference['gyroscope'].rate_s[rows])
+        found.append(drift_over(true, felt['accelerometer'], felt['gyroscope'], seconds=DEAD_RECKONING))
+    return found

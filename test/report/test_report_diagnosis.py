@@ -110,3 +110,21 @@ def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
     assert gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12) and gain['windows'] == of_formula.diagnosis.locked
     line = next(line for line in of_formula.lines if 'gain of the formula' in line)
     assert '0.0286 deg/s before, 0.00286 deg/s to 0.00859 deg/s after' in line
+
+
+def test_the_distance_agrees_with_the_held_out_gain(result):
+    """The reduction on all windows and that on held-out windows have overlapping intervals."""
+    gain = result.diagnosis.gain
+    of_all = result.diagnosis.traces.distances[gain.sensor].gains[gain.measure]
+    assert gain.ci95[0] < of_all.ci95[1] and of_all.ci95[0] < gain.ci95[1]
+    assert of_all.reduction == pytest.approx(gain.reduction, abs=0.08)
+    bands = result.document['simulation_distance']['gyroscope']['bands']
+    assert max(bands[0]['after']) < 0.2 * max(bands[0]['before'])
+
+
+def test_the_segments_are_measured_and_simulated(result):
+    """Over a segment the simulation of the extended model differs from the measurement by noise, that of the baseline by more."""
+    for segment in result.diagnosis.traces.segments['gyroscope']:
+        assert 5.0 < np.ptp(segment.time) < 11.0 and len(segment.time) <= 800
+        before, after = (np.mean(segment.signals['measured'] - segment.signals[f'simulated {when}']) for when in ('before', 'after'))
+        assert abs(after) < 0.6 * abs(before)
