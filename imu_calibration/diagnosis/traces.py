@@ -30,7 +30,7 @@ SEGMENT, POINTS = 10.0, 400
 
 
 @dataclass(frozen=True, eq=False)
-class Segment:
+class OverlaySegment:
     """Measured and simulated signal of one axis."""
 
     time: np.ndarray
@@ -64,7 +64,7 @@ class Traces:
     dead_reckoning: dict | None
     """{'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after', 'stretches'}: medians, m and m/s, or None when
     no stretch of the recording is long enough."""
-    segments: dict[str, list[Segment]] = field(default_factory=dict)
+    segments: dict[str, list[OverlaySegment]] = field(default_factory=dict)
     """Sensor -> for each axis the segment with the largest residual before."""
     distances: dict[str, Distance] = field(default_factory=dict)
     """Sensor -> residual power by band; empty by hand."""
@@ -128,7 +128,7 @@ def _segment(windows, table, models, sensor, axis, start, stop):
     rows = np.flatnonzero((time >= start) & (time <= stop))
     size = max(1, len(rows) // POINTS)
     rows = rows[:len(rows) // size * size].reshape(-1, size)
-    return Segment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
+    return OverlaySegment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
 
 
 def _measured(window):
