@@ -49,8 +49,9 @@ class Distance:
         return [(name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise)) for name, power, noise in found]
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)) of the bands with data, 1/sqrt(Hz)."""
+        """Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)) of the bands with data, 1/sqrt(Hz); without the last one."""
         rows = self.power[0].any(axis=1)
+        rows[-1] = False   # the Nyquist frequency cuts it
         width = np.diff(self.edges)[rows, None]
         return (np.sqrt(self.edges[:-1] * self.edges[1:])[rows], np.sqrt(self.power[:, rows] / width), np.sqrt(self.noise[rows] / width))
 

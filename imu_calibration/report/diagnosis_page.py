@@ -4,13 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.diagnosis.result import Diagnosis, Finding, formula_gain
-from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
+from imu_calibration.report.overlay import overlay_section, variables
 from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.spectrum_figure import draw_tones
@@ -41,7 +40,8 @@ def diagnosis_report(result: DiagnosisResult) -> str:
                   lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
                   findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
                   formulas=[_formula(diagnosis, rest) for rest in diagnosis.unexplained.values() if rest.proposal is not None],
-                  traces=draw_over_time(result), candidates=[_candidate(row) for row in diagnosis.candidates],
+                  overlay=overlay_section(diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)),
+                  candidates=[_candidate(row) for row in diagnosis.candidates],
                   rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
                   beyond=[f'{_capital(line)}.'
                           for line in (*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes)],
@@ -149,17 +149,13 @@ def draw_over_time(result: DiagnosisResult) -> str:
                 label='Residuals over time before and after the extension')
 
 
-def variables(traces: Traces, joint_names: Sequence[str]) -> dict[str, tuple[str, np.ndarray]]:
-    """Return {label: (kind, values)} of everything that a residual may be drawn against, in people's units."""
-    found = {'time, s': ('time', traces.time)}
-    if traces.temperature_c is not None:
-        found['temperature, °C'] = ('temperature', traces.temperature_c)
-    for k, axis in enumerate('xyz'):
-        found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
-        found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
-    for name, angle in zip(joint_names, traces.position.T):   # by hand no joint is known
-        found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * angle))))
-    return found
+def _causes(diagnosis):
+    """Return sensor -> label of the variable of its first finding, or of its formula."""
+    pairs = [(rest.proposal.sensor, [kind for effect in rest.proposal.effects for kind in effect.against])
+             for rest in diagnosis.unexplained.values() if rest.proposal is not None]
+    pairs += [(finding.gain.sensor, finding.against) for finding in reversed(diagnosis.findings)]
+    known = variables(diagnosis.traces, diagnosis.baseline.model.joint_names)
+    return {sensor: label for sensor, against in pairs if (label := cause_of(diagnosis, sensor, against)[1]) in known}
 
 
 def explained_share(values: np.ndarray, signal: np.ndarray) -> float:

@@ -1,7 +1,10 @@
 """The report of a diagnosis: the finding, its evidence and its picture, on a recording with a hidden g-sensitivity."""
 
+import json
 import re
 from dataclasses import replace
+from html import unescape
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -44,9 +47,12 @@ def test_the_finding_is_told_drawn_and_measured(result):
     head = page[:page.index('<nav>')]
     assert 'cause found' in head or 'causes found' in head
     assert 'respond to specific force' in head
-    assert page.count('<svg') == 1 + len(result.diagnosis.findings)
-    assert not re.search(r'https?://(?!www\.w3\.org)|<script', page)
-    for section in ('findings', 'unexplained', 'candidates', 'untested', 'parameters'):
+    assert page.count('<svg') == len(result.diagnosis.findings)
+    plain = page.replace(resources.files('imu_calibration.report').joinpath('templates/uPlot.iife.min.js').read_text().strip(), '')
+    assert len(page) - len(plain) > 50_000 and page.count('<script>') == page.count('<script') == 1
+    assert not re.search(r'https?://(?!www\.w3\.org)|\bsrc=|fetch\(|import\(', plain)
+    assert len(page.encode()) < 4e6
+    for section in ('findings', 'unexplained', 'simulation', 'candidates', 'untested', 'parameters'):
         assert f'<section id="{section}">' in page
     for row in result.diagnosis.candidates:
         assert row.effect.replace('_', ' ') in page
@@ -128,3 +134,17 @@ def test_the_segments_are_measured_and_simulated(result):
         assert 5.0 < np.ptp(segment.time) < 11.0 and len(segment.time) <= 800
         before, after = (np.mean(segment.signals['measured'] - segment.signals[f'simulated {when}']) for when in ('before', 'after'))
         assert abs(after) < 0.6 * abs(before)
+
+
+def test_the_charts_have_the_data_of_each_sensor_and_axis(result):
+    """Five rows of three axes for each sensor, the same numbers as the traces, and the cause as the first variable."""
+    charts = [json.loads(unescape(each)) for each in re.findall(r'data-chart="([^"]*)"', diagnosis_report(result))]
+    assert [chart['title'] for chart in charts[:3]] == ['accelerometer x', 'accelerometer y', 'accelerometer z'] and len(charts) == 30
+    overlay, difference = charts[15:18], charts[18:21]
+    for segment, signals, errors in zip(result.diagnosis.traces.segments['gyroscope'], overlay, difference):
+        assert signals['names'] == ['measured', 'simulated before', 'simulated after'] and errors['names'] == ['before', 'after']
+        np.testing.assert_allclose(signals['data'][1], np.rad2deg(segment.signals['measured']), rtol=1e-4, atol=1e-12)
+        np.testing.assert_allclose(errors['data'][2], np.rad2deg(segment.signals['measured'] - segment.signals['simulated after']),
+                                   rtol=1e-4, atol=1e-12)
+    assert charts[21]['kind'] == 'points' and charts[21]['x'].startswith('specific force')
+    assert charts[24]['kind'] == 'log' and sum(charts[27]['data'][1]) > 0.95 * len(result.diagnosis.traces.time)
