@@ -49,7 +49,11 @@ class Distance:
         return [(name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise)) for name, power, noise in found]
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)) of the bands with data, 1/sqrt(Hz); without the last one."""
+        """
+        Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)), per sqrt(Hz).
+
+        Bands without data and the last one are left out.
+        """
         rows = self.power[0].any(axis=1)
         rows[-1] = False   # the Nyquist frequency cuts it
         width = np.diff(self.edges)[rows, None]
