@@ -44,7 +44,7 @@ class Adopted:
 
     def line(self) -> str:
         """Return in one line what is in force."""
-        return f'calibration {self.version} from {self.source} ({trust.standing(self.calibration)}) taken over'
+        return f'calibration {self.version} from {self.source} ({trust.standing(self.calibration)}) adopted'
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
         """Return whether a person should hear of this after `other`: it came from elsewhere, or says something else."""

@@ -26,14 +26,14 @@ PAUSE = 0.01
 class PlayerSettings:
     """What to play, and how fast."""
 
-    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start and says why',
+    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start with a reason',
                        session=True, path=True)
     topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing',
                           session=True)
     rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible',
                           (0.0, 10000.0), 'too large: messages are lost')
     clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time',
-                          symptom='nodes with use_sim_time stand still')
+                          symptom='nodes with use_sim_time do not advance')
     loop: bool = setting(False, '', 'start again at the end; the stamps then jump back', symptom='the node ends after one round')
     wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start',
                                         (0, 100), 'the first messages are missed')
@@ -78,19 +78,19 @@ class BagPlayerNode(Node):
         asked = self.settings.topics.split()
         unknown = [name for name in asked if name not in self._bag.types]
         if unknown:
-            raise InputError(f'{self.settings.bag} must hold the topics asked for, it has no {", ".join(unknown)}; '
-                             f'it holds {", ".join(sorted(self._bag.types))}')
+            raise InputError(f'{self.settings.bag} must contain the requested topics, it has no {", ".join(unknown)}; '
+                             f'it contains {", ".join(sorted(self._bag.types))}')
         chosen = []
         for name in asked or sorted(self._bag.types):
             if _message_class(self._bag.types[name]) is not None:
                 chosen.append(name)
             elif asked:
                 raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; '
-                                 'leave the topic out')
+                                 'omit the topic')
             else:
                 self.get_logger().warning(f'{name} is left out: its type {self._bag.types[name]} is not installed')
         if not chosen:
-            raise InputError(f'{self.settings.bag} must hold a topic whose type is installed, it holds none; check the bag')
+            raise InputError(f'{self.settings.bag} must contain a topic whose type is installed, it has none; check the bag')
         return chosen
 
     def _publisher(self, name):

@@ -51,7 +51,7 @@ class CalibrationGuide:
     def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         coming = set() if state.streams is None else {name for name in state.streams.coming if name in self._inputs}
         for name in sorted(coming - self._coming):
-            yield INFO, f'{KINDS[name]} messages come on {self._inputs[name].source()}'
+            yield INFO, f'{KINDS[name]} messages are received on {self._inputs[name].source()}'
         self._coming = coming
         line = None if state.streams is None else state.streams.stamping
         if line is not None and line.word != self._stamping:

@@ -68,42 +68,41 @@ class CalibrationNodeSettings:
     table_file: str = setting('', '', 'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
                               'turns between them', symptom='joint states are not listened to', session=True, path=True,
                               fixed='all motion gathered so far belongs to the table')
-    frame_id: str = setting('', '', 'frame of the Imu messages to use, others are dropped; empty: that of the first message',
-                            symptom='every Imu message is dropped, diagnostics say so', session=True,
+    frame_id: str = setting('', '', 'frame of the Imu messages to use, all other messages are dropped; empty: that of the first message',
+                            symptom='every Imu message is dropped, see diagnostics', session=True,
                             fixed='all motion gathered so far is that of one sensor')
     accelerometer_model: str = setting('', '',
                                        'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
-                                       'when the rotation shows it', symptom='an effect that is there stays in the residuals',
+                                       'when the rotation shows it', symptom='an effect of the sensor remains in the residuals',
                                        fixed='motion is gathered for the model')
     gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix',
-                                   symptom='an effect that is there stays in the residuals', fixed='motion is gathered for the model')
+                                   symptom='an effect of the sensor remains in the residuals', fixed='motion is gathered for the model')
     reference_model: str = setting('', '',
                                    "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
                                    'azimuth is unknown', symptom='a tilted table shows as accelerometer bias',
                                    fixed='motion is gathered for the model')
-    model_as_asked: bool = setting(False, '', 'add nothing to the model, whatever the motion demands',
-                                   symptom='an effect that is there bends the others', fixed='motion is gathered for the model')
+    model_as_asked: bool = setting(False, '', 'do not extend the model by effects that the data support',
+                                   symptom='an unmodelled effect biases the parameters', fixed='motion is gathered for the model')
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='good parameters are called weak', session=True, path=True)
-    effects_file: str = setting('', '', 'effects of your own beside the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
+    effects_file: str = setting('', '', 'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
                                 'tolerance, text}, '
-                                'or a calibration that has some; a model may name them then',
+                                'or a calibration with own effects; a model may then name them',
                                 symptom='the node refuses a model that names them',
                                 session=True, path=True, fixed='motion is gathered for the model')
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: how its biases move from window to window, on a table; '
-                              'empty: what '
-                              'the windows say of it', symptom='standard deviations of the biases are too large or too small',
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a table; '
+                              'empty: estimated from the windows', symptom='standard deviations of the biases are too large or too small',
                               session=True, path=True, fixed='one session is judged by one noise')
-    save_file: str = setting('', '', 'where ~/save writes the calibration; the accumulator goes beside it as NAME.accumulator.npz, '
-                             'also when '
-                             'the node ends with motion that is in no file; empty: calibration.yaml in the working directory, '
-                             'with ~/save alone',
-                             symptom='the node says at its start that the place is not writable', session=True, path=True)
+    save_file: str = setting('', '', 'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same folder, '
+                             'written also when '
+                             'the node ends with unsaved motion; empty: calibration.yaml in the working directory, '
+                             'by ~/save only',
+                             symptom='the node reports at its start that the folder is not writable', session=True, path=True)
     serial: str = setting('', '', 'serial number of the IMU, for the calibration', session=True,
-                          symptom='calibrations of several units look alike')
+                          symptom='calibrations of several units are not distinguished')
     operator: str = setting('', '', 'name of the operator, for the calibration', session=True,
                             symptom='a calibration does not name its operator')
-    resume: bool = setting(False, '', 'go on with the accumulator beside save_file when there is one',
+    resume: bool = setting(False, '', 'continue with the accumulator in the folder of save_file if it exists',
                            symptom='old motion of another IMU enters the calibration', session=True)
     autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
                                      'after a crash the session starts from the last ~/save', live=True)
@@ -182,10 +181,10 @@ class CalibrationNode(Node):
             live = self._make_live(place.earlier())
         except ImuCalibrationError as error:
             kept = place.put_aside()   # a save would write over it
-            say(self.get_logger(), ERROR, f'cannot go on where it was saved: {error}; starts anew, the earlier motion is kept in {kept}')
+            say(self.get_logger(), ERROR, f'the saved session cannot be continued: {error}; a new one starts, earlier motion is in {kept}')
             return self._make_live()
-        self.get_logger().info(f'goes on with {live.n_windows} {live.observations} from {place.accumulator}'
-                               if live.n_windows else f'nothing to go on with in {place.accumulator}: starts anew')
+        self.get_logger().info(f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
+                               if live.n_windows else f'no session in {place.accumulator}: a new session starts')
         return live
 
     def _serve(self, what: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -32,7 +32,7 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
 
 
 def _group_status(group: GroupState):
-    text = {'determined': 'determined', 'weak': 'weak', 'held': 'held at its prior: the motion so far says next to nothing',
+    text = {'determined': 'determined', 'weak': 'weak', 'held': 'held at its prior: the motion so far contains almost no information',
             'waiting': 'no solution yet'}[group.status]
     if group.needs:
         text += f'; still needed: {group.needs}'

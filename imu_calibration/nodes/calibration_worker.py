@@ -220,7 +220,7 @@ class CalibrationWorker(threading.Thread):
 
     def _diagnose(self) -> tuple[bool, str]:
         if not self._diagnosis_period:
-            return False, "nothing is diagnosed by hand while it runs, nor where parameter 'diagnosis_period' is 0"
+            return False, "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0"
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
         return True, (f'diagnosis of {self.live.n_windows} windows started; '
@@ -234,7 +234,7 @@ class CalibrationWorker(threading.Thread):
         except ImuCalibrationError as error:
             what = f'no calibration yet: {error.told(self.hints)}'
         if text is None and not self.live.n_windows:
-            return False, f'{what}; nothing written'
+            return False, f'{what}; no file was written'
         whole, written = self.place.save(self.live, text)
         self._note_fault('place', '' if whole else written)
         return whole and text is not None, f'{what}; {written}'
@@ -246,8 +246,8 @@ class CalibrationWorker(threading.Thread):
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
-        return True, (f'started anew, {lost} {self.gathered} that were in no file are forgotten; ' if lost else 'started anew; ') + \
-            'the last calibration stays published until there is another one'
+        return True, (f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; ') + \
+            'the last calibration remains published until the next one'
 
     def change_settings(self, settings: LiveSettings) -> tuple[bool, str]:
         """Use the intervals of other LiveSettings."""
@@ -281,7 +281,7 @@ class CalibrationWorker(threading.Thread):
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
                   f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
         if self.live.needs_linearising():
-            lines = [*lines, 'an effect is too far from its point of linearisation and the stored windows are not available any more: '
+            lines = [*lines, 'an effect is outside the range of its linearisation and the stored windows are no longer available: '
                      'calibrate the recording offline']
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
         groups = self.live.groups() if stale else self.state.groups

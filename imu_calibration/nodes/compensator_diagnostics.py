@@ -25,14 +25,14 @@ ANOTHER_RATE = 0.1
 COLD = 10.0
 """Seconds without a temperature after which diagnostics say so; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
-KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature came yet: nothing is published',
+KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
-         'covariance not finite': ("covariances that came are none (not finite, or a variance below zero): "
-                                   "the calibration's noise takes their place"),
-         'zero stamp': ('the driver sets no stamps, they are zero: '
-                        'the time of arrival stands for them where the angular acceleration is formed'),
-         'beyond what can be undone': 'readings are too large for the non-linear effects to be undone: these messages are not published'}
+         'covariance not finite': ("received covariances are invalid (not finite, or a variance below zero): "
+                                   "the calibration's noise is used"),
+         'zero stamp': ('the stamps of the driver are zero: '
+                        'times of arrival are used for the angular acceleration'),
+         'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published'}
 
 
 class CompensatorDiagnostics:
@@ -99,7 +99,7 @@ class CompensatorDiagnostics:
             source = node.imu.source()
             if source != self._told_source and node.imu.publishers:
                 self._told_source = source
-                node.get_logger().info(f'Imu messages come on {source}')
+                node.get_logger().info(f'Imu messages are received on {source}')
         self._tell_stamps(compensation)
         return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
 
@@ -117,7 +117,7 @@ class CompensatorDiagnostics:
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
         if node.problem:
-            serious.append(node.problem + (f'; calibration {node.adopted.version} stays' if node.adopted else ''))
+            serious.append(node.problem + (f'; calibration {node.adopted.version} remains in use' if node.adopted else ''))
         if compensation is None:
             what = 'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
             waiting = f'waiting for {node.awaited}; {what}' if node.awaited else f'waiting for a calibration, {what}'
@@ -156,7 +156,7 @@ class CompensatorDiagnostics:
                          'the driver')
             self._unusable_temperatures = ''
         if monotonic() - self._temperature_at > COLD:
-            last = 'none came yet' if self._temperature is None else f'the last one, {self._temperature:.1f} C, stays in use'
+            last = 'none received yet' if self._temperature is None else f'the last one, {self._temperature:.1f} C, remains in use'
             lines.append(f'{node.temperature.silence()}; {last}')
         return lines
 

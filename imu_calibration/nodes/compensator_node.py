@@ -151,7 +151,7 @@ class CompensatorNode(Node):
 
     def _failed(self, error: Exception) -> None:
         if self.context.ok():   # otherwise the node is ending, and nothing can be published any more
-            self.complaints.event('what came could not be used, the node goes on as before: '
+            self.complaints.event('a message could not be used, the node continues unchanged: '
                                   + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
 
     def _on_document(self, message: String) -> None:
@@ -164,7 +164,7 @@ class CompensatorNode(Node):
         if self.settings.takes_topic:
             self._try(self._topic, self._take_topic, self.settings)
         else:
-            self.complaints.event(f"a calibration came on {self.documents.topic_name} and is not taken: parameter 'adopt' is "
+            self.complaints.event(f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt' is "
                                   f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'")
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
@@ -284,7 +284,7 @@ class CompensatorNode(Node):
     def look_for_correction(self) -> None:
         """Notice when another compensator publishes the input, and when it no longer does."""
         topic = self.imu.topic_name
-        self.corrected_already = (f'{topic} is corrected already (a publisher of {topic + MARK} says so): nothing is published; '
+        self.corrected_already = (f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are published; '
                                   'remap imu/data_raw to the raw topic') if self.count_publishers(topic + MARK) else ''
 
     def _refuse_own_output(self) -> None:

@@ -18,10 +18,10 @@ from imu_calibration.use_cases.view_messages import HEALTH, PARAMETERS, READINGS
 class CompensatorFoxglove(FoxgloveSettings):
     """The same beside a calibration_node on the same host."""
 
-    foxglove_port: int = setting(8767, '', 'port to listen on, beside those of foxglove_bridge and calibration_node; 0: any that is free',
+    foxglove_port: int = setting(8767, '', 'port to listen on, not that of foxglove_bridge or calibration_node; 0: any free port',
                                  (0, 65535),
-                                 'another program has it: the node says so and shows nothing',
-                                 fixed='the port is taken when the server starts')
+                                 'a program uses the port: the node warns and has no view',
+                                 fixed='the server is bound to the port at its start')
 
 
 class CompensatorView(LiveView):

@@ -58,7 +58,7 @@ class DiagnosticsPublisher:
         try:
             statuses = self._collect()
         except Exception as error:   # diagnostics must not end what they speak of
-            statuses = [make_status(ERROR, 'diagnostics', shortened(f'the state cannot be told: {type(error).__name__}: {error}', 300))]
+            statuses = [make_status(ERROR, 'diagnostics', shortened(f'state not available: {type(error).__name__}: {error}', 300))]
         array = DiagnosticArray(status=statuses)
         array.header.stamp = self._node.get_clock().now().to_msg()
         prefix = self._node.get_fully_qualified_name().lstrip('/')

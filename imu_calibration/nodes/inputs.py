@@ -112,7 +112,7 @@ class MatchedInput:
         patience = DEAD_AFTER if len(set(names)) == 1 else SEVERAL_AFTER
         if not self.single or self._several_since is None or time.monotonic() - self._several_since < patience:
             return []
-        return [f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): what they send mixes; stop all but one, '
+        return [f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their messages mix; stop all but one, '
                 f'or remap {self.topic}']
 
     def source(self) -> str:
@@ -123,10 +123,10 @@ class MatchedInput:
     def silence(self, unusable: str = '') -> str:
         """Return why nothing may come on the topic, and which other topic there is; `unusable` says what was dropped of what does come."""
         if unusable:
-            return f'nothing on {self.topic_name} can be used: {unusable}'
-        what = f'nothing comes on {self.topic_name} ({self.type_name})'
+            return f'no message on {self.topic_name} is usable: {unusable}'
+        what = f'no messages on {self.topic_name} ({self.type_name})'
         if self.publishers:
-            return f'{what}: {", ".join(sorted(set(self.names())))} publishes it and sends nothing'
+            return f'{what}: {", ".join(sorted(set(self.names())))} is a publisher but does not send'
         if self.others:
             return f'{what}: {self.others[0].node_name} publishes {self.others[0].topic_type} there; remap {self.topic} to another topic'
         return f'{what}: {self._elsewhere()}'

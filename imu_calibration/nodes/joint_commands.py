@@ -21,7 +21,7 @@ from msg_adapters.joint_trajectory import encode_trajectory
 COMMANDS = ('topic', 'action', 'auto')
 """How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""
 DEPTH = 10
-RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left its path',
+RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left the path',
            -5: 'a joint did not reach the end'}
 """Error codes of FollowJointTrajectory, in words."""
 

@@ -49,7 +49,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         print(help_text(make_node))
         return 0
     if own:
-        print(f"error: the node takes what stands behind --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
+        print(f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
               'and see --help', file=sys.stderr)
         return 1
     # rclpy's handlers, installed by init, end the wait and call these; without them Python would also raise KeyboardInterrupt in mid-write.
@@ -84,7 +84,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         # A context that ends while something is being made or published fails in many ways; none of them is news.
         time.sleep(HEARD)
         if not asked_to_end:
-            return _failed(f'the node cannot go on: {shortened(f"{type(error).__name__}: {error}", 300)}')
+            return _failed(f'the node cannot continue: {shortened(f"{type(error).__name__}: {error}", 300)}')
     finally:
         _end(node)
     return int(getattr(node, 'failed', False))

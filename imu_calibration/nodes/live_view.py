@@ -19,12 +19,12 @@ class FoxgloveSettings:
     """Whether, and where, a node shows itself to Foxglove."""
 
     foxglove: bool = setting(False, '', 'show it live to Foxglove over a websocket; needs foxglove-sdk', live=True, session=True,
-                             symptom='the application finds nobody; the node says at its start where to look, or what is missing')
-    foxglove_host: str = setting('127.0.0.1', '', 'address to listen on; 0.0.0.0: on every network, for everybody there',
-                                 symptom='only programs on the same host find it', fixed='the address is taken when the server starts')
-    foxglove_port: int = setting(8766, '', 'port to listen on, beside the 8765 of foxglove_bridge; 0: any that is free', (0, 65535),
-                                 'another program has it: the node says so and shows nothing',
-                                 fixed='the port is taken when the server starts')
+                             symptom='the application finds no server; the node prints the address, or the missing package, at its start')
+    foxglove_host: str = setting('127.0.0.1', '', 'address to listen on; 0.0.0.0: on every network, without access control',
+                                 symptom='only programs on the same host find it', fixed='the server is bound to the address at its start')
+    foxglove_port: int = setting(8766, '', 'port to listen on, different from the 8765 of foxglove_bridge; 0: any free port', (0, 65535),
+                                 'a program uses the port: the node warns and has no view',
+                                 fixed='the server is bound to the port at its start')
 
 
 class LiveView:
@@ -47,7 +47,7 @@ class LiveView:
         try:
             self.change(settings)
         except InputError as error:
-            node.get_logger().warning(f'nothing is shown, the node goes on without: {error}')
+            node.get_logger().warning(f'no view, the node continues without it: {error}')
 
     @property
     def is_on(self) -> bool:

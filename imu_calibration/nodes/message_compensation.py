@@ -111,7 +111,7 @@ class LiveCompensation(SampleCompensation):
         if self.frame_id and frame_id != self.frame_id:
             self._message.forget()
             known = len(self.counts) < MANY or f"frame_id '{frame_id}'" in self.counts
-            self.refuse(f"frame_id '{frame_id}'" if known else 'frame_id of many others')
+            self.refuse(f"frame_id '{frame_id}'" if known else 'many further frame_ids')
             return False
         self._orientation_in = None
         return True

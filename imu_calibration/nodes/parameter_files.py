@@ -37,7 +37,7 @@ def settings_of(node: str) -> list[type]:
 
 def rendered(node: str) -> str:
     """Return the text of the parameter file of `node`."""
-    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and what you see when it is wrong.', '/**:',
+    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a wrong value.', '/**:',
              '  ros__parameters:']
     for group in settings_of(node):
         for item in describe(group):

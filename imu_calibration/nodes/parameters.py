@@ -16,7 +16,7 @@ from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.settings import Setting, describe, override
 
 RETIRED = {'reliable': 'inputs connect as their publishers offer',
-           'diagnosis_samples': 'evenly spread windows are asked, as of a recording'}
+           'diagnosis_samples': 'evenly spread windows are used, as in a recording'}
 """Parameters of earlier versions -> why they are not needed any more."""
 NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the parameters that rclpy itself has."""

@@ -111,7 +111,7 @@ class PlannerNode(Node):
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-                               f'nothing moves before ~/start; limits: {self._limit_words()}')
+                               f'no motion before ~/start; limits: {self._limit_words()}')
         for line in range_warnings(self._table):
             self.get_logger().warning(line)
 
@@ -147,7 +147,7 @@ class PlannerNode(Node):
     def _make_separator(self, suspect: Suspect, noise: dict) -> MotionPlanner:
         calibration = self._latest()
         if calibration is None:
-            raise InputError('a calibration must be known before causes are told apart, none came; publish imu/calibration')
+            raise InputError('a calibration is required before causes can be separated, none was received; publish imu/calibration')
         return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options,
                             limits=self.driver.limits)
 
@@ -242,7 +242,7 @@ class PlannerNode(Node):
         answer = self._ask('solve')
         if answer is None:
             raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
-                             "see whether it runs")
+                             "check that it runs")
         if not answer.success:
             self._say(INFO, f'no calibration yet: {answer.message}')
             return None
@@ -274,11 +274,11 @@ class PlannerNode(Node):
         if trouble := self.driver.stamp_fault(time.monotonic()):
             return False, trouble
         if not self._command.is_heard:
-            return False, f'nobody listens to {self._command.name}: start the controller, or remap joint_trajectory'
+            return False, f'{self._command.name} has no subscriber: start the controller, or remap joint_trajectory'
         if other := self._others.found():
             return False, other
         if not self._calibrator['solve'].service_is_ready():
-            return False, f'nobody takes the windows: {self._calibrator["solve"].srv_name} is not there; start calibration_node'
+            return False, f'service {self._calibrator["solve"].srv_name} does not exist; start calibration_node, which collects the windows'
         if not self._is_placed:
             self.driver.limits, self._is_placed = restricted_limits(self.driver.limits, self.driver.position, self.settings), True
         self.worker.go(motions)
@@ -291,7 +291,7 @@ class PlannerNode(Node):
 
     def _stop(self) -> tuple[bool, str]:
         self.worker.halt('stopped by ~/stop')
-        return True, 'stopped: nothing moves before the next ~/start'
+        return True, 'stopped: no motion before the next ~/start'
 
     def _serve(self, what: str, answer: Any, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:

@@ -142,8 +142,8 @@ class PlannerWorker(threading.Thread):
             self._measure()
         decision = self._decide()
         while decision is not None and decision.diagnose:
-            self.doing = 'asking what the model gets wrong'
-            self._peers.say(INFO, f'{decision.why}; asking what the model gets wrong')
+            self.doing = 'diagnosing'
+            self._peers.say(INFO, f'{decision.why}; diagnosing')
             asked = self.campaign.take_findings(self._peers.diagnose())
             if asked:
                 self._peers.say(INFO, asked)
@@ -162,9 +162,9 @@ class PlannerWorker(threading.Thread):
             if trouble := self.driver.stamp_fault(time.monotonic()):
                 raise InputError(trouble)
             if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # nobody need be looked for yet
-                self.doing, end = 'waiting until the controller must have taken the stop', time.monotonic() + patience
+                self.doing, end = 'waiting for the controller to stop', time.monotonic() + patience
             if time.monotonic() > end:
-                raise InputError(f'the joints must rest before a motion begins, they have not within {patience:g} s; see what moves them')
+                raise InputError(f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause')
             self._wake.wait(PERIOD)
             self._wake.clear()
 
@@ -178,7 +178,7 @@ class PlannerWorker(threading.Thread):
         if not self._wanted:
             with self._lock:
                 if self.driver.state is DriveState.MEASURING:
-                    self.driver.wait('rests until the next motion is asked for')
+                    self.driver.wait('rests until the next motion is requested')
 
     def _decide(self):
         if not self._wanted or self._ending:

@@ -36,18 +36,18 @@ class RobotSettings:
     """The arm that carries the IMU."""
 
     urdf_file: str = setting('', '', "description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; "
-                             f"{TOPIC}: what comes on robot_description; empty: "
-                             'table_file alone. Beside an arm table_file says where it stands: up, gravity, latitude, '
+                             f"{TOPIC}: the topic robot_description; empty: "
+                             'table_file only. With an arm, table_file describes the site: up, gravity, latitude, '
                              'limits of joints by name',
-                             symptom='the node waits, and says for what', session=True, path=True,
+                             symptom='the node waits for the missing input', session=True, path=True,
                              fixed='all motion gathered so far is of that arm')
     imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',
                             symptom='another place and attitude of the sensor', session=True,
                             fixed='all motion gathered so far is of that link')
     world_frame: str = setting('', '', 'frame whose z axis points up and that /tf_static ties to the root of the arm; '
-                               'empty: up is as table_file says, '
-                               "else the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
-                               fixed='all motion gathered so far is of an arm that stands so')
+                               'empty: up of table_file, '
+                               "otherwise the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
+                               fixed='all motion gathered so far is for this attitude of the arm')
     allow_xacro: bool = setting(False, '', 'expand a .xacro file, which is a program: its expressions can execute any Python code',
                                 symptom='the node refuses a .xacro file')
 
@@ -89,7 +89,7 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
     """Return what `chain_of` gives, in words."""
     if not robot.urdf_file:
         return f'the table {files.user_path(table_file)}'
-    return 'the arm that comes on robot_description' if robot.urdf_file == TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
+    return 'the arm of the topic robot_description' if robot.urdf_file == TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
 
 
 def _topic_text(node):

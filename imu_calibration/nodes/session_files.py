@@ -41,7 +41,7 @@ class SessionFiles:
             for path in (self.calibration, self.accumulator):
                 files.try_place(path)
         except ImuCalibrationError as error:
-            return f'nothing could be saved now: {error}'
+            return f'saving failed: {error}'
         return ''
 
     def earlier(self) -> bytes | None:
@@ -95,7 +95,7 @@ class SessionFiles:
                 files.write_whole(path, make())
                 done.append(str(path))
             except ImuCalibrationError as error:
-                failed.append(f'{error}; {"the earlier one there stays whole" if existed else "there was none before"}')
+                failed.append(f'{error}; {"the earlier file is unchanged" if existed else "no earlier file existed"}')
         if not failed:
             self.note_saved(live.n_windows)
         lines = [f'written: {" and ".join(done)}'] * bool(done) + [f'not written: {line}' for line in failed]
@@ -122,4 +122,4 @@ class SessionFiles:
             files.write_whole(self.accumulator, live.saved(pending=True))
         except Exception as error:   # the process ends now, whatever happens
             return f'{ends} and are lost: {shortened(str(error), 300)}'
-        return f'{ends}: they are kept in {self.accumulator}; resume:=true goes on with them'
+        return f'{ends}: they are kept in {self.accumulator}; resume:=true continues with them'

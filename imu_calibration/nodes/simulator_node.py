@@ -57,21 +57,21 @@ class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
     table_file: str = setting('', '', 'table description, path; empty: the installed config/table_simulated.yaml, '
-                              'or with urdf_file nothing',
-                              symptom='joint names are not those expected', session=True, path=True)
+                              'or none with urdf_file',
+                              symptom='joint names differ from the expected ones', session=True, path=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
-                           'a trajectory comes on joint_trajectory', symptom='the node refuses and lists the names', session=True)
+                           'a trajectory is received on joint_trajectory', symptom='the node refuses and lists the names', session=True)
     repeat: bool = setting(False, '', 'start the profile again at its end', symptom='the table rests after one round')
-    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table goes on resting',
+    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table remains at rest',
                                 symptom='the node does not end')
     calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
                                     symptom='another IMU is simulated', session=True, path=True)
     grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
                          symptom='noise too large or small')
-    hide: str = setting('', '', 'what else is wrong with the IMU, by its physics, names joined by +: ' + ', '.join(CAUSES),
-                        symptom='the diagnosis finds something else, or nothing', session=True)
-    hide_size: float = setting(1.0, '1', 'size of that, in units of the size that is drawn', (0.0, 100.0), 'too small: nobody finds it')
+    hide: str = setting('', '', 'further errors of the IMU, by their physics, names joined by +: ' + ', '.join(CAUSES),
+                        symptom='the diagnosis has a different finding, or none', session=True)
+    hide_size: float = setting(1.0, '1', 'size of the hidden error, in units of the drawn size', (0.0, 100.0), 'too small: not detectable')
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
     imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
     imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time',
@@ -83,10 +83,10 @@ class SimulatorSettings:
     stamp_jitter: float = setting(0.0, 's', 'standard deviation of the Imu stamps', (0.0, 0.01), 'too large: stamps out of order')
     temperature: bool = setting(False, '', 'publish imu/temperature, warming up from 25 C', symptom='thermal effects cannot be calibrated')
     frame_id: str = setting('imu_link', '', 'frame of the Imu messages', symptom='another frame_id')
-    truth: bool = setting(False, '', 'publish imu/truth: what a perfect IMU would measure', symptom='no messages on imu/truth')
+    truth: bool = setting(False, '', 'publish imu/truth: readings of a perfect IMU', symptom='no messages on imu/truth')
     time_factor: float = setting(1.0, '1', 'seconds of simulated time per second; 0: as fast as possible',
                                  (0.0, 10000.0), 'too large: messages are lost')
-    clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time stand still')
+    clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time do not advance')
     start_time: float = setting(0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day')
     wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start',
                                         (0, 100), 'the first messages are missed')
@@ -206,7 +206,7 @@ class SimulatorNode(Node):
 
     def _statuses(self):
         refused = self._driven['why refused']
-        text = f'the last trajectory that was refused: {refused}' if refused else 'follows what comes on joint_trajectory'
+        text = f'the last refused trajectory: {refused}' if refused else 'follows joint_trajectory'
         return [make_status(WARN if refused else OK, 'table', text, values=dict(self._driven))]
 
     def _ended(self, error):

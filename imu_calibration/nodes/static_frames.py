@@ -39,7 +39,7 @@ class StaticFrames:
     def waits_for(self, target: str, source: str) -> str:
         """Return what is waited for, for people."""
         return f"the transform from '{target}' to '{source}' on {TOPIC}: {self.transforms.why_not(target, source)}" + \
-            (f'; {self.n_unusable} transforms that came are unusable (not finite)' if self.n_unusable else '')
+            (f'; {self.n_unusable} received transforms are unusable (not finite)' if self.n_unusable else '')
 
     def take(self, message: Any) -> None:
         """Take a tf2_msgs/TFMessage."""
